@@ -1,15 +1,15 @@
 """Lost in space: identification of the stars of a frame without prior information.
 
-Every triangle of the brightest observed stars is looked up by shape, orientation and size among the triangles
-of guide stars, all at once. Each match votes for its three pairs of an observed and a guide star: true pairs
-occur in many triangles, chance pairs in one. The matches with the most votes are verified against the whole
-field until one is accepted. If no match is accepted, triangles spread over all stars are looked up. Even if
-most stars, including the brightest, are false, enough of a thousand triangles consist of true stars only.
-Finally the mirrored field is tried, and scales outside the given range if this range is narrow, because a
-narrow range may be wrong.
+Triangles of the brightest observed stars are looked up by shape, orientation and size among the triangles of
+guide stars. Each match of two triangles votes for three pairs of an observed star and a guide star. True
+pairs occur in many triangles, and chance pairs in only one. The matches with the most votes are verified
+against the whole field until one match is accepted. If no match is accepted, triangles of all observed stars,
+not only of the brightest, are looked up. Of a thousand such triangles, enough consist of true stars even if
+most observed points are false. If no match is accepted, the mirrored field is tried. Finally, scales outside
+the given range are tried if the given range is narrow, because a narrow range may be wrong.
 
 The shape of a triangle on the sphere depends slightly on the scale of the image. A wide range of scales is
-divided into steps, each narrow enough for the side ratios to stay within the tolerance.
+divided into steps that are so narrow that the side ratios stay within the tolerance.
 """
 
 from __future__ import annotations
@@ -49,18 +49,19 @@ _BRIGHTEST = 12
 _NEIGHBOURS = 5
 _CENTRES = 40
 _MOST_STARS = 64
-# Limits of the longest side, relative to the width of the field.
-# The index has larger triangles only of bright stars, and smaller triangles are less accurate.
+# Limits of the longest side of a triangle, relative to the width of the field.
+# Larger triangles in the index have only bright stars, and smaller triangles are less accurate.
 _MIDDLE_SIZES = 0.3, 0.75
 
 
 @dataclass(frozen=True, slots=True)
 class BatchSizes:
-    """Numbers of triangles in successive batches, each of which is looked up at once.
+    """Numbers of triangles in the successive batches that are looked up.
 
     Attributes:
-        bright: batches of the brightest stars, at each step of scale; these solve most frames.
-        spread: batches of triangles spread over many stars, for frames whose brightest points are false.
+        bright: numbers of triangles of the brightest stars, for each step of scale; they identify most
+            frames.
+        spread: numbers of triangles of many stars, for frames whose brightest points are false.
     """
 
     bright: tuple[int, ...] = (60, 250)
@@ -68,10 +69,11 @@ class BatchSizes:
 
 
 def batches_of(field: StarField, sizes: BatchSizes, steps: int) -> Iterator[tuple[IntArray, bool]]:
-    """Yield batches of triangles (t, 3), and whether the triangles are spread over many stars.
+    """Yield batches of triangles (t, 3), and whether a batch has triangles of many stars.
 
-    With many `steps` of scale a batch of the brightest stars is smaller, by the square root of their number.
-    The last batch includes triangles of neighbours, for a list that is not sorted by brightness.
+    The size of a batch of the brightest stars is divided by the square root of the number of `steps` of
+    scale. The last batch includes triangles of neighbouring stars, for points that are not sorted by
+    brightness.
     """
     brightest = triples(min(len(field), _BRIGHTEST))
     begin = 0
@@ -97,13 +99,13 @@ def middle_sized(field: StarField) -> IntArray:
     least = np.minimum(np.minimum(cosine[first, second], cosine[second, third]), cosine[third, first])
     longest = np.sqrt(np.maximum(2.0 - 2.0 * least, 0.0)) / (2.0 * max(field.half_width))
     kept = np.flatnonzero((longest >= _MIDDLE_SIZES[0]) & (longest <= _MIDDLE_SIZES[1]))
-    # The seed is fixed, so that the same list always gives the same result.
+    # The seed is fixed, so that the same field always gives the same triangles.
     return np.asarray(triangles[np.random.default_rng(len(field)).permutation(kept)])
 
 
 @lru_cache(maxsize=32)
 def triples(count: int) -> IntArray:
-    """Return all triangles (t, 3) of `count` stars, sorted by the faintest star of each."""
+    """Return all triangles (t, 3) of `count` stars, sorted by the index of each triangle's faintest star."""
     first, second, third = np.meshgrid(*[np.arange(count)] * 3, indexing="ij")
     ascending = (first < second) & (second < third)
     triangles = np.stack([first[ascending], second[ascending], third[ascending]], axis=-1)
@@ -111,7 +113,7 @@ def triples(count: int) -> IntArray:
 
 
 def neighbours(field: StarField) -> IntArray:
-    """Return triangles (t, 3) of stars and their nearest neighbours of any brightness."""
+    """Return triangles (t, 3) of a star and two of its nearest neighbours of any brightness."""
     cosines = field.direction[:_CENTRES] @ field.direction.T
     near = np.argsort(-cosines, axis=1)[:, 1 : _NEIGHBOURS + 1]
     one, two = np.triu_indices(_NEIGHBOURS, 1)
@@ -126,11 +128,11 @@ _LARGEST_SIZE = (1 << SIZE_BITS) - 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleSteps:
-    """Ranges of scale that together cover the range of the lens, each narrow enough for one set of shapes.
+    """Steps that divide the range of possible scales, so that triangle shapes are constant within a step.
 
     Attributes:
-        middle: scale at which the shapes are computed (s,).
-        lowest, highest: ends of each range (s,).
+        middle: scale of each step for which the triangle shapes are computed (s,).
+        lowest, highest: limits of the scale of each step (s,).
     """
 
     middle: FloatArray
@@ -142,10 +144,11 @@ class ScaleSteps:
 
     @classmethod
     def of(cls, field: StarField, tolerance: float) -> ScaleSteps:
-        """Return the steps for the scale range of a field; side ratios vary by `tolerance` within a step.
+        """Return the steps of a field's range of scales; side ratios vary by `tolerance` within a step.
 
-        At the tangent t from the boresight a gnomonic image is stretched by 1 + t^2 along the radius and by
-        1 + t^2 / 2 across it. The ratio of two sides half-way to the corner therefore varies by t^2 / 2.
+        At the tangent t from the boresight, a gnomonic image is enlarged by 1 + t^2 along the radius and by
+        1 + t^2 / 2 across the radius. Therefore a side ratio at this tangent varies by t^2 / 2. The steps are
+        computed for the tangent half-way to the corner.
         """
         lowest, highest = field.scale
         half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
@@ -156,12 +159,12 @@ class ScaleSteps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleMatches:
-    """Matches of observed triangles with triangles of guide stars, corner by corner.
+    """Matches of observed triangles with triangles of guide stars.
 
     Attributes:
-        observed: indices of the observed stars (k, 3), uint32.
-        star: indices of the guide stars (k, 3), uint32.
-        scale: factor of the tangents that makes the longest sides equal (k,).
+        observed: indices of the observed stars at the corners of each match (k, 3), uint32.
+        star: indices of the guide stars at the same corners (k, 3), uint32.
+        scale: factor on the observed tangents that makes the longest sides of each match equal (k,).
     """
 
     observed: npt.NDArray[np.uint32]
@@ -183,11 +186,14 @@ class TriangleMatches:
         )
 
     def votes(self) -> IntArray:
-        """Return for each pair of each match (k, 3) how many matches of similar scale contain it."""
+        """Return the votes (k, 3) for each pair of an observed star and a guide star in each match.
+
+        The votes of a pair are the number of matches of similar scale that contain the pair.
+        """
         bins = np.log(self.scale) * _BINS_PER_LN_SCALE
         bins -= bins.min()
         bits = max(13, self.star.size.bit_length())
-        # With this multiplicative hash, two pairs rarely share a slot, and a collision is harmless.
+        # With this multiplicative hash, two pairs rarely share a slot; a collision only adds wrong votes.
         code = (self.star * np.uint32(1021) + self.observed) * np.uint32(257)
         code += bins.astype(np.uint32)[:, None]
         slot = (code * np.uint32(2654435761)) >> np.uint32(32 - bits)
@@ -209,13 +215,13 @@ def look_up(
     """Return the matches of observed triangles in the index, and the number of index entries read.
 
     Args:
-        field: the observed stars.
-        sky: the index.
-        steps: ranges of scale.
-        triangles: indices (t, 3) of the observed stars at the corners of each triangle.
+        field: observed points of the frame.
+        sky: sky index of guide stars and their triangles.
+        steps: steps of the scale of the image.
+        triangles: indices of the observed stars at the corners of each triangle (t, 3).
         tolerance: tolerance of a side ratio, in standard deviations.
-        distortion: additional error of a side ratio.
-        most: maximum number of entries to read; the first triangles take precedence.
+        distortion: additional error of a side ratio due to distortion of the lens.
+        most: maximum number of index entries to read, beginning with the first triangles.
     """
     corners, sides, left = _forms(field, triangles, steps)
     size = np.maximum(sides[:, 2], SIZE_UNIT)
@@ -230,26 +236,26 @@ def look_up(
     lowest = size * (steps.lowest / steps.middle)[step] * (1.0 - slack)
     highest = size * (steps.highest / steps.middle)[step] * (1.0 + slack)
     query, short, middle, begin, end = _runs(sky, ratio, slack, left, lowest, highest)
-    # Only the first runs with at most `most` entries in total are read.
+    # Only the first runs of index entries, with at most `most` entries in total, are read.
     count = end - begin
     kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
     begin, count = begin[:kept], count[:kept]
     query, short, middle = query[: len(count)], short[: len(count)], middle[: len(count)]
-    # int32 halves the time, most of which is spent on these entries.
+    # Most of the time is spent on these entries, and int32 halves it.
     first = (begin - (np.cumsum(count) - count)).astype(np.int32)
     entry = np.arange(int(count.sum()), dtype=np.int32) + np.repeat(first, count)
     near = np.ones(len(entry), dtype=np.bool_)
     for column, cells in enumerate((short, middle)):
         lowest_place, width = _places(ratio[query, column], slack[query], cells)
         place = sky.triangles.shape[:, column][entry]
-        # Below the lowest position the difference of the unsigned bytes wraps around to a large number.
+        # For a position below the lowest one, the difference of unsigned bytes wraps to a large number.
         near &= place - np.repeat(lowest_place, count) <= np.repeat(width, count)
     chosen = np.flatnonzero(near)
     total = len(entry)
     entry = entry[chosen]
     query = query[np.searchsorted(np.cumsum(count), chosen, side="right")]
     longest = (sky.triangles.key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
-    # The runs contain some triangles that are too small or too large for the step.
+    # The runs also contain some triangles that are too small or too large for the step of scale.
     fits = np.flatnonzero((longest >= lowest[query]) & (longest <= highest[query]))
     entry, query, longest = entry[fits], query[fits], longest[fits]
     scale = longest / size[query] * steps.middle[step[query]]
@@ -260,8 +266,11 @@ def look_up(
 def _places(
     ratio: FloatArray, slack: FloatArray, cells: IntArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest position within `slack` of each ratio, and the number of further positions."""
-    # The positions are in units of the finest division of a ratio, relative to the middle of a division.
+    """Return the lowest position in a cell that agrees with each ratio, and the number of further positions.
+
+    A position agrees with a ratio if it differs from the ratio by at most `slack`.
+    """
+    # Positions are in units of 1 / FINE of a cell, and refer to the middle of such a unit.
     wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
     reach = slack * (CELLS * FINE) + 0.5
     lowest = np.clip(np.ceil(wanted - reach), 0, FINE - 1)
@@ -272,7 +281,10 @@ def _places(
 def _forms(
     field: StarField, triangles: IntArray, steps: ScaleSteps
 ) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return corners and sides (t s, 3), sorted by side, and whether the corners run counterclockwise."""
+    """Return corners and sides (t s, 3) of t triangles at s scales, sorted by the length of the side.
+
+    The third value is the orientation of the corners in the image (t s,).
+    """
     x, y, z = field.direction.T
     direction = np.empty((len(steps), len(field), 3))
     direction[:, :, 0] = steps.middle[:, None] * x
@@ -301,17 +313,17 @@ def _runs(
     lowest: FloatArray,
     highest: FloatArray,
 ) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
-    """Return the runs of keys that contain triangles similar to the queries.
+    """Return the runs of contiguous keys that contain triangles similar to the observed triangles (queries).
 
-    Each run has the index of its query, the cells of the short and of the middle ratio, and its beginning and
-    end. Each ratio of a query may lie in up to three cells.
+    Each run has the index of its query, the cells of both side ratios, and its beginning and end in the keys.
+    Each side ratio of a query may lie in up to three cells.
     """
     low = np.maximum(((ratio - slack[:, None]) * CELLS).astype(np.int64), 0)
     high = np.minimum(((ratio + slack[:, None]) * CELLS).astype(np.int64), CELLS - 1)
     spans = high - low
     widest = int(spans.max(initial=0)) + 1
     here = np.arange(widest) <= spans[:, :, None]
-    # The runs are in the order of the queries, so that the first triangles are read first.
+    # The runs are in the order of the queries, so that the runs of the first triangles are read first.
     query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
     short = low[query, 0] + along_short
     middle = low[query, 1] + along_middle
@@ -325,18 +337,18 @@ def _runs(
 
 @dataclass(frozen=True, slots=True)
 class IdentificationSettings:
-    """Tolerances and limits of the search.
+    """Settings of the identification without prior attitude.
 
     Attributes:
         tolerance: tolerance of the side ratios, in standard deviations.
-        distortion: additional error of a side ratio, for a lens that is not a pinhole.
+        distortion: additional error of a side ratio due to distortion of the lens.
         batches: numbers of triangles to look up.
         work: maximum number of index entries to read.
-        verified: maximum number of candidates of each batch to verify.
+        verified: maximum number of candidates to verify after each batch.
         mirror: whether the mirrored field is searched too.
-        hint_error: factor by which the scale may lie outside of a narrow range, which is considered a hint;
-            1 if the range is certain. A calibrated scale, (1, 1), is always considered certain.
-        verification: conditions under which a candidate is accepted.
+        hint_error: factor by which the true scale may lie outside a narrow range of scales; 1 if the range is
+            certain. A calibrated scale, (1, 1), is always considered certain.
+        verification: settings of the verification of candidates.
     """
 
     tolerance: float = 3.0
@@ -349,16 +361,16 @@ class IdentificationSettings:
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
-# Factor on tolerance and on verified candidates for triangles that are spread over many stars.
-# Both may be smaller, because many true triangles vote for the same stars.
+# Factor on the tolerance and on the number of verified candidates for triangles of many stars.
+# The factor is below 1, because many true triangles vote for the same stars.
 _OF_SPREAD = 0.6
-# Factor by which a match of the mirrored field, or against a hint, must be less likely by chance.
+# Factor by which a match in the mirrored field or outside the range of scales must be less likely by chance.
 _RARE = 10.0
 DEFAULT = IdentificationSettings()
 
 
 def identify(observed: StarField, sky: SkyIndex, settings: IdentificationSettings = DEFAULT) -> StarMatch:
-    """Return the identified stars and the attitude of a frame, or why it cannot be identified."""
+    """Return the identified stars and the attitude of a frame, or a status that states why there are none."""
     if len(observed) < settings.verification.least_matches:
         return nothing(observed, MatchStatus.TOO_FEW_STARS)
     answer = _search(observed, sky, settings, 1.0)
@@ -375,7 +387,7 @@ def identify(observed: StarField, sky: SkyIndex, settings: IdentificationSetting
 def _search(
     observed: StarField, sky: SkyIndex, settings: IdentificationSettings, searched: float
 ) -> StarMatch:
-    """Return the identification of a field without trying its mirror image or another scale."""
+    """Return the identification of a field, without trying the mirrored field or other scales."""
     steps = ScaleSteps.of(observed, settings.distortion)
     found: list[TriangleMatches] = []
     tried: set[tuple[int, int]] = set()
@@ -406,11 +418,11 @@ def _search(
 def _candidates(
     observed: StarField, sky: SkyIndex, finds: TriangleMatches, tried: set[tuple[int, int]], most: int
 ) -> Iterator[tuple[FloatArray, float]]:
-    """Yield attitudes (3, 3) and scales of the matches with the most votes, without repetition."""
+    """Yield the attitudes (3, 3) and scales of the matches with the most votes, each only once."""
     if not len(finds):
         return
     votes = finds.votes().sum(axis=1)
-    # There may be a hundred thousand matches: only those with the most votes are sorted.
+    # There may be a hundred thousand matches, so only the matches with the most votes are sorted.
     first = np.argpartition(-votes, min(8 * most, len(votes) - 1))[: 8 * most]
     order = first[np.lexsort((first, -votes[first]))]
     yielded = 0
@@ -419,9 +431,9 @@ def _candidates(
         if sum(pair in tried for pair in pairs) >= 2:
             continue
         tried.update(pairs)
-        # One triangle gives an inaccurate scale, which is limited to the range of the lens.
+        # The scale from one triangle is inaccurate, so it is limited to the range of possible scales.
         scale = min(max(float(finds.scale[find]), observed.scale[0]), observed.scale[1])
-        # The attitude that maps the guide stars of the match onto the observed stars.
+        # The attitude transforms the guide stars of the match into the observed stars.
         seen = stretched(observed.direction[finds.observed[find]], float(finds.scale[find]))
         yield np.asarray(_frame(seen).T @ _frame(sky.stars.direction[finds.star[find]])), scale
         yielded += 1
@@ -430,7 +442,10 @@ def _candidates(
 
 
 def _frame(corners: FloatArray) -> FloatArray:
-    """Return the axes, as rows (3, 3), of a frame fixed in a triangle (3, 3): the first is its centre."""
+    """Return the axes, as rows (3, 3), of a frame that is fixed to a triangle of unit vectors (3, 3).
+
+    The first axis points to the centre of the triangle.
+    """
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners.tolist()
     mx, my, mz = ax + bx + cx, ay + by + cy, az + bz + cz
     norm = math.sqrt(mx * mx + my * my + mz * mz)

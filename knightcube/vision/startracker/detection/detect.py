@@ -1,7 +1,7 @@
 """Detection of the stars of a frame, in the whole frame or near predicted positions.
 
-`detect` searches a whole frame: local maxima of the areas, measurement, and quality flags for what is not a
-star. `measure_near` reads only small windows around predicted positions, for tracking.
+`detect` searches a whole frame: it measures the local maxima of the areas above the noise, and flags sources
+that are not stars. `measure_near` reads only small windows around predicted positions, for tracking.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from knightcube.vision.startracker.detection.survey import (
 
 
 class Quality(IntFlag):
-    """Flags of a detection; a saturated, blended or clipped detection is still a star."""
+    """Quality flags of a source; a saturated, blended or clipped source may still be a star."""
 
     POINT = 0
     SATURATED, BLENDED, CLIPPED = 1, 2, 4
@@ -56,17 +56,17 @@ class Detections:
     """The sources of one frame, the brightest first.
 
     Attributes:
-        points: positions (n, 2), x and y, px.
-        sigma: standard deviation along one axis (n,), px.
-        covariance: of the positions (n, 2, 2), px^2.
-        flux: light above the background (n,), counts.
-        background: sky background at the source (n,), counts per pixel.
-        signal_to_noise: flux over its standard deviation (n,).
-        width: sigma of the Gaussian that fits the source alone best (n,), px; NaN if not measured.
-        quality: `Quality` flags (n,), int64.
-        prediction: number of the prediction near which a source was found (n,); -1 in a search of the whole
-            frame.
-        psf_sigma: width of the PSF of the frame, px; NaN if it was neither given nor measured.
+        points: positions (x, y) of the sources (n, 2), px.
+        sigma: standard deviation of the positions along one axis (n,), px.
+        covariance: covariances of the positions (n, 2, 2), px^2.
+        flux: counts above the background of each source (n,).
+        background: sky background at each source (n,), counts per pixel.
+        signal_to_noise: flux of each source divided by its standard deviation (n,).
+        width: standard deviation of the Gaussian that best fits each source (n,), px; NaN if not measured.
+        quality: `Quality` flags of each source (n,), int64.
+        prediction: index of the prediction near which each source was found (n,); -1 in a search of the
+            whole frame.
+        psf_sigma: standard deviation of the frame's PSF, px; NaN if it was neither given nor measured.
     """
 
     points: FloatArray
@@ -99,11 +99,11 @@ class Detections:
 
     @property
     def is_star(self) -> BoolArray:
-        """Which sources (n,) may be stars: not hot, extended, a streak or clutter."""
+        """Which sources (n,) may be stars, because they are not hot, extended, streaks or clutter."""
         return np.asarray((self.quality & REFUSED) == 0)
 
     def select(self, chosen: BoolArray | IntArray) -> Detections:
-        """Return the sources `chosen` by a mask (n,), or by numbers (k,) in the order given."""
+        """Return the sources that `chosen` selects by a mask (n,), or by indices (k,) in the given order."""
         return select(self, chosen, "psf_sigma")
 
     def in_order(self) -> Detections:
@@ -122,7 +122,7 @@ class Detections:
         return len(self.flux)
 
 
-# Wings of a bright star, which have local maxima: the share times (1 + (d / scale)^2)^-power of the peak.
+# The wings of a bright star at the distance d are at most share (1 + (d / scale)^2)^-power of its peak.
 _WING_SCALE, _WING_POWER, _WING_SHARE = 2.0, 2.0, 0.7
 _WINGS_END = 60.0
 _CELLS = 4
@@ -131,13 +131,13 @@ _MOST_COMPARED = 500
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peaks:
-    """Local maxima of the smoothed frame, highest first.
+    """Local maxima (peaks) of the smoothed frame, the highest first.
 
     Attributes:
-        place: column and row (p, 2), px.
-        height: height in the smoothed frame (p,), counts.
-        area: number of the area that contains the peak (p,).
-        core: radius of the saturated disc around the peak (p,), px; 0 for none.
+        place: column and row of each peak (p, 2).
+        height: height of each peak in the smoothed frame (p,), counts.
+        area: index of the area that contains each peak (p,).
+        core: radius of the saturated disc around each peak (p,), px; 0 if the peak is not saturated.
     """
 
     place: IntArray
@@ -146,7 +146,7 @@ class Peaks:
     core: FloatArray
 
     def select(self, chosen: BoolArray | IntArray) -> Peaks:
-        """Return the peaks that `chosen` selects."""
+        """Return some of the peaks, selected by a mask (p,) or by indices (`chosen`)."""
         return select(self, chosen)
 
     def __len__(self) -> int:
@@ -154,7 +154,7 @@ class Peaks:
 
 
 def find_peaks(areas: Areas) -> Peaks:
-    """Return the local maxima of the areas; a saturated disc counts as one, at its centre."""
+    """Return the local maxima of the areas; a saturated disc has a single maximum, at its centre."""
     top = areas.peak
     place = np.stack([areas.column[top], areas.row[top]], axis=-1)
     peaks = Peaks(place, areas.smooth[top], areas.owner[top], np.zeros(len(place)))
@@ -164,12 +164,18 @@ def find_peaks(areas: Areas) -> Peaks:
 
 
 def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return the numbers (k,) of the peaks to measure, highest first, without maxima on the wings of others.
+    """Return the indices (k,) of the peaks to measure, the highest first.
 
-    At most `most` peaks of the open sky are chosen, `open_sky` (p,) being a mask, and at most a quarter of
-    `most` from each sixteenth of the frame of `shape`, so that a cloud that is brighter than all stars leaves
-    room for the stars beside it. As many peaks outside of the open sky are chosen too: they show what the
-    sources of the foreground look like, without displacing stars.
+    Local maxima on the wings of brighter stars are excluded. At most `most` peaks in the open sky are
+    selected, and at most a quarter of `most` in each sixteenth of the frame, so that a bright cloud does not
+    exclude the stars beside it. The same number of peaks outside the open sky is selected too, in order to
+    measure the shape of foreground sources.
+
+    Args:
+        peaks: local maxima of the frame, the highest first.
+        open_sky: which peaks are in the open sky (p,).
+        shape: rows and columns of the frame.
+        most: maximum number of peaks in the open sky.
     """
     compared = np.sort(
         np.concatenate([np.flatnonzero(part)[:_MOST_COMPARED] for part in (open_sky, ~open_sky)])
@@ -180,7 +186,7 @@ def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], m
 
 
 def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return the first `most` of the peaks, at most a quarter of them from each sixteenth of `shape`."""
+    """Return the indices of the first `most` peaks, at most a quarter of them in a sixteenth of the frame."""
     row, column = (peaks.place[:, k] * _CELLS // shape[1 - k] for k in (1, 0))
     cell = row * _CELLS + column
     order = np.argsort(cell, kind="stable")
@@ -190,12 +196,12 @@ def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
 
 
 def on_wings(peaks: Peaks) -> BoolArray:
-    """Return which peaks (p,), highest first, may be maxima on the wings of a brighter peak."""
+    """Return which peaks (p,) may be local maxima on the wings of a brighter star."""
     x, y = peaks.place.T.astype(np.float32)
     square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
-    # Only pairs nearer than 60 px are compared: there the wings are a millionth of the peak.
+    # Only pairs closer than 60 px are compared, because the wings fall to a millionth of the peak at 60 px.
     lower, higher = np.nonzero(np.tri(len(x), k=-1, dtype=bool) & (square < _WINGS_END**2))
-    # A saturated disc's wings begin at its rim.
+    # The wings of a saturated disc begin at the rim of the disc.
     apart = np.maximum(np.sqrt(square[lower, higher]) - peaks.core[higher], 0.0)
     wing = _WING_SHARE * (1.0 + (apart / _WING_SCALE) ** 2) ** -_WING_POWER
     hidden = peaks.height[lower] < peaks.height[higher] * wing
@@ -203,7 +209,7 @@ def on_wings(peaks: Peaks) -> BoolArray:
 
 
 def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
-    """Return the peaks with one at the centre of each saturated disc, and no other on the disc or its rim."""
+    """Return the peaks with a single peak for each saturated disc, at the centre of the disc."""
     row, column = areas.row[areas.saturated], areas.column[areas.saturated]
     owner, count = label_pixels(row * areas.shape[1] + column, areas.shape[1])
     size = np.bincount(owner, minlength=count)
@@ -223,17 +229,17 @@ def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
     )
 
 
-# Number of measured peaks per requested star: some peaks prove not to be stars.
+# Number of measured peaks per requested star; some peaks are found not to be stars.
 _MEASURED_FOR_ONE = 1.5
 _CLUTTERED_SHARE = 0.25
-# Noise relative to the median of the frame above which a block is foreground and not sky.
+# Noise of a block, relative to the median of the frame, above which the block counts as foreground.
 _RESTLESS = 2.5
-# Radius (px) of a saturated disc above which it is not a star but a planet, the Moon or a lamp.
+# Radius (px) of a saturated disc above which it is a planet, the Moon or a lamp instead of a star.
 _WIDEST_CORE = 7.0
 _SHARPER, _BROADER = 0.55, 1.8
 _SURE = 3.0
 _LONGER_THAN_COMA = 12.0
-# Radius (px) around a source in which most sources must have the shape of a star; otherwise it is clutter.
+# Radius (px) around a source within which most sources must look like stars; otherwise the source is clutter.
 _ABOUT = 48.0
 _ODD_PART, _LEAST_ODD = 0.5, 8
 _ODD_WIDTH, _ODD_LENGTH = 1.25, 2.5
@@ -242,15 +248,15 @@ _FARTHEST = 2.0
 
 
 def detect(pixels: Image, settings: DetectionSettings | None = None) -> Detections:
-    """Return the sources of a frame (rows, columns), the brightest first; `stars()` selects the stars.
+    """Return the sources of a frame (rows, columns), the brightest first; `Detections.stars` selects stars.
 
-    Raises ValueError unless `pixels` is finite, of real numbers, and 16 x 16 pixels or larger.
+    Raises ValueError unless the pixels are finite real numbers and the frame has at least 16 x 16 pixels.
     """
     return measure_areas(survey(pixels, settings))
 
 
 def measure_areas(seen: Survey) -> Detections:
-    """Return the sources of the areas of a survey, the brightest first."""
+    """Return the sources in the areas of a survey, the brightest first."""
     pixels, settings, areas = seen.pixels, seen.settings, seen.areas
     peaks = find_peaks(areas)
     if not len(peaks):
@@ -279,14 +285,14 @@ def measure_areas(seen: Survey) -> Detections:
     real = confirmed(found, targets, settings) | ((quality & REFUSED) != 0)
     whole = assemble(found, shapes, quality, targets, spread, np.full(len(peaks), -1)).select(real)
     found_all = whole.in_order()
-    # The brightest stars, and the same number of sources that are not stars.
+    # The brightest stars are kept, and at most the same number of sources that are not stars.
     star = found_all.is_star
     kept = np.where(star, np.cumsum(star), np.cumsum(~star)) <= settings.most_stars
     return found_all.select(kept).scaled(seen.unit)
 
 
 def quality_of(found: MeasuredStars, shapes: Shapes, spread: FrameSpread, targets: StarTargets) -> IntArray:
-    """Return the flags (n,) that follow from the pixels of each star."""
+    """Return the quality flags (n,) that follow from the pixels of each source."""
     sure = _SURE * shapes.error
     alone = (targets.core == 0.0) & ~found.blended
     hot = alone & (shapes.hot | (shapes.width + sure < _SHARPER * spread.psf_sigma))
@@ -305,26 +311,29 @@ def quality_of(found: MeasuredStars, shapes: Shapes, spread: FrameSpread, target
 
 
 def plain_ones(sound: BoolArray, targets: StarTargets) -> BoolArray:
-    """Return which of the `sound` stars (n,) determine the PSF: those not saturated, if there are any."""
+    """Return which of the `sound` stars (n,) determine the PSF.
+
+    These are the stars that are not saturated, or all stars if all are saturated.
+    """
     plain = sound & (targets.core == 0.0)
     return plain if plain.any() else sound
 
 
 def looks_odd(quality: IntArray, shapes: Shapes, spread: FrameSpread) -> BoolArray:
-    """Return which sources (n,) do not look like stars: streaks, clutter, or broader than the PSF."""
+    """Return which sources (n,) are streaks, clutter or wider than the PSF, and so do not look like stars."""
     refused = (quality & REFUSED & ~int(Quality.HOT)) != 0
     return np.asarray(refused | (shapes.width - shapes.error > _ODD_WIDTH * spread.psf_sigma))
 
 
 def among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
-    """Return which sources (n,) at `points` (n, 2) px are surrounded mostly by `odd` (n,) sources."""
+    """Return which sources (n,) at `points` (n, 2), px, are mostly surrounded by `odd` sources (n,)."""
     near = np.sum((points[:, None] - points) ** 2, axis=-1) < _ABOUT**2
     strange = near @ odd.astype(float)
     return np.asarray((strange >= _LEAST_ODD) & (strange > _ODD_PART * near.sum(axis=1)))
 
 
 def confirmed(found: MeasuredStars, targets: StarTargets, settings: DetectionSettings) -> BoolArray:
-    """Return which stars (n,) have enough light, lie near their peak and inside of the frame."""
+    """Return which sources (n,) are significant, near their peak and inside the frame."""
     far = np.maximum(_FARTHEST, targets.core)[:, None]
     near = (np.abs(found.points - targets.middle) < far).all(axis=1)
     limits = np.array(targets.pixels.shape)[::-1] - 0.5
@@ -342,7 +351,7 @@ def assemble(
     spread: FrameSpread,
     prediction: IntArray,
 ) -> Detections:
-    """Return the detections in the order of the targets."""
+    """Return the measured sources as detections, in the order of the targets."""
     return Detections(
         found.points,
         np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2)),
@@ -358,19 +367,19 @@ def assemble(
 
 
 def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
-    """Return the flags (p,) that follow from the areas: streak and clutter."""
+    """Return the quality flags STREAK and CLUTTER (p,) of peaks, which follow from the areas."""
     noise = sky.smooth_noise
     restless = noise.at(*peaks.place.T) > _RESTLESS * np.median(noise.values)
     clutter = restless | cluttered(areas, peaks.place, _CLUTTERED_SHARE)
     long = is_streak(areas)[peaks.area]
     if frame_shape(areas).kind is not FrameKind.STREAKS:
-        # Several stars in a row are long too, but have several peaks; a bright star in a corner has a tail.
+        # A row of stars is also long, but has several peaks. A bright star in a corner has a tail.
         long &= np.bincount(peaks.area, minlength=len(areas))[peaks.area] == 1
         long &= (areas.length[peaks.area] > _LONGER_THAN_COMA) & (peaks.core == 0.0)
     return np.asarray(Quality.CLUTTER * clutter | Quality.STREAK * long)
 
 
-# Width (px) of the rim around the search area from which the sky is measured.
+# Width (px) of the rim around the search area in which the sky is measured.
 _RIM = 5
 _ROUNDING = 12.0**-0.5
 _SAME_STAR = 1.5
@@ -384,18 +393,19 @@ def measure_near(
 ) -> Detections:
     """Return the stars near predicted positions, the brightest first.
 
-    Only windows around the predictions are read. A prediction without a peak above the threshold within the
-    search radius gives no star; a peak near several predictions is assigned to the nearest one.
+    Only windows around the predictions are read. A prediction gives a star only if a peak within the search
+    radius exceeds the threshold. A peak near several predictions is assigned to the nearest prediction.
 
     Args:
-        pixels: frame (rows, columns).
-        predicted: predicted positions (m, 2), px; those outside of the frame are ignored.
-        settings: detection settings.
-        trail: displacement of each star over the exposure (m, 2), px, a few pixels at most; None: none.
+        pixels: counts of the frame (rows, columns).
+        predicted: predicted positions (m, 2), px; positions outside the frame are ignored.
+        settings: detection settings; None for the defaults.
+        trail: displacement of each star during the exposure (m, 2), px, of at most a few pixels; None for no
+            displacement.
 
     Raises:
-        ValueError: unless `pixels` is a frame of real numbers, 16 x 16 pixels or larger, and all predictions
-            are finite.
+        ValueError: unless pixels and predictions are finite real numbers and the frame has at least 16 x 16
+            pixels.
     """
     pixels, unit = in_counts(pixels)
     settings = (settings or DetectionSettings()).in_units_of(unit)
@@ -409,7 +419,7 @@ def measure_near(
     ceiling = saturation_level(pixels, settings.saturation)
     half = int(np.ceil(settings.search_radius)) + _RIM
     whole = np.zeros(len(asked))
-    # The search for the peak uses saturated pixels too.
+    # The search for peaks also uses saturated pixels.
     path = None if trail is None else trail[asked]
     windows = cut(pixels, np.rint(predicted[asked]).astype(np.int64), half, whole, whole, np.inf, path)
     targets, number = _peaks_near(pixels, windows, predicted[asked], ceiling, settings)
@@ -428,7 +438,7 @@ def measure_near(
 def _peaks_near(
     pixels: Image, windows: StarWindows, predicted: FloatArray, ceiling: float, settings: DetectionSettings
 ) -> tuple[StarTargets, IntArray]:
-    """Return the highest peaks above the threshold within the search radius, and their predictions (k,)."""
+    """Return the highest peak near each prediction, if it exceeds the threshold, and its prediction (k,)."""
     level, noise, tail, correlation = _sky_of(windows, settings.search_radius)
     light = np.where(windows.good, windows.light - level[:, None, None], 0.0)
     smooth = smoothed(light)
@@ -448,7 +458,7 @@ def _peaks_near(
     apart = np.linalg.norm(middle - predicted, axis=1)
     number = np.flatnonzero(bright)
     points, apart = middle[number], apart[number]
-    # Of several predictions at one peak, the nearest one counts.
+    # A peak near several predictions is assigned to the nearest prediction.
     same = np.linalg.norm(points[:, None] - points, axis=-1) < _SAME_STAR
     order = np.arange(len(points))
     better = (apart < apart[:, None]) | ((apart == apart[:, None]) & (order < order[:, None]))
@@ -457,16 +467,16 @@ def _peaks_near(
 
 
 def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return background (n,), noise of single (n,) and of smoothed pixels (n,), and the correlation.
+    """Return background (n,), noise of single pixels (n,), noise of smoothed pixels (n,), and correlation.
 
-    All are measured in the rims of the windows. The noise of smoothed pixels includes faint stars, as the
-    threshold of the search requires. The correlation is the noise of a sum of pixels relative to that of
-    independent pixels.
+    These values are measured in the rims of the windows. The noise of smoothed pixels includes faint stars,
+    because the detection threshold depends on it. The correlation is the ratio of the noise of a sum of
+    pixels to that of a sum of independent pixels.
     """
     step = np.abs(np.arange(-windows.half, windows.half + 1))
     rim = np.maximum(step[:, None], step) > radius + 1.0
     mean, variance = _clipped(np.where(windows.good, windows.light, np.inf)[:, rim])
-    # Other stars, or a rim of few counts, falsify the noise of single windows: all windows share the median.
+    # All windows use their median noise, because other stars or low counts falsify the noise of one window.
     common = float(np.sqrt(np.median(variance) + _ROUNDING**2))
     light = np.where(windows.good, windows.light - mean[:, None, None], 0.0)
     smooth = smoothed(light)[:, 1:-1, 1:-1][:, rim[1:-1, 1:-1]]
@@ -484,7 +494,7 @@ def _reach(values: FloatArray) -> float:
 
 
 def _clipped(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the clipped mean and variance (n,), (n,) of each row of `values` (n, k); infinity is ignored."""
+    """Return the clipped mean (n,) and variance (n,) of each row of `values` (n, k); infinity is ignored."""
     level = _median(values)
     apart = np.abs(values - level[:, None])
     kept = apart <= 3.0 * np.maximum(MAD_TO_SIGMA * _median(apart), 0.5)[:, None]
@@ -495,6 +505,6 @@ def _clipped(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _median(values: FloatArray) -> FloatArray:
-    """Return the lower median (n,) of each row of `values` (n, k), in which infinity is ignored."""
+    """Return the lower median (n,) of each row of `values` (n, k); infinity is ignored."""
     count = np.maximum(np.isfinite(values).sum(axis=1), 1)
     return np.asarray(np.sort(values, axis=1)[np.arange(len(values)), (count - 1) // 2])

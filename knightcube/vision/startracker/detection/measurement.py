@@ -1,16 +1,17 @@
-"""Positions and fluxes of stars: by a PSF fit, or by the centre of mass in a window.
+"""Positions and fluxes of stars from a fit of the point spread function (PSF) or from a window's centroid.
 
 `first_look` fits each star alone with a free width, and `frame_spread` derives the PSF and the noise of the
-frame from these fits. `measure` then fits every star with the PSF of the frame, or takes a centroid in a
-window with border subtraction (Michalski eq. 12-21). Equations 14 and 15 as printed end the window one pixel
-too far for the divisor 4 (a - 1) of equation 16e, which counts the border of a x a pixels; here the window
-ends at x_start + a - 1. Equation 20 is y_CM with j (errata).
+frame from these fits. `measure` then fits each star with the PSF of the frame, or computes a centroid in a
+window whose border is subtracted (Michalski, eq. (12) to (21)). The window ends at x_start + a - 1.
+Michalski, eq. (14) and (15), end the window one pixel later, which contradicts the divisor 4 (a - 1) of eq.
+(16e), the number of border pixels of a window of a x a pixels. Michalski, eq. (20), is used as y_CM with j
+(errata).
 
-Three other centroids start from the centre of mass and weigh the pixels differently. `weighted` weighs each
-pixel with its own light (Michalski's reference [22]; most CubeSat star trackers use it). `iterative` uses a
-Gaussian weight that follows the centroid (Stone 1989, Astron. J. 97, 1227; the windowed positions of
-SExtractor). `gaussian` fits a parabola to the logarithm of the light. Each also returns the derivatives of
-the centroid by the pixels, from which its variance follows.
+Three other centroid methods start from the centre of mass and weight the pixels. `weighted` weights each
+pixel with its own counts (Michalski, reference [22]; most CubeSat star trackers use this method). `iterative`
+uses a Gaussian weight that follows the centroid (Stone 1989, Astron. J. 97, 1227, and the windowed positions
+of SExtractor). `gaussian` fits a parabola to the logarithm of the counts. Each method also returns the
+derivatives of the centroid with respect to the pixels, from which the variance of the centroid is computed.
 """
 
 from __future__ import annotations
@@ -42,21 +43,20 @@ FIRST_WIDTH = 1.0
 _HALF_OF_FIRST = 4
 LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
-"""Half width of a window, in sigmas of the PSF; its limits are `LEAST_HALF` and `MOST_HALF`, px."""
+"""Half-width of a window, in standard deviations of the PSF, within `LEAST_HALF` and `MOST_HALF` px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
-# Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the light.
-# A smaller value is needed, because with the first noise model only the wings of bright stars determine the
-# fit.
+# Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the star's counts.
+# It is smaller than in the first fit, so that not only the wings of bright stars determine the fit.
 _NEXT_MISMATCH = 0.02
-# Mismatch that is assumed if no star determines it.
+# Mismatch between PSF and Gaussian that is assumed if no star determines it.
 _UNKNOWN_MISMATCH = 0.02
 _MOST_OF_CELL = 4
-# Number of stars from which the measured width replaces a given one.
+# Number of stars from which the measured width of the PSF replaces a given width.
 _MANY = 8
 _LEAST_LONE = 3
-# Minimum height of a hot pixel, in units of the noise of a pixel.
+# Minimum height of a hot pixel, in standard deviations of a pixel's noise.
 _LEAST_HOT = 10.0
-# Minimum distance (px) between two windows of the first look that do not overlap.
+# Minimum distance (px) between two stars whose windows in the first fit do not overlap.
 _APART = 2 * _HALF_OF_FIRST + 1
 
 
@@ -65,11 +65,11 @@ class Shapes:
     """The first fits of n stars, each with a free width.
 
     Attributes:
-        width: sigma of the Gaussian (n,), px.
-        error: standard deviation of the width (n,), px.
-        hot: whether the star is a hot pixel (n,).
-        fitted: the fits.
-        windows: the windows of the fits.
+        width: standard deviation of the Gaussian fitted to each star (n,), px.
+        error: standard deviation of each fitted width (n,), px.
+        hot: which stars are hot pixels (n,).
+        fitted: results of the fits.
+        windows: windows in which the stars were fitted.
     """
 
     width: FloatArray
@@ -81,19 +81,19 @@ class Shapes:
 
 @dataclass(frozen=True, slots=True)
 class FrameSpread:
-    """The width of the PSF of one frame, px, and the noise of the pixels of its stars."""
+    """The standard deviation of the PSF of one frame, px, and the noise model of the stars' pixels."""
 
     psf_sigma: float
     noise: NoiseModel
 
     @property
     def half(self) -> int:
-        """The half width of the window of a star, px."""
+        """The half-width of the window in which a star is fitted, px."""
         return int(np.clip(np.ceil(REACH * self.psf_sigma), LEAST_HALF, MOST_HALF))
 
 
 def first_look(targets: StarTargets, gain: float | None = None) -> Shapes:
-    """Return the shapes of stars before their PSF is known; `gain` is in electrons per count, if known."""
+    """Return the first fits of stars, before the PSF is known; `gain` is in electrons per count, if known."""
     windows = targets.windows(_HALF_OF_FIRST)
     offset, flux = start(windows)
     width = np.full(len(windows), FIRST_WIDTH)
@@ -102,15 +102,15 @@ def first_look(targets: StarTargets, gain: float | None = None) -> Shapes:
     if gain is not None:
         noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
         fitted = fit(windows, fitted.offset, fitted.flux, width, noise, free_width=True, steps=1)
-    # The errors of the widths include the deviations from a Gaussian that the first noise model assumes.
+    # The errors of the widths include the deviations from a Gaussian that the first noise model allows.
     return Shapes(width, error, single_pixels(windows), fitted, windows)
 
 
 def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) -> FrameSpread:
-    """Return the width of the PSF and the noise from the stars `plain` (n,), a mask; the brightest are first.
+    """Return the width of the PSF and the noise model of a frame, from the stars selected by `plain` (n,).
 
-    A gain in the settings is kept; a width in the settings is kept unless eight stars or more determine it.
-    Without a usable star the width is 1 px and the photon noise 0, unless the settings give them.
+    A gain in the settings is kept. A width in the settings is kept unless at least eight stars determine the
+    width. If no star is usable, the width is 1 px and the photon noise 0, unless the settings state them.
     """
     fitted = shapes.fitted
     certain = fitted.flux > 8.0 * np.sqrt(fitted.covariance[:, FLUX, FLUX])
@@ -131,7 +131,7 @@ def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) 
     alike = telling[np.abs(width - psf_sigma) < np.maximum(3.0 * error, 0.25 * psf_sigma)]
     part, windows = fitted.select(alike), shapes.windows.select(alike)
     noise = _noise_of(part, windows, settings)
-    # A given PSF needs no second fit, which takes half of the time of a tracking frame.
+    # If the PSF is given, the second fit is omitted, because it takes half the time of a tracking frame.
     for _ in range(0 if given else 2):
         part = fit(windows, part.offset, part.flux, part.width, noise, free_width=True, steps=2)
         noise = _noise_of(part, windows, settings)
@@ -154,29 +154,30 @@ def start(windows: StarWindows) -> tuple[FloatArray, FloatArray]:
     whole = np.maximum(core.sum(axis=(1, 2)), 1e-12)
     x = (core[:, :, 2] - core[:, :, 0]).sum(axis=1) / whole
     y = (core[:, 2] - core[:, 0]).sum(axis=1) / whole
-    # These pixels hold three quarters of the light of a star of sigma 1 px; more would include neighbours.
+    # The 3 x 3 pixels contain three quarters of the flux of a star of 1 px standard deviation.
     flux = np.maximum(whole / 0.75, windows.noise)
     return np.clip(np.stack([x, y], axis=-1), -0.6, 0.6), flux
 
 
 def single_pixels(windows: StarWindows) -> BoolArray:
-    """Return which windows (n,) hold hot pixels: one or two bright pixels with dark neighbours."""
+    """Return which windows (n,) show a hot pixel: one or two bright pixels with dark neighbours."""
     h = windows.half
     core = windows.light[:, h - 1 : h + 2, h - 1 : h + 2].reshape(len(windows), 9)
     return np.asarray(are_hot(core.T, windows.noise) & (core.max(axis=1) > _LEAST_HOT * windows.noise))
 
 
 def crowded(middle: IntArray) -> BoolArray:
-    """Return which targets (n,) have another target in their window of the first look."""
+    """Return which stars (n,) have another star in their window of the first fit."""
     apart = np.abs(middle[:, None] - middle).max(axis=-1)
     np.fill_diagonal(apart, _APART)
     return np.asarray(apart.min(axis=1) < _APART)
 
 
 def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return the first four of `chosen` (k,) in each sixteenth of the area that they cover, and weights (k,).
+    """Return at most four of the `chosen` stars in each sixteenth of their area, and weights of these stars.
 
-    Each sixteenth has the same total weight: stars are everywhere, but the leaves of a tree in one corner.
+    Each sixteenth has the same total weight, because stars are everywhere, but foreground sources, such as
+    the leaves of a tree, are in one part of the frame.
     """
     place = middle[chosen] - middle.min(axis=0)
     column, row = (place * 4 // (np.ptp(middle, axis=0) + 1)).T
@@ -194,11 +195,11 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 
 Centroid = tuple[FloatArray, FloatArray]
-"""Positions (n, 2), px, relative to the middle, and their derivatives by pixel (n, 2, m, m), px/count."""
+"""Centroids relative to the middle of the window (n, 2), px, and their derivatives (n, 2, m, m), px/count."""
 
 _ROUNDS = 12
 _STANDS_OUT = 3.0
-"""Minimum light of a pixel whose logarithm is fitted, in standard deviations."""
+"""Minimum counts of a pixel whose logarithm is fitted, in standard deviations."""
 _LEAST = 6
 """Minimum number of pixels for a parabola with four unknowns."""
 _INSIDE = 1.5
@@ -206,7 +207,7 @@ _INSIDE = 1.5
 
 
 def weighted(clean: FloatArray, _: FloatArray, start: Centroid, __: float) -> Centroid:
-    """Return the centres of the squared light (n, m, m)."""
+    """Return the centroids of the squared counts of windows `clean` (n, m, m)."""
     light = np.maximum(clean, 0.0)
     total = np.maximum(np.sum(light * light, axis=(1, 2)), 1e-30)
     places, slopes = [], []
@@ -218,14 +219,14 @@ def weighted(clean: FloatArray, _: FloatArray, start: Centroid, __: float) -> Ce
 
 
 def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: float) -> Centroid:
-    """Return the centres under a Gaussian window that follows them, started at the centre of mass."""
+    """Return centroids with a Gaussian weight that follows the centroid, started at the centre of mass."""
     steps = np.stack([np.broadcast_to(step, clean.shape[1:]) for step in _steps(clean)])
     place, reach = start[0].copy(), (clean.shape[1] - 1) / 2.0
     for _round in range(_ROUNDS + 1):
         off = steps - place[:, :, None, None]
         window = np.exp(-0.5 * np.sum(off * off, axis=1) / psf_sigma**2)
         seen = (window * clean)[:, None]
-        # The derivative of the weighted sum by the position of the window, about half of the weighted light.
+        # `gain` is the derivative of the weighted sum by the position of the weight, about half of the sum.
         gain = np.sum(seen * (1.0 - off * off / psf_sigma**2), axis=(2, 3))
         half = 0.5 * np.sum(seen, axis=(2, 3))
         gain = np.maximum(gain, np.maximum(0.5 * half, 1e-30))
@@ -236,9 +237,9 @@ def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: floa
 
 
 def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float) -> Centroid:
-    """Return the vertices of parabolas through the logarithm of the light.
+    """Return the vertices of parabolas fitted to the logarithm of the counts.
 
-    Where too few pixels exceed the noise, the start is returned.
+    If too few pixels exceed the noise, the initial centroid is returned.
     """
     x, y = (np.broadcast_to(step, clean.shape) for step in _steps(clean))
     used: BoolArray = clean > _STANDS_OUT * np.sqrt(variance)
@@ -247,7 +248,7 @@ def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float)
     columns = np.stack([np.ones_like(x), x, y, -(x * x + y * y)], axis=1).reshape(len(clean), 4, -1)
     weighed = columns * weight.reshape(len(clean), 1, -1)
     normal = weighed @ columns.transpose(0, 2, 1) + 1e-12 * np.eye(4)
-    # The derivatives of the four unknowns by the logarithm of each pixel.
+    # `moved` contains the derivatives of the four unknowns with respect to the logarithm of each pixel.
     moved = np.linalg.solve(normal, weighed)
     found = np.sum(moved * np.log(light).reshape(len(clean), 1, -1), axis=2)
     bend = np.where(found[:, 3] > 0.0, found[:, 3], np.inf)
@@ -270,7 +271,7 @@ METHODS: dict[str, Callable[[FloatArray, FloatArray, Centroid, float], Centroid]
 
 
 def _steps(clean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the pixel positions along x (1, m) and y (m, 1) relative to the middle, px."""
+    """Return the pixel positions along x (1, m) and y (m, 1) relative to the middle of the window, px."""
     half = clean.shape[1] // 2
     step = np.arange(-half, half + 1, dtype=float)
     return step[None, :], step[:, None]
@@ -278,7 +279,7 @@ def _steps(clean: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 _PHASES = np.linspace(-0.45, 0.45, 10)
 _FAINTEST = 1e-3
-"""Noise of a pixel, as a fraction of the star's light, in the simulation of the systematic error."""
+"""Noise of a pixel, as a fraction of the star's flux, in the simulation of the systematic error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -286,10 +287,10 @@ class WindowCentroids:
     """Centroids of n stars in their windows.
 
     Attributes:
-        offset: position relative to the middle pixel (n, 2), px; limited to the window.
-        flux: light within the border of the window (n,), counts.
-        sky: mean of the border (n,), counts per pixel.
-        variance: variance along one axis (n,), px^2, due to the noise and to the finite window.
+        offset: centroids relative to the middle pixel of the window (n, 2), px, limited to the window.
+        flux: sum of the counts inside the border of the window, above the sky (n,).
+        sky: mean of the border of the window (n,), counts per pixel.
+        variance: variance of the centroid along one axis (n,), px^2, due to noise and the finite window.
         flux_variance: variance of the flux (n,), counts^2.
     """
 
@@ -303,9 +304,9 @@ class WindowCentroids:
 def centre_of_mass(
     windows: StarWindows, noise: NoiseModel, psf_sigma: float, method: Method = "window"
 ) -> WindowCentroids:
-    """Return the centroids in `windows` (eq. 12-20) by a method of `METHODS`, or the centre of mass.
+    """Return the centroids in windows by the centre of mass (Michalski, eq. (12) to (20)) or by `METHODS`.
 
-    In a window that the edge of the frame cuts, pixels outside of the frame count as zero.
+    Pixels of a window that are outside the frame count as zero.
     """
     half = windows.half
     offset, flux, sky = _moments(windows.light)
@@ -313,7 +314,7 @@ def centre_of_mass(
     variance = noise.variance(inner - sky[:, None, None], windows.noise)
     offset, slopes = _places(windows.light, variance, psf_sigma, method)
     both = 0.5 * np.sum(variance[:, None] * slopes**2, axis=(1, 2, 3))
-    # The noise of the mean of the border changes the sky level, and so the centre of mass.
+    # The noise of the border's mean changes the sky level, and therefore the centroid.
     border = windows.noise**2 / (8.0 * half)
     area = float(inner[0].size) if len(inner) else 1.0
     both += 0.5 * np.sum(slopes.sum(axis=(2, 3)) ** 2, axis=1) * border
@@ -327,7 +328,7 @@ def centre_of_mass(
 
 
 def _places(window: FloatArray, variance: FloatArray, psf_sigma: float, method: Method) -> Centroid:
-    """Return the centroids of a method and their derivatives by the pixels within the border."""
+    """Return the centroids from a method, and their derivatives by the pixels inside the window's border."""
     offset, flux, sky = _moments(window)
     clean = window[:, 1:-1, 1:-1] - sky[:, None, None]
     half = window.shape[1] // 2
@@ -353,7 +354,7 @@ def _moments(window: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _cut_off(half: int, psf_sigma: float, method: Method) -> float:
-    """Return the rms systematic error (px) of a method over the positions within a pixel, without noise."""
+    """Return the rms systematic error (px) of a centroid method for noiseless stars anywhere in a pixel."""
     place = np.stack([_PHASES, np.zeros_like(_PHASES)], axis=-1)
     stars = light(place, np.full(len(_PHASES), psf_sigma), half)
     places, _ = _places(stars, np.full_like(stars[:, 1:-1, 1:-1], _FAINTEST**2), psf_sigma, method)
@@ -362,7 +363,7 @@ def _cut_off(half: int, psf_sigma: float, method: Method) -> float:
 
 _BLEND_ROUNDS = 5
 _STEPS, _STEPS_SATURATED = 3, 12
-# Minimum standard deviation (px): pixels differ, and no PSF is exactly Gaussian.
+# Minimum standard deviation (px) of a position, because pixels differ and the PSF is not exactly Gaussian.
 _FLOOR = 0.002
 
 
@@ -371,11 +372,11 @@ class MeasuredStars:
     """The measurements of n stars.
 
     Attributes:
-        points: positions (n, 2), px.
-        covariance: of the positions (n, 2, 2), px^2.
-        flux, flux_sigma: light and its standard deviation (n,), counts.
-        sky: residual sky level (n,), counts per pixel.
-        blended: whether the image overlaps with that of another star (n,).
+        points: positions (x, y) of the stars (n, 2), px.
+        covariance: covariances of the positions (n, 2, 2), px^2.
+        flux, flux_sigma: flux and its standard deviation (n,), counts.
+        sky: residual sky level at each star (n,), counts per pixel.
+        blended: which stars overlap with the image of another star (n,).
     """
 
     points: FloatArray
@@ -389,7 +390,7 @@ class MeasuredStars:
 def measure(
     targets: StarTargets, shapes: Shapes, spread: FrameSpread, settings: DetectionSettings
 ) -> MeasuredStars:
-    """Return the stars measured by the method of the settings; saturated stars are always fitted."""
+    """Return the stars measured by the method in the settings; saturated stars are always fitted."""
     parts = [(targets.core == 0.0, False), (targets.core > 0.0, True)]
     count = len(targets)
     out = MeasuredStars(
@@ -423,7 +424,7 @@ def _fitted(
     windows = targets.windows(half)
     offset, flux = start(windows)
     if free_width:
-        # At the rim of the saturated disc the light equals the saturation level.
+        # At the rim of the saturated disc, the star's profile equals the saturation level.
         steep = np.minimum(0.5 * (targets.core / spread.psf_sigma) ** 2, 12.0)
         flux = 2.0 * np.pi * spread.psf_sigma**2 * (targets.ceiling - targets.level) * np.exp(steep)
     else:
@@ -441,7 +442,7 @@ def _fitted(
     freedom = np.maximum(found.used - found.covariance.shape[1], 1)
     excess = found.chi2 / freedom
     excess = np.where(excess > 1.0 + 3.0 * np.sqrt(2.0 / freedom), excess, 1.0) * targets.correlation**2
-    # Overlapping stars share the information of their pixels: the nearer they are, the less each has.
+    # Overlapping stars share the information in their pixels, so a larger overlap increases the covariance.
     excess = excess / (1.0 - pairs.overlap) ** 2
     covariance = found.covariance[:, :2, :2] * excess[:, None, None] + _FLOOR**2 * np.eye(2)
     flux_sigma = _flux_sigma(found, windows, spread.noise) * targets.correlation
@@ -459,9 +460,10 @@ def _shared(
     noise: NoiseModel,
     free_width: bool,
 ) -> PsfFit:
-    """Return `found` with blended stars fitted again, each after the light of its neighbours is subtracted.
+    """Return the fits with blended stars fitted again, each after the light of its neighbours is subtracted.
 
-    The fits start from `begin`, offset (n, 2) and flux (n,): the fit of two stars as one is a bad start.
+    The fits start from `begin`, which contains offsets (n, 2), px, and fluxes (n,), counts, because a fit of
+    two stars as one is a bad start.
     """
     some = np.unique(pairs.first)
     own = windows.select(some)
@@ -476,7 +478,7 @@ def _shared(
 
 
 def _flux_sigma(found: PsfFit, windows: StarWindows, noise: NoiseModel) -> FloatArray:
-    """Return the standard deviation (n,) of the fluxes, counts, due to sky and photon noise only."""
+    """Return the standard deviations (n,) of the fluxes, counts, due to sky noise and photon noise only."""
     flux = np.where(found.flux > 0.0, found.flux, np.inf)[:, None, None]
     seen = np.where(windows.good, found.model / flux, 0.0)
     counted = NoiseModel(noise.photon).variance(found.model, windows.noise)
@@ -486,7 +488,7 @@ def _flux_sigma(found: PsfFit, windows: StarWindows, noise: NoiseModel) -> Float
 def _centred(targets: StarTargets, spread: FrameSpread, settings: DetectionSettings) -> MeasuredStars:
     half = settings.window // 2
     windows = targets.windows(half)
-    # The window is centred on the brightest pixel (text before eq. 12), not on the smoothed peak.
+    # The window is centred on the brightest pixel, as in Michalski (text before eq. (12)).
     core = windows.light[:, half - 1 : half + 2, half - 1 : half + 2].reshape(len(windows), 9)
     row, column = np.divmod(core.argmax(axis=1), 3)
     limits = np.array(targets.pixels.shape)[::-1] - 1

@@ -1,14 +1,16 @@
-"""Stars fitted to their pixels with a Gaussian point spread function (PSF), all stars of a frame at once.
+"""Fit of a Gaussian point spread function (PSF) to the pixels of all stars of a frame at once.
 
-Each star is fitted in a square window: position, flux, residual sky level and, on request, its own width. A
-star that moves over the exposure is the mean of Gaussians along its path (Gauss-Legendre quadrature). The
-Gauss-Newton weights come from the fitted light, not from the counts: otherwise a pixel that happens to be low
-would weigh more, and the flux would be too low. The normal matrices, 4 x 4 or 5 x 5 for each star, are solved
-together.
+For each star, position, flux, residual sky level and optionally the width are fitted in a square window. A
+star that moves during the exposure is modelled as a mean of Gaussians along its path (Gauss-Legendre
+quadrature). The weights of the Gauss-Newton fit are computed from the fitted model, not from the counts.
+Weights from the counts would favour pixels that are low by chance, and the flux would be too low. The normal
+equations of all stars, 4 x 4 or 5 x 5 each, are solved together.
 
-The variance of a pixel is noise^2 + light / gain + (mismatch light)^2: sky, photons, and the difference
-between the PSF and a Gaussian. Where the gain is unknown, gain and mismatch are measured from the residuals
-of the stars: photon noise grows with the light, the mismatch with its square.
+The variance of a pixel is noise^2 + light / gain + (mismatch x light)^2, where light is the star's counts in
+the pixel. The three terms are the sky noise, the photon noise, and the difference between the PSF and a
+Gaussian. If the gain is unknown, gain and mismatch are measured from the residuals of the stars. They can be
+distinguished because the variance of photon noise is proportional to the light, and that of the mismatch to
+the square of the light.
 """
 
 from __future__ import annotations
@@ -26,12 +28,12 @@ class StarWindows:
     """Square windows of k x k pixels around n stars, k = 2 half + 1.
 
     Attributes:
-        middle: column and row of the middle pixel (n, 2).
-        half: half width of the windows, px.
-        light: counts above the sky (n, k, k); 0 outside of the frame; saturated pixels are unchanged.
-        good: which pixels are inside of the frame and not saturated (n, k, k).
-        noise: noise of a pixel without a star (n,), counts.
-        trail: displacement of the star from the beginning to the end of the exposure (n, 2), px.
+        middle: column and row of the middle pixel of each window (n, 2).
+        half: half-width of the windows, px.
+        light: counts above the sky, including saturated pixels (n, k, k); 0 outside the frame.
+        good: which pixels are inside the frame and not saturated (n, k, k).
+        noise: standard deviation of a background pixel in each window (n,), counts.
+        trail: displacement of each star from the beginning to the end of the exposure (n, 2), px.
     """
 
     middle: IntArray
@@ -42,7 +44,7 @@ class StarWindows:
     trail: FloatArray
 
     def select(self, chosen: BoolArray | IntArray) -> StarWindows:
-        """Return the windows that `chosen` picks."""
+        """Return some of the windows, selected by a mask (n,) or by indices (`chosen`)."""
         return select(self, chosen, "half")
 
     def without(self, light: FloatArray) -> StarWindows:
@@ -62,16 +64,16 @@ def cut(
     ceiling: float,
     trail: FloatArray | None = None,
 ) -> StarWindows:
-    """Return the windows around the pixels `middle` (n, 2), which must be inside of the frame.
+    """Return the windows around the pixels `middle` (n, 2), which must be inside the frame.
 
     Args:
-        pixels: frame (rows, columns), counts.
-        middle: columns and rows of the middle pixels (n, 2).
-        half: half width of the windows, px.
-        level: sky background (n,), counts.
-        noise: noise of a pixel without a star (n,), counts.
-        ceiling: pixels of this many counts or more are saturated and not used.
-        trail: displacement of the stars over the exposure (n, 2), px; None: none.
+        pixels: counts of the frame (rows, columns).
+        middle: column and row of the middle pixel of each window (n, 2).
+        half: half-width of the windows, px.
+        level: sky background in each window (n,), counts.
+        noise: standard deviation of a background pixel in each window (n,), counts.
+        ceiling: counts from which a pixel is saturated and not used.
+        trail: displacement of each star during the exposure (n, 2), px; None for no displacement.
     """
     rows, columns = pixels.shape
     step = np.arange(-half, half + 1)
@@ -94,16 +96,16 @@ def smoothed(light: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarTargets:
-    """The pixels around which n stars are measured, with the sky there.
+    """The pixels around which n stars are measured, with the sky background at these pixels.
 
     Attributes:
-        pixels: frame (rows, columns), counts.
-        middle: column and row of each star (n, 2).
-        level, noise: background and noise of a pixel without a star (n,), counts.
+        pixels: counts of the frame (rows, columns).
+        middle: column and row of the pixel around which each star is measured (n, 2).
+        level, noise: level and standard deviation of the sky background at each star (n,), counts.
         ceiling: counts at which pixels saturate.
-        core: radius of the saturated disc (n,), px; 0 if no pixel is saturated.
-        trail: displacement of the star from the beginning to the end of the exposure (n, 2), px.
-        correlation: noise of a sum of pixels relative to that of independent pixels.
+        core: radius of the saturated disc of each star (n,), px; 0 if the star is not saturated.
+        trail: displacement of each star from the beginning to the end of the exposure (n, 2), px.
+        correlation: ratio of the noise of a sum of pixels to that of a sum of independent pixels.
     """
 
     pixels: Image
@@ -121,25 +123,26 @@ class StarTargets:
         return cut(self.pixels, about, half, self.level, self.noise, self.ceiling, self.trail)
 
     def select(self, chosen: BoolArray | IntArray) -> StarTargets:
-        """Return the targets that `chosen` picks."""
+        """Return some of the targets, selected by a mask (n,) or by indices (`chosen`)."""
         return select(self, chosen, "pixels", "ceiling", "correlation")
 
     def __len__(self) -> int:
         return len(self.middle)
 
 
-# Length (px) below which a path counts as a point: it widens a PSF of 1 px by 0.2 %.
+# Length (px) below which a path counts as a point; such a path widens a PSF of 1 px by 0.2 %.
 _SHORTEST = 0.2
-# Number of quadrature nodes: accurate to 1e-3 of the light for paths of four sigmas.
+# Number of quadrature nodes, which are accurate to 0.1 % of the flux for paths of four PSF widths.
 _NODES = 4
 _BELL = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the share (n, k) of a star's light in each of k = 2 half + 1 pixels along one axis.
+    """Return the fraction (n, k) of a star's flux in each of k = 2 half + 1 pixels along one axis.
 
-    Also return its derivatives (n, k) by position and by sigma. `offset` (n,) is the position of the star
-    relative to the centre of the middle pixel, px; `sigma` (n,) is the width of the PSF, px.
+    The second and third value are the derivatives of the fraction (n, k), 1/px, by `offset` and by `sigma`.
+    `offset` (n,) is the position of the star relative to the centre of the middle pixel, px, and `sigma` (n,)
+    is the standard deviation of the PSF, px.
     """
     from scipy.special import ndtr  # noqa: PLC0415 - see `regions.label_pixels`
 
@@ -153,7 +156,11 @@ def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArra
 
 
 def path(trail: FloatArray) -> list[tuple[FloatArray, float]]:
-    """Return positions (n, 2), px, along paths of `trail` (n, 2), relative to the middle, with weights."""
+    """Return the nodes of a quadrature along the paths of n stars, with their weights.
+
+    Each node is the displacement of the stars from the middles of their paths (n, 2), px. The paths have the
+    lengths and directions of `trail` (n, 2), px.
+    """
     if not len(trail) or float(np.abs(trail).max()) < _SHORTEST:
         return [(np.zeros_like(trail), 1.0)]
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
@@ -161,13 +168,13 @@ def path(trail: FloatArray) -> list[tuple[FloatArray, float]]:
 
 
 def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | None = None) -> FloatArray:
-    """Return the share of each star's light in each pixel of its window (n, k, k), rows first.
+    """Return the fraction of each star's flux in each pixel of its window (n, k, k), rows first.
 
     Args:
-        offset: position relative to the centre of the middle pixel (n, 2), px.
-        sigma: width of the PSF (n,), px.
-        half: half width of the window, px.
-        trail: displacement of the star over the exposure (n, 2), px; None: none.
+        offset: position of each star relative to the centre of the middle pixel (n, 2), px.
+        sigma: standard deviation of the PSF of each star (n,), px.
+        half: half-width of the windows, px.
+        trail: displacement of each star during the exposure (n, 2), px; None for no displacement.
     """
     out = np.zeros((len(offset), 2 * half + 1, 2 * half + 1))
     for shift, share in path(np.zeros_like(offset) if trail is None else trail):
@@ -177,7 +184,7 @@ def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | 
     return out
 
 
-# Residual that a wrong PSF may cause, as a fraction of the star's light in the pixel.
+# Residual that a wrong PSF may cause, as a fraction of the star's counts in the pixel.
 _TOLERATED = 0.25
 _LEAST_PIXELS = 40
 _ROUNDS = 3
@@ -185,18 +192,18 @@ _ROUNDS = 3
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """The noise of a pixel with the light of a star.
+    """The noise model of pixels that contain the light of a star.
 
     Attributes:
-        photon: photon noise, counts^2 per count of light (1/gain).
-        mismatch: difference between the PSF and a Gaussian, as a fraction of the light.
+        photon: variance of the photon noise per count of light, counts (the reciprocal of the gain).
+        mismatch: difference between the PSF and a Gaussian, as a fraction of the star's counts.
     """
 
     photon: float = 0.0
     mismatch: float = 0.0
 
     def variance(self, light: FloatArray, noise: FloatArray) -> FloatArray:
-        """Return the variance (n, k, k), counts^2, of pixels with `light` (n, k, k) and sky `noise` (n,)."""
+        """Return the variances of pixels with `light` (n, k, k), counts, and sky `noise` (n,), counts."""
         seen = np.maximum(light, 0.0)
         return np.asarray((noise**2)[:, None, None] + self.photon * seen + (self.mismatch * seen) ** 2)
 
@@ -209,17 +216,17 @@ def measure_noise(
     noise: FloatArray,
     gain: float | None,
 ) -> NoiseModel:
-    """Return the noise model from the residuals of a fit; a given `gain` is kept.
+    """Return the noise model from the residuals of a fit of stars; if the gain is given, it is kept.
 
-    This is a non-negative least-squares fit of residual^2 - noise^2 by light and light^2, weighted with the
-    variance of the square of a normal residual.
+    A non-negative least-squares fit models residual^2 - noise^2 as a sum of multiples of light and light^2.
+    Its weights are the reciprocal variances of the square of a normal residual.
 
     Args:
         residual: residuals of the fit (n, k, k), counts.
-        variance: their assumed variance (n, k, k), counts^2; infinite for unused pixels.
-        leverage: part of the variance of each residual that the fit absorbed (n, k, k).
-        light: fitted light of the stars (n, k, k), counts.
-        noise: noise of a pixel without a star (n,), counts.
+        variance: assumed variances of the residuals (n, k, k), counts^2; infinite for unused pixels.
+        leverage: fraction of the variance of each residual that the fit has absorbed (n, k, k).
+        light: fitted counts of the stars (n, k, k).
+        noise: standard deviation of a background pixel in each window (n,), counts.
         gain: electrons per count, if known.
     """
     used = np.isfinite(variance) & (light > 0.5 * noise[:, None, None]) & (leverage < 0.8)
@@ -235,7 +242,7 @@ def measure_noise(
     for _ in range(_ROUNDS):
         expected = floor + photon * m + square * m * m
         weight = 1.0 / expected**2
-        # Residuals beyond 5 sigma of the present model are ignored: neighbours and hot pixels.
+        # Residuals beyond 5 standard deviations are ignored, because they are neighbours or hot pixels.
         weight = np.where(excess < 25.0 * expected, weight, 0.0) if square or photon else weight
         photon, square = _non_negative(m, excess, weight)
     return NoiseModel(photon, float(np.sqrt(square)))
@@ -249,9 +256,10 @@ def _shared_mismatch(
     used: BoolArray,
     photon: float,
 ) -> float:
-    """Return the mismatch as the weighted median over the stars, for a known photon noise.
+    """Return the mismatch between PSF and Gaussian as a weighted median over the stars.
 
-    A wrong PSF affects all stars alike; the light of a neighbour, which is not a mismatch, affects a few.
+    The photon noise is known. The median is used because a wrong PSF affects all stars, but the light of
+    neighbouring stars affects only a few.
     """
     m = np.where(used, light, 0.0)
     floor = np.broadcast_to((noise**2)[:, None, None], light.shape)
@@ -269,7 +277,7 @@ def _shared_mismatch(
 
 
 def _non_negative(m: FloatArray, excess: FloatArray, weight: FloatArray) -> tuple[float, float]:
-    """Return the non-negative least-squares coefficients of `excess` by m and m^2."""
+    """Return the non-negative coefficients a, b of the weighted least-squares fit excess = a m + b m^2."""
     first, second, third = (float(np.sum(weight * m**power)) for power in (2, 3, 4))
     along, square = float(np.sum(weight * excess * m)), float(np.sum(weight * excess * m * m))
     determinant = first * third - second**2
@@ -287,13 +295,13 @@ def _non_negative(m: FloatArray, excess: FloatArray, weight: FloatArray) -> tupl
 
 X, Y, FLUX, SKY, WIDTH = range(5)
 NARROWEST, WIDEST = 0.25, 6.0
-# Maximum steps of position and width (px): a start one pixel off must not diverge.
+# Maximum steps of position and of width (px), which keep fits from diverging if the start is 1 px off.
 _LONGEST_STEP = 0.7
 _WIDEST_STEP = 0.35
-# Residuals (sigmas) beyond which a pixel is excluded, and the number of last steps in which this is done.
+# Residual (standard deviations) above which a pixel is excluded, and number of final steps that do so.
 _CLIP = 6.0
 _CLIP_FROM_END = 1
-# Regularisation of the scaled normal matrix: a star without information keeps its position.
+# Regularisation of the scaled normal matrix, so that a star without information keeps its position.
 _RIDGE = 1e-9
 
 
@@ -302,15 +310,16 @@ class PsfFit:
     """The fits of n stars in their windows.
 
     Attributes:
-        offset: position relative to the middle of the window (n, 2), px.
-        flux: counts (n,).
-        sky: residual sky level, counts per pixel (n,).
-        width: sigma of the Gaussian (n,), px.
-        covariance: of x, y, flux and sky, and of the width if it was free (n, p, p).
-        chi2: sum of the squared residuals over their variance (n,).
-        used: number of pixels used (n,).
-        residual, variance, leverage: of each pixel (n, k, k); the variance of an unused pixel is infinite.
-        model: light of the star alone (n, k, k), counts.
+        offset: position of each star relative to the middle of its window (n, 2), px.
+        flux: flux of each star (n,), counts.
+        sky: residual sky level at each star (n,), counts per pixel.
+        width: standard deviation of each star's Gaussian (n,), px.
+        covariance: covariance of x, y, flux and sky, and of the width if it was fitted (n, p, p).
+        chi2: chi-square of each fit (n,).
+        used: number of pixels used in each fit (n,).
+        residual, leverage: residual, counts, and leverage of each pixel (n, k, k).
+        variance: assumed variance of each pixel (n, k, k), counts^2; infinite for unused pixels.
+        model: fitted counts of the star without sky (n, k, k).
     """
 
     offset: FloatArray
@@ -326,11 +335,11 @@ class PsfFit:
     model: FloatArray
 
     def select(self, chosen: IntArray) -> PsfFit:
-        """Return the stars `chosen` (k,) by number."""
+        """Return the fits of the stars with the indices `chosen` (k,)."""
         return select(self, chosen)
 
     def replaced(self, chosen: IntArray, part: PsfFit) -> PsfFit:
-        """Return these fits with the stars `chosen` (k,) replaced by `part`."""
+        """Return the fits with those of the stars `chosen` (k,) replaced by the fits in `part`."""
         out = {item.name: getattr(self, item.name).copy() for item in fields(self)}
         for name, values in out.items():
             values[chosen] = getattr(part, name)
@@ -352,8 +361,8 @@ def fit(
         windows: windows around the stars.
         offset: initial positions relative to the middle of the window (n, 2), px.
         flux: initial fluxes (n,), counts.
-        width: initial widths (n,), px.
-        noise: noise of the pixels.
+        width: initial standard deviations of the Gaussians (n,), px.
+        noise: noise model of the pixels.
         free_width: whether the width of each star is fitted.
         steps: number of Gauss-Newton steps.
     """
@@ -365,7 +374,7 @@ def fit(
         variance = noise.variance(star, windows.noise)
         good = windows.good
         if step >= steps - _CLIP_FROM_END:
-            # The limit tolerates PSFs that are not Gaussian.
+            # The limit of the residuals tolerates PSFs that are not Gaussian.
             good = good & ~(residual * residual > _CLIP**2 * (variance + (_TOLERATED * star) ** 2))
         weight = (good / variance).reshape(len(values), -1)
         weighted = jacobian * weight[:, None, :]
@@ -391,7 +400,7 @@ def fit(
 
 
 def _jacobian(values: FloatArray, windows: StarWindows, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the light (n, k, k) of the stars and its derivatives (n, count, k k)."""
+    """Return the modelled counts of the stars (n, k, k), and their derivatives (n, count, k k)."""
     total: FloatArray | None = None
     flux, size = values[:, FLUX, None], 2 * windows.half + 1
     for shift, share in path(windows.trail):
@@ -412,7 +421,7 @@ def _jacobian(values: FloatArray, windows: StarWindows, count: int) -> tuple[Flo
 
 
 def _advance(values: FloatArray, step: FloatArray, half: int) -> None:
-    """Change `values` (n, 5) in place by `step` (n, p), limited to the maximum step."""
+    """Add `step` (n, p), limited to the maximum step, in place to the parameters `values` (n, 5)."""
     step[:, :2] = np.clip(step[:, :2], -_LONGEST_STEP, _LONGEST_STEP)
     if step.shape[1] > WIDTH:
         step[:, WIDTH] = np.clip(step[:, WIDTH], -_WIDEST_STEP, _WIDEST_STEP)
@@ -422,13 +431,13 @@ def _advance(values: FloatArray, step: FloatArray, half: int) -> None:
 
 
 def _inverse(normal: FloatArray) -> FloatArray:
-    """Return the inverses of normal matrices (n, p, p), which are scaled to a unit diagonal meanwhile."""
+    """Return the inverses of normal matrices (n, p, p), computed after scaling to a unit diagonal."""
     scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-30))
     outer = scale[:, :, None] * scale[:, None, :]
     return np.asarray(np.linalg.inv(normal / outer + _RIDGE * np.eye(normal.shape[1])) / outer)
 
 
-# Distance (PSF sigmas) beyond a window's edge from which a neighbour contributes no light to it.
+# Distance of a star from a window's edge, in PSF standard deviations, beyond which its light is neglected.
 _BEYOND = 3.0
 _MOST_OVERLAP = 0.8
 _LEAST_OVERLAP = 0.01
@@ -436,11 +445,11 @@ _LEAST_OVERLAP = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Ordered pairs of stars whose light overlaps.
+    """Ordered pairs of stars of which the second contributes light to the window of the first.
 
     Attributes:
-        first, second: numbers of stars (p,), (p,); the second sends light into the window of the first.
-        overlap: largest overlap of each star with a neighbour (n,), 0 to 1.
+        first, second: indices of the first and of the second star of each pair (p,).
+        overlap: largest overlap of each star with a neighbour (n,), between 0 and 1.
     """
 
     first: IntArray
@@ -449,10 +458,10 @@ class Pairs:
 
 
 def neighbours(points: FloatArray, flux: FloatArray, psf_sigma: float, half: int) -> Pairs:
-    """Return which of the stars at `points` (n, 2) px send light into the window of another star.
+    """Return the pairs of stars at `points` (n, 2), px, of which one contributes light to the other's window.
 
-    The overlap of two images at the distance d is exp(-d^2 / 4 sigma^2); it is 0 for an isolated star and
-    where it is below 1 %.
+    The overlap of two star images at the distance d is exp(-d^2 / 4 sigma^2), where sigma is the standard
+    deviation of the PSF. An overlap below 1 % is set to 0.
     """
     apart = points[:, None] - points
     reach = half + _BEYOND * psf_sigma
@@ -474,10 +483,15 @@ def neighbour_light(
     flux: FloatArray,
     width: FloatArray,
 ) -> FloatArray:
-    """Return the light (n, k, k), counts, of all neighbours in the window of each star.
+    """Return the counts of all neighbours in the window of each star (n, k, k).
 
-    The stars are at `offset` (n, 2) px from the middle pixels `middle` (n, 2) of their windows, with `flux`
-    (n,), counts, and `width` (n,), px.
+    Args:
+        pairs: pairs of a star and a neighbour.
+        windows: windows around the stars.
+        middle: column and row of the middle pixel of each window (n, 2).
+        offset: position of each star relative to the middle pixel (n, 2), px.
+        flux: flux of each star (n,), counts.
+        width: standard deviation of each star's Gaussian (n,), px.
     """
     size = 2 * windows.half + 1
     out = np.zeros((len(middle), size, size))

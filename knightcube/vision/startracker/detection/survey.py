@@ -1,12 +1,12 @@
-"""The survey of a frame: its sky background, the areas above the noise, and whether they are streaks.
+"""The survey of a frame: the sky background, the areas above the noise, and whether they are streaks.
 
-`survey` smooths the frame, finds the pixels above the noise and joins them into areas. The shapes of the
-brightest areas distinguish a frame of points from a frame of streaks.
+`survey` smooths the frame, finds the pixels above the noise and joins them into connected areas. The shapes
+of the brightest areas distinguish a frame of points from a frame of streaks.
 
-The smoothing kernel is [1 2 1] along rows and columns, nearly the matched filter for a star of sigma 0.7 to
-1.5 px. The noise of the smoothed frame is measured in the smoothed frame: demosaicing and JPEG correlate
-pixels, and a threshold derived from single pixels would pass thousands of peaks. The frame is processed in
-bands of rows that fit into the processor cache; no second image of its size is allocated.
+The smoothing kernel is [1 2 1] along rows and columns, which is nearly the matched filter for a star of 0.7
+to 1.5 px standard deviation. The threshold is derived from the noise of the smoothed frame. Demosaicing and
+JPEG correlate pixels, so that a threshold derived from the noise of single pixels would pass thousands of
+peaks. The frame is processed in bands of rows that fit into the processor cache, without a copy of the frame.
 """
 
 from __future__ import annotations
@@ -31,32 +31,37 @@ from knightcube.vision.frame import (
 )
 
 KERNEL_NORM = 6.0
-"""Noise of the smoothed frame for white noise of 1: the root of the sum of squares of the kernel."""
+"""Noise of the smoothed frame for white noise of 1, which is the root sum square of the kernel."""
 LEAST_SIDE = 16
-# Noise (counts) to which a frame of floating-point numbers is scaled.
+# Noise (counts) to which a floating-point frame is scaled.
 _FLOATING_NOISE = 16.0
 _BAND = 32
 _SKY_BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
 TAIL_PART = 0.97725
-"""Share of a normal distribution below two standard deviations."""
-# Ratio below which a correlation of pixels is attributed to chance and to the faintest stars.
+"""Fraction of a normal distribution that lies below the mean plus two standard deviations."""
+# Noise ratio below which a correlation of pixels is attributed to chance and to the faintest stars.
 _CORRELATED = 1.05
-# Ratio of the lower tail of the noise to two standard deviations, below which it is clipped at zero counts.
+# Ratio of the noise's lower tail to two standard deviations below which the noise counts as clipped at zero.
 _CUT_OFF = 0.8
-# Noise (counts) below which quantisation hides it.
+# Noise (counts) that is too small to be measured because of quantisation.
 _HIDDEN = 0.5
 _ROUNDING = 12.0**-0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A surface over a frame of `shape`: `values` (down, across) at block centres, bilinear between them."""
+    """A bilinear surface over a frame.
+
+    Attributes:
+        values: values at the centres of the blocks of the frame (down, across).
+        shape: rows and columns of the frame.
+    """
 
     values: FloatArray
     shape: tuple[int, int]
 
     def at(self, column: npt.ArrayLike, row: npt.ArrayLike) -> FloatArray:
-        """Return the values (n,) at pixels `column` (n,), `row` (n,)."""
+        """Return the values of the surface (n,) at the pixels `column` (n,), `row` (n,)."""
         top, down = place_among_blocks(np.asarray(row, dtype=float), self.shape[0], self.values.shape[0])
         left, across = place_among_blocks(
             np.asarray(column, dtype=float), self.shape[1], self.values.shape[1]
@@ -68,7 +73,7 @@ class Surface:
         return np.asarray(high * (1.0 - down) + low * down)
 
     def factors(self) -> tuple[Float32Array, Float32Array]:
-        """Return (rows, down) and (down, columns), whose product is the whole frame."""
+        """Return two matrices (rows, down), (down, columns) whose product is the surface at every pixel."""
         down, across = (
             interpolation_weights(pixels, blocks)
             for pixels, blocks in zip(self.shape, self.values.shape, strict=True)
@@ -82,10 +87,10 @@ class SkyBackground:
 
     Attributes:
         level, noise: background and noise of single pixels, counts; the noise includes faint stars.
-        pixel_noise: noise of a pixel without a star, counts.
-        smooth_level, smooth_noise: background and noise of the smoothed frame (kernel of sum 16), including
-            faint stars.
-        correlation: noise of a sum of pixels relative to that of independent pixels; 1 or more.
+        pixel_noise: noise of a single pixel without faint stars, counts.
+        smooth_level, smooth_noise: background and noise of the smoothed frame (kernel of sum 16), counts; the
+            noise includes faint stars.
+        correlation: ratio of the noise of a sum of pixels to that of a sum of independent pixels; 1 or more.
     """
 
     level: Surface
@@ -98,11 +103,11 @@ class SkyBackground:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BrightPixels:
-    """The pixels (m,) of the smoothed frame above the noise, row by row.
+    """The m pixels of the smoothed frame that are above the noise.
 
     Attributes:
-        index: numbers of the pixels in the flattened frame, increasing.
-        smooth: counts of the smoothed frame above its background.
+        index: increasing indices of the pixels in the flattened frame (m,).
+        smooth: counts of the smoothed frame above the background (m,).
         shape: rows and columns of the frame.
     """
 
@@ -112,10 +117,10 @@ class BrightPixels:
 
 
 def in_counts(pixels: Image) -> tuple[Image, float]:
-    """Return `pixels` (rows, columns) scaled to counts, and the size of one count in the original unit.
+    """Return a frame (rows, columns) scaled to counts, and the size of one count in the original unit.
 
-    Integer frames are returned unchanged. Raises ValueError unless the frame is finite, of real numbers, and
-    16 x 16 pixels or larger.
+    Integer frames are returned unchanged. Raises ValueError unless the pixels are finite real numbers and the
+    frame has at least 16 x 16 pixels.
     """
     if pixels.ndim != 2 or min(pixels.shape) < LEAST_SIDE:
         raise ValueError(f"a frame of shape {pixels.shape}: give (rows, columns), {LEAST_SIDE} or more each")
@@ -133,21 +138,21 @@ def in_counts(pixels: Image) -> tuple[Image, float]:
 
 
 def measure_sky(pixels: Image) -> SkyBackground:
-    """Return background and noise of `pixels` (rows, columns), for single pixels and the smoothed frame."""
+    """Return the sky background and noise of a frame (rows, columns), before and after smoothing."""
     shape = (pixels.shape[0], pixels.shape[1])
     single = estimate_background(pixels, _SKY_BLOCK, _SINGLE_STRIDE)
     level = Surface(single.level, shape)
     row, column = np.arange(2, shape[0] - 1, _STRIDE), np.arange(2, shape[1] - 1, _STRIDE)
     sample = _smoothed_at(pixels, row, column)
     smooth = estimate_background(sample, _SKY_BLOCK // _STRIDE, 1)
-    # Rounding to whole counts is noise, even of a sky that is zero everywhere.
+    # Rounding to whole counts causes noise even if the sky is zero everywhere.
     smooth_noise = np.maximum(smooth.noise, KERNEL_NORM * _ROUNDING)
     lone = pixels[2::_STRIDE, 2::_STRIDE].astype(np.float32)
     tail, cut_off = _tails(lone, single.level, single.noise)
     smooth_tail, _ = _tails(sample, smooth.level, smooth_noise)
     noise, smooth_noise_up = single.noise * tail, smooth_noise * smooth_tail
-    # Faint stars widen the upper tail, mostly of sums of pixels, but do not add noise to star positions.
-    # The upper tail determines the noise only if the lower tail is clipped at zero.
+    # Faint stars widen the upper tail of the noise, but do not add noise to the positions of stars.
+    # The upper tail determines the noise of a pixel only if the lower tail is clipped at zero.
     own, own_smooth = np.where(cut_off, noise, single.noise), np.where(cut_off, smooth_noise_up, smooth_noise)
     return SkyBackground(
         level,
@@ -160,16 +165,16 @@ def measure_sky(pixels: Image) -> SkyBackground:
 
 
 def correlation_of(smooth: float, single: float) -> float:
-    """Return the noise of a sum of pixels relative to that of independent pixels, 1 or more.
+    """Return the ratio of the noise of a sum of pixels to that of a sum of independent pixels, 1 or more.
 
-    `smooth` is the noise of the smoothed frame, `single` the noise of single pixels, counts.
+    `smooth` is the noise of the smoothed frame, counts, and `single` is the noise of single pixels, counts.
     """
     ratio = smooth / (KERNEL_NORM * single)
     return ratio if ratio > _CORRELATED else 1.0
 
 
 def one_sided(reach: FloatArray, noise: FloatArray) -> BoolArray:
-    """Return where a noise (n,) is clipped at zero counts or hidden by quantisation, as a mask (n,).
+    """Return which noise values (n,) are unreliable because of clipping at zero counts or quantisation.
 
     `reach` (n,) is the distance from the median to the lower 2.3rd percentile, counts.
     """
@@ -177,10 +182,10 @@ def one_sided(reach: FloatArray, noise: FloatArray) -> BoolArray:
 
 
 def without_hot_pixels(pixels: Image, most: int) -> Image:
-    """Return `pixels` (rows, columns) with hot pixels replaced, if there are more of them than `most`.
+    """Return a frame (rows, columns) with hot pixels replaced, if the frame has more than `most` hot pixels.
 
-    A few hot pixels are kept: they are measured and flagged. The thousands of a damaged sensor would displace
-    all stars from the list and raise the noise.
+    A few hot pixels are kept, because they are measured as sources and flagged. Thousands of hot pixels of a
+    damaged sensor would replace all stars in the list of sources and increase the noise.
     """
     single = estimate_background(pixels, _SKY_BLOCK, _SINGLE_STRIDE)
     signal = pixels - single.map(single.level)
@@ -196,7 +201,7 @@ def without_hot_pixels(pixels: Image, most: int) -> Image:
 
 
 def find_bright(pixels: Image, sky: SkyBackground, sigmas: float) -> BrightPixels:
-    """Return the pixels of the smoothed frame that exceed its background by `sigmas` times its noise."""
+    """Return the pixels of the smoothed frame that exceed the background by `sigmas` standard deviations."""
     rows, columns = pixels.shape
     limit = Surface(sky.smooth_level.values + sigmas * sky.smooth_noise.values, (rows, columns))
     down, across = limit.factors()
@@ -220,7 +225,7 @@ def find_bright(pixels: Image, sky: SkyBackground, sigmas: float) -> BrightPixel
         np.matmul(down[first : first + count], across, out=bound)
         above = np.flatnonzero(smooth > bound)
         row, column = np.divmod(above, columns - 2)
-        # The last band may begin before its predecessor's end.
+        # The last band may overlap the previous band.
         place = (row + first) * columns + column + 1
         new = slice(0, None) if not places or not len(places[-1]) else place > places[-1][-1]
         places.append(place[new])
@@ -231,7 +236,7 @@ def find_bright(pixels: Image, sky: SkyBackground, sigmas: float) -> BrightPixel
 
 
 def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array:
-    """Return the smoothed frame (r, c) at the evenly spaced rows `row` (r,) and columns `column` (c,)."""
+    """Return the smoothed frame at evenly spaced rows (r,) and columns (c,), as (r, c)."""
     total = np.zeros((len(row), len(column)), dtype=np.float32)
     for dy in (-1, 0, 1):
         rows = slice(row[0] + dy, row[-1] + dy + 1, _STRIDE)
@@ -242,12 +247,13 @@ def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array
 
 
 def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the upper tail of each block's noise relative to a normal distribution, and where it is clipped.
+    """Return each block's upper noise tail relative to a normal distribution, and where noise is clipped.
 
-    2.3 % of the pixels of a block should exceed twice its noise, upwards and downwards. A sky that is clipped
-    at zero counts has noise on one side only, and its moments underestimate the noise. Each block takes the
-    median of the 3 x 3 blocks around it: the texture of a foreground has a long tail, but the sky beside it
-    does not, and a few stars hardly change the median. The relative tail is 1 or more.
+    In a normal distribution, 2.3 % of the pixels of a block exceed the mean by more than two standard
+    deviations, and 2.3 % fall below it by more than two. If a sky is clipped at zero counts, its moments
+    underestimate the noise. Each block uses the median of the 3 x 3 blocks around it, because a textured
+    foreground has a long tail while the sky beside it has not, and a few stars hardly change the median. The
+    relative tail is at least 1.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
@@ -273,21 +279,21 @@ CENTROIDS: tuple[Method, ...] = get_args(Method)
 
 @dataclass(frozen=True, slots=True)
 class DetectionSettings:
-    """Settings of star detection; the defaults suit a camera of which nothing is known.
+    """Settings of star detection; the defaults suit an unknown camera.
 
     Attributes:
-        method: `psf` fits the point spread function, `window` takes the centre of mass (eq. 12-21), and the
-            other methods weigh the pixels of the window differently (`measurement`).
-        threshold_sigmas: minimum height of a peak of the smoothed frame, in units of its measured noise.
-        most_stars: maximum number of stars, the brightest; the number from any sixteenth of the frame is
-            limited to a quarter of it.
-        psf_sigma: width of the PSF, px. None: measured from the frame, which needs several stars; give it for
-            tracking windows with few stars.
-        gain: electrons per count. None: measured from the residuals of the stars.
-        saturation: counts at which a pixel saturates. None: the highest count of the frame if several pixels
-            share it, otherwise the maximum of the integer type.
-        window: side length of the centroid window, px, odd (a_ROI of eq. 12-15).
-        search_radius: radius around a prediction in which `measure_near` searches, px.
+        method: `psf` fits the point spread function (PSF), `window` computes the centre of mass (Michalski,
+            eq. (12) to (21)), and the other methods weight the pixels of the window (`measurement`).
+        threshold_sigmas: minimum height of a peak in the smoothed frame, in standard deviations of its noise.
+        most_stars: maximum number of stars, the brightest first. Each sixteenth of the frame contributes at
+            most a quarter of this number.
+        psf_sigma: standard deviation of the PSF, px. None means that it is measured in the frame, which needs
+            several stars. State the value for tracking windows with few stars.
+        gain: electrons per count; None means that it is measured from the residuals of the stars.
+        saturation: counts at which a pixel saturates. None means the highest count of the frame if several
+            pixels have it, otherwise the maximum of the integer type.
+        window: side length of the centroid window, px, an odd number (a_ROI in Michalski, eq. (12) to (15)).
+        search_radius: radius around a predicted position in which `measure_near` searches, px.
     """
 
     method: Method = "psf"
@@ -317,7 +323,7 @@ class DetectionSettings:
             raise ValueError(f"window = {self.window!r}: give an odd number of pixels, 5 .. 31")
 
     def in_units_of(self, unit: float) -> DetectionSettings:
-        """Return the settings for a frame whose counts were divided by `unit`."""
+        """Return the settings converted to a frame whose pixel values were divided by `unit`."""
         if unit == 1.0:
             return self
         saturation = None if self.saturation is None else self.saturation / unit
@@ -328,7 +334,7 @@ _BLOCK = 32
 
 
 class FrameKind(Enum):
-    """The content of a frame: stars at rest, stars drawn out to streaks, or neither."""
+    """The kind of a frame: stars are points, stars are streaks, or neither."""
 
     POINTS = "points"
     STREAKS = "streaks"
@@ -337,7 +343,7 @@ class FrameKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameShape:
-    """The kind of a frame, and the median length of its streaks, px (about 0 for points)."""
+    """The kind of a frame, and the median length of its streaks or points (about 0), px."""
 
     kind: FrameKind
     length: float
@@ -348,18 +354,18 @@ class Areas:
     """The n connected areas of bright pixels of a frame, and their m pixels.
 
     Attributes:
-        row, column: position of each pixel (m,).
-        owner: number of the area of each pixel (m,).
-        smooth: counts of the smoothed frame above its background at each pixel (m,).
-        peak: whether no neighbour of the pixel is higher (m,).
-        saturated: whether the pixel is saturated (m,).
+        row, column: row and column of each pixel (m,).
+        owner: index of the area of each pixel (m,).
+        smooth: counts of the smoothed frame above the background at each pixel (m,).
+        peak: which pixels are local maxima of the smoothed frame (m,).
+        saturated: which pixels are saturated (m,).
         ceiling: counts at which pixels saturate; infinite if unknown.
         pixels: number of pixels of each area (n,).
-        flux: sum of the counts above the background (n,).
-        centre: centre of light (n, 2), px.
-        length: length of a uniform line with the moments of the area, without the PSF (n,), px.
-        thickness: rms width across that line (n,), px.
-        direction: angle of that line to the rows (n,), rad.
+        flux: sum of the counts above the background of each area (n,).
+        centre: centroid of each area (n, 2), px.
+        length: length of the uniform line with the same moments as each area, without the PSF (n,), px.
+        thickness: rms width of each area across its line (n,), px.
+        direction: angle between the line of each area and the rows (n,), rad.
         shape: rows and columns of the frame.
     """
 
@@ -383,7 +389,7 @@ class Areas:
 
 
 def find_areas(pixels: Image, sky: SkyBackground, bright: BrightPixels, saturation: float | None) -> Areas:
-    """Return the 8-connected areas of `bright` pixels, with the moments of `pixels` above the background."""
+    """Return the 8-connected areas of bright pixels, with moments of the counts above the background."""
     owner, count = label_pixels(bright.index, bright.shape[1])
     row, column = np.divmod(bright.index, bright.shape[1])
     counts = pixels[row, column].astype(np.float64)
@@ -409,10 +415,10 @@ def find_areas(pixels: Image, sky: SkyBackground, bright: BrightPixels, saturati
 
 
 def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
-    """Return which pixels `place` (p, 2) lie in a 32 px block of which areas fill more than `share`.
+    """Return which pixels `place` (p, 2) are in a block of 32 x 32 px with a large fraction of bright pixels.
 
-    Blocks shifted by half a block in each direction are tested too, so that the result does not depend on
-    where the blocks begin.
+    The fraction of bright pixels is large if it exceeds `share`. Blocks that are displaced by half a block
+    along rows and columns are tested too, so that the result does not depend on where the blocks begin.
     """
     down, across = areas.shape[0] // _BLOCK + 2, areas.shape[1] // _BLOCK + 2
     found = np.zeros(len(place), dtype=bool)
@@ -426,11 +432,11 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
 
 
 def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArray:
-    """Return which pixels (m,) are higher than all adjacent pixels; of equal neighbours, the last one is.
+    """Return which bright pixels (m,) are local maxima; of equal neighbours, only the last pixel is one.
 
-    `index` (m,) are the increasing flat numbers of the pixels. Pixels below the noise threshold are lower
-    than those above it. The outermost columns hold no bright pixel, so pixels at opposite borders of the
-    frame are never compared.
+    `index` (m,) contains the increasing indices of the pixels in the flattened frame. Pixels that are not in
+    `index` are below the noise threshold and never exceed a bright pixel. The outermost columns never contain
+    bright pixels, so pixels at opposite borders of the frame are never compared.
     """
     pairs = []
     for step in (1, columns - 1, columns, columns + 1):
@@ -445,8 +451,7 @@ def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArra
     return best
 
 
-# Number of the brightest areas that decide between points and streaks.
-# A rotation streaks all stars except near its axis.
+# Number of areas, the brightest first, from which a frame is classified as points or streaks.
 _LOOKED_AT = 20
 _LEAST_PIXELS = 4
 _SHORTEST_STREAK = 5.0
@@ -455,7 +460,7 @@ _LEAST_STREAKS = 4
 _STREAKED_PART = 0.4
 _ROUND = 3.0
 _THICKEST = 6.0
-# Maximum median sine between streaks and the flow of one rotation; lines of a foreground exceed it.
+# Maximum median sine of the angle between streaks and the flow of one rotation; foreground lines exceed it.
 _CROOKED = 0.12
 
 
@@ -465,7 +470,11 @@ def is_streak(areas: Areas) -> BoolArray:
 
 
 def frame_shape(areas: Areas) -> FrameShape:
-    """Return the kind of the frame: streaks if four, and 40 % of the brightest areas, are streaks."""
+    """Return the kind of a frame.
+
+    The kind is STREAKS if at least four, and at least 40 %, of the brightest areas are streaks that follow
+    one rotation of the camera.
+    """
     chosen = np.argsort(-areas.flux, kind="stable")[: 3 * _LOOKED_AT]
     usable = (areas.pixels[chosen] >= _LEAST_PIXELS) & (areas.thickness[chosen] < _THICKEST)
     chosen = chosen[usable][:_LOOKED_AT]
@@ -484,11 +493,12 @@ def frame_shape(areas: Areas) -> FrameShape:
 
 
 def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
-    """Return whether lines at `centre` (n, 2) px, `direction` (n,) rad, follow one rotation of the camera.
+    """Return whether lines follow one rotation, from `centre` (n, 2), px, and `direction` (n,), rad.
 
-    Near the boresight the flow of a rotation is t + w (-y, x), and lines that follow it have no component of
-    it along their normals. The best t and w are the smallest right singular vector of the products of the
-    normals with the flow.
+    Near the boresight, a rotation displaces the image at (x, y) by t + w (-y, x), with a vector t and a
+    number w. The flow has no component along the normal of a line that follows it. The best t and w are the
+    right singular vector with the smallest singular value of the matrix that maps t and w to the normal
+    components.
     """
     middle = centre.mean(axis=0)
     scale = float(np.abs(centre - middle).max()) or 1.0
@@ -503,14 +513,14 @@ def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """The first pass over a frame: its sky background and the areas above the noise.
+    """The sky background of a frame and the areas above the noise.
 
     Attributes:
-        pixels: the frame (rows, columns) in counts; hot pixels are replaced if there are many.
+        pixels: frame in counts (rows, columns); hot pixels are replaced if they are many.
         unit: size of one count in the original unit of the frame.
-        settings: detection settings, in counts.
-        sky: the sky background.
-        areas: the connected areas above the noise.
+        settings: detection settings, converted to counts.
+        sky: sky background and noise.
+        areas: connected areas above the noise.
     """
 
     pixels: Image
@@ -521,12 +531,15 @@ class Survey:
 
     @property
     def shape(self) -> FrameShape:
-        """Whether the areas are points or streaks."""
+        """Whether the areas of the frame are points or streaks."""
         return frame_shape(self.areas)
 
 
 def survey(pixels: Image, settings: DetectionSettings | None = None) -> Survey:
-    """Return sky and areas above the noise of a frame (rows, columns). Raises ValueError as `detect`."""
+    """Return the sky background of a frame (rows, columns) and its areas above the noise.
+
+    Raises ValueError unless the pixels are finite real numbers and the frame has at least 16 x 16 pixels.
+    """
     pixels, unit = in_counts(pixels)
     settings = (settings or DetectionSettings()).in_units_of(unit)
     pixels = without_hot_pixels(pixels, settings.most_stars)

@@ -1,1 +1,1 @@
-"""The sky index: guide stars and their triangles, in memory-mapped files."""
+"""The sky index of guide stars and of the triangles that they form, in memory-mapped files."""

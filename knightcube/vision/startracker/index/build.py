@@ -1,8 +1,9 @@
 """Builds the sky index: python -m knightcube.vision.startracker.index.build [--output FILE].
 
-The default index is built at the first use, in some seconds, and kept in the cache folder
-$XDG_CACHE_HOME/knightcube or ~/.cache/knightcube. On board the installer builds it, and the configuration
-names its path. `python -m flight index --camera CONFIG` builds the index for the camera of a mission.
+The default index is built at its first use, which takes some seconds, and is stored in the cache folder
+$XDG_CACHE_HOME/knightcube or ~/.cache/knightcube. On board, the installer builds the index, and the
+configuration names its path. `python -m flight index --camera CONFIG` builds the index for a mission's
+camera.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from knightcube.vision.startracker.index.sky_index import (
 
 @dataclass(frozen=True, slots=True)
 class IndexSettings:
-    """Contents of the index.
+    """Settings that determine the contents of a sky index.
 
     Attributes:
-        faintest: V of the faintest guide star.
-        epoch: Julian year of the directions; `SkyIndex.at` changes it.
+        faintest: V magnitude of the faintest guide star.
+        epoch: Julian year of the directions; `SkyIndex.at` changes the epoch.
         resolution: angle below which two stars are merged, rad.
         smallest, largest: range of the longest sides of the triangles, rad.
-        density: number of stars that count as bright around a triangle of 2.5 deg. It is larger for larger
-            triangles, so that every octave of size has about the same number of triangles.
-        few: number of the brightest stars of any circle whose triangles are in the index.
+        density: number of stars around a triangle of 2.5 deg that count as bright. For larger triangles the
+            number is larger, so that every octave of size has about the same number of triangles.
+        few: number of the brightest stars of any circle whose triangles are always included.
     """
 
     faintest: float = 8.5
@@ -55,21 +56,21 @@ class IndexSettings:
 
     @classmethod
     def of_field(cls, fov: float, pixel: float | None = None) -> IndexSettings:
-        """Return the settings for a camera with a field of view `fov`, rad, and pixels of `pixel`, rad.
+        """Return the settings for a camera with the field of view `fov`, rad, and pixels of `pixel` rad.
 
-        Raises UsageError for a field of view below 2 or above 120 deg.
+        Raises UsageError if the field of view is below 2 deg or above 120 deg.
         """
         if not _NARROWEST <= fov <= _WIDEST:
-            raise UsageError(f"a field of {np.rad2deg(fov):g} deg: an index serves 2 to 120 deg")
+            raise UsageError(f"a field of {np.rad2deg(fov):g} deg: an index can serve 2 to 120 deg")
         longest = min(fov, DEFAULT.largest)
         resolution = DEFAULT.resolution if pixel is None else _RESOLVED_PIXELS * pixel
         return cls(smallest=_SMALLEST_SHARE * longest, largest=longest, resolution=resolution)
 
 
 _NARROWEST, _WIDEST = float(np.deg2rad(2.0)), float(np.deg2rad(120.0))
-# Ratio of the smallest to the largest triangle of a field.
+# Ratio of the smallest to the largest triangle for a given field of view.
 _SMALLEST_SHARE = 0.2
-# Distance (px) of two stars that an image resolves.
+# Minimum distance (px) of two stars that an image resolves.
 _RESOLVED_PIXELS = 2.5
 _MOST_STARS = 1 << 16
 DEFAULT = IndexSettings()
@@ -78,12 +79,15 @@ _REFERENCE_SIZE = float(np.deg2rad(2.5))
 
 
 def build(settings: IndexSettings = DEFAULT) -> SkyIndex:
-    """Return the index of the catalogue. Raises UsageError if it would hold too many or too few stars."""
+    """Return the sky index of the star catalogue.
+
+    Raises UsageError if the index would contain too many or too few stars.
+    """
     stars = catalogue.load()
     guide_stars = choose_guide_stars(stars, settings.faintest, settings.epoch, settings.resolution)
     if not 3 <= len(guide_stars) <= _MOST_STARS:
         raise UsageError(
-            f"{len(guide_stars)} stars to V {settings.faintest:g}: an index holds 3 to {_MOST_STARS}"
+            f"{len(guide_stars)} stars to V {settings.faintest:g}: an index can hold 3 to {_MOST_STARS}"
         )
     count = round(_BANDS_PER_OCTAVE * np.log2(settings.largest / settings.smallest))
     sizes = np.geomspace(settings.smallest, settings.largest, count + 1)
@@ -94,7 +98,7 @@ def build(settings: IndexSettings = DEFAULT) -> SkyIndex:
 
 
 def proper_motion(stars: GuideStars) -> npt.NDArray[np.float32]:
-    """Return the proper motion (n, 3), float32, rad/yr, of guide stars, by their Hipparcos numbers."""
+    """Return the proper motion (n, 3), rad/yr, float32, of guide stars, found by their Hipparcos numbers."""
     source = catalogue.load()
     order = np.argsort(source.hip)
     place = order[np.searchsorted(source.hip, stars.hip, sorter=order)]
@@ -103,14 +107,14 @@ def proper_motion(stars: GuideStars) -> npt.NDArray[np.float32]:
 
 
 def ensure_default_index() -> None:
-    """Build the default index if it is missing, so that no flight waits for it."""
+    """Build the default sky index if it is missing, so that a flight does not have to wait for it."""
     if not PATH.exists():
         default_index()
 
 
 @cache
 def default_index() -> SkyIndex:
-    """Return the default index, read once per process; it is built and stored if it is missing."""
+    """Return the default sky index, which is built and stored if it is missing, and read once per process."""
     path = PATH
     try:
         return load(path)
@@ -127,7 +131,7 @@ def default_index() -> SkyIndex:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Build and store the index. Return 0 if it was stored, 2 after wrong use."""
+    """Build and store the sky index. Return 0 if it was stored, or 2 after an error."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=PATH, help="file (default %(default)s)")
     parser.add_argument(

@@ -1,30 +1,32 @@
 """The sky index for star identification: guide stars and their triangles, in one memory-mapped file.
 
-The file begins with a header: 8 bytes of magic that identify the kind of table, the version (uint32), the
-CRC-32 of everything after the header (uint32), and the length of the table of contents (uint32). The table of
-contents is JSON. The columns follow, little-endian, each at a multiple of 64 bytes. The same columns give the
-same bytes.
+The file begins with a header, which contains 8 magic bytes that identify the kind of table, the version
+(uint32), the CRC-32 of everything after the header (uint32), and the length of the table of contents
+(uint32). The table of contents is JSON. The columns follow, little-endian, each at a multiple of 64 bytes. A
+file with the same columns always has the same bytes.
 
-Guide stars are the catalogue as a given lens images it (Michalski 3.3): proper motion is applied up to the
-epoch of observation, and stars that the image cannot resolve are merged into one star at their centre of
-light, with their joint magnitude. Aberration is not included: it depends on the velocity of the camera and is
-applied to the matched directions on board.
+Guide stars are the stars of the catalogue as a given lens images them (Michalski, section 3.3). Proper motion
+is applied up to the epoch of observation. Stars that the image cannot resolve are merged into one star at
+their centroid, with their joint magnitude. Aberration is not included in the index, because it depends on the
+velocity of the camera; it is applied to the matched directions on board.
 
-A star belongs to the triangles at whose size it is among the brightest: with r its distance from the
-`rank`-th nearest of the stars brighter than itself, it is among the `rank` brightest of every circle around
-it that is smaller than r. A triangle is kept if its longest side is at most r of each of its stars. The field
-of view does not enter: a frame of any field of view finds about as many triangles of stars that are among its
-brightest. Every part of the sky has about as many such stars, and a dense region adds no triangles. Beside a
-cluster of bright stars no star is among the brightest of its circle. Therefore circles of every radius that
-cover the sky add the triangles of their `few` brightest stars.
+The index contains only triangles whose stars are bright relative to the size of the triangle. The reach r of
+a star is its distance from the `rank`-th nearest of the stars that are brighter than the star itself. The
+star is then among the `rank` brightest stars of every circle around it that is smaller than r. The index
+contains a triangle if its longest side is at most the reach of each of its stars. The index does not depend
+on the field of view: frames of any field of view find about the same number of triangles of their brightest
+stars. Every part of the sky has about the same number of such stars, so dense regions do not add triangles.
+Near a cluster of bright stars, no star has a long reach. Therefore the triangles of the `few` brightest stars
+of circles that cover the sky are added, for circles of several radii.
 
-The key of a triangle consists of the ratios of the shortest and of the middle side to the longest, in cells
-of `CELL`; of whether the corners opposite the shortest, the middle and the longest side turn left or right;
-and of the longest side. The triangles of one cell within limits of size are one run of the sorted keys. Sides
-are chords.
+The sides of a triangle are chords of the unit sphere. The key of a triangle consists of three parts. The
+first part is whether the corners opposite the shortest, the middle and the longest side run left or right.
+The second part is the ratios of the shortest and of the middle side to the longest side, in cells of `CELL`.
+The third part is the longest side. In the sorted keys, the triangles of one cell within limits of size are
+contiguous.
 
-`python -m knightcube.vision.startracker.index.build` builds the index. The same stars and limits give
-the same bytes.
+`python -m knightcube.vision.startracker.index.build` builds the index. The same stars and settings give a
+file with the same bytes.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ Facts = dict[str, float]
 _HEADER = struct.Struct("<8sIII")
 _ALIGNMENT = 64
 _UNFIT = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, SyntaxError)
-"""Exceptions that invalid contents with a correct checksum may raise."""
+"""Exceptions that invalid contents of a file with a correct checksum may raise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +63,9 @@ class TableKind:
     """A kind of table file.
 
     Attributes:
-        magic: first 8 bytes of the file.
+        magic: first 8 bytes of a file of this kind.
         version: version of the columns.
-        name: name in messages.
+        name: name of the kind in messages.
         cure: advice in messages about a file that cannot be used.
     """
 
@@ -73,13 +75,13 @@ class TableKind:
     cure: str
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless the magic has 8 bytes."""
+        """Raise ValueError unless `magic` has 8 bytes."""
         if len(self.magic) != 8:
             raise ValueError(f"magic {self.magic!r}: give 8 bytes")
 
 
 def save_table(path: Path, kind: TableKind, columns: Columns, facts: Facts) -> None:
-    """Write columns and numbers to `path` atomically: a partly written file is never left there."""
+    """Write a table of `columns` and of single numbers (`facts`) atomically to the file `path`."""
     little = {name: _little(column) for name, column in columns.items()}
     contents: dict[str, Any] = {"facts": facts, "columns": {}}
     offset = 0
@@ -91,14 +93,14 @@ def save_table(path: Path, kind: TableKind, columns: Columns, facts: Facts) -> N
     body = bytearray(table)
     for column in little.values():
         body += column.tobytes() + b"\0" * (-column.nbytes % _ALIGNMENT)
-    # Two processes may write at once: each writes a file of its own, and the last one replaces the other.
+    # Two processes may write at once, so each process writes a file of its own and then renames it.
     temporary = path.with_name(f"{path.name}.{os.getpid()}.new")
     temporary.write_bytes(_HEADER.pack(kind.magic, kind.version, zlib.crc32(body), len(table)) + bytes(body))
     temporary.replace(path)
 
 
 def load_table(path: Path, kind: TableKind) -> tuple[Columns, Facts]:
-    """Return the columns, memory-mapped and read-only, and the numbers.
+    """Return the columns of a table, memory-mapped and read-only, and its single numbers (facts).
 
     Raises InputError if the file is missing, damaged, of another kind or of another version.
     """
@@ -141,10 +143,10 @@ class GuideStars:
     """Stars as the camera resolves them, the brightest first.
 
     Attributes:
-        hip: Hipparcos numbers (n,), int32; of a merged group that of its brightest star.
-        direction: unit vectors (n, 3), ICRS, at `epoch`.
-        magnitude: Johnson V magnitudes (n,); of a merged group the joint magnitude.
-        epoch: Julian year.
+        hip: Hipparcos numbers (n,), int32; for merged stars, the number of the brightest star.
+        direction: unit vectors to the stars (n, 3), ICRS, at `epoch`.
+        magnitude: Johnson V magnitudes (n,); for merged stars, the joint magnitude.
+        epoch: Julian year of the directions.
     """
 
     hip: npt.NDArray[np.int32]
@@ -156,7 +158,7 @@ class GuideStars:
         return len(self.hip)
 
     def brighter_than(self, magnitude: float) -> GuideStars:
-        """Return the stars with V below `magnitude`, as views of the same arrays."""
+        """Return the stars with V magnitudes below `magnitude`, as views of the same arrays."""
         count = int(np.searchsorted(self.magnitude, magnitude, side="left"))
         return GuideStars(self.hip[:count], self.direction[:count], self.magnitude[:count], self.epoch)
 
@@ -164,9 +166,9 @@ class GuideStars:
 def choose_guide_stars(
     catalogue: StarCatalogue, faintest: float, epoch: float, resolution: float
 ) -> GuideStars:
-    """Return the stars with a joint V below `faintest` at Julian year `epoch`.
+    """Return the guide stars with V magnitudes below `faintest`, for the Julian year `epoch`.
 
-    Stars closer together than `resolution`, rad, directly or through other stars, are merged. Raises
+    Stars closer together than `resolution`, rad, are merged, also in chains of several stars. Raises
     ValueError if `epoch` is not finite.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
@@ -179,7 +181,7 @@ def choose_guide_stars(
     centre = np.stack(
         [np.bincount(group, light * axis, minlength=len(catalogue)) for axis in direction.T], axis=-1
     )
-    # A group has the number of its first member, and the catalogue is sorted by brightness.
+    # A group is numbered by its first member, which is its brightest star, as the catalogue is sorted.
     first = np.flatnonzero(group == np.arange(len(catalogue)))
     magnitude = -2.5 * np.log10(joint[first])
     seen = np.flatnonzero(magnitude < faintest)
@@ -190,7 +192,7 @@ def choose_guide_stars(
 
 
 def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return for each of `count` stars (count,) the lowest number of its connected group."""
+    """Return the lowest index in the connected group of each star (count,), for `pairs` of stars (p, 2)."""
     group = np.arange(count)
     while True:
         lowest = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
@@ -203,34 +205,34 @@ def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
 
 CELLS = 80
 CELL = 1.0 / CELLS
-"""Width of the cells of side ratios from 0 to 1; a byte gives the position within the cell."""
+"""Width of the cells into which side ratios from 0 to 1 are divided."""
 FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
-"""Resolution of the longest side's chord in a key; the chord is below 1."""
+"""Resolution of the longest side in a key; the side is a chord below 1."""
 RUN_BITS = 12
-"""Keys are counted in steps of 2^12 units of size, about one key per step."""
+"""Binary logarithm of the step of size in which keys are counted, in `SIZE_UNIT`; about one key per step."""
 TIE = 1e-9
-"""Relative tolerance of a side against a limit, because the limits are sides themselves."""
+"""Relative tolerance of a side against a limit, because rounding affects sides that equal the limit."""
 LEAST_RATIO = 0.1
-"""Minimum ratio of the shortest to the longest side: flatter triangles are hardly better than a pair."""
+"""Minimum ratio of the shortest to the longest side; a flatter triangle is hardly better than a pair."""
 
 
-# Distance of the centres of circles, relative to their radius.
+# Distance between the centres of neighbouring circles that cover the sky, relative to their radius.
 _CIRCLES_APART = 0.7
-# Factor of the average number of stars needed that are searched first.
+# Number of stars searched first, relative to the number needed in a sky of uniform density.
 _ENOUGH = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleIndex:
-    """Triangles sorted by their keys.
+    """Triangles of guide stars, sorted by their keys.
 
     Attributes:
-        key: cell of shape and orientation, then size (m,), uint32.
-        corners: numbers of the guide stars opposite the shortest, the middle and the longest side (m, 3),
+        key: orientation, cell of the side ratios, and longest side of each triangle (m,), uint32.
+        corners: indices of the guide stars opposite the shortest, the middle and the longest side (m, 3),
             uint16.
-        shape: positions of the two ratios within their cells (m, 2), uint8.
+        shape: positions of the two side ratios within their cells (m, 2), uint8.
     """
 
     key: npt.NDArray[np.uint32]
@@ -242,16 +244,17 @@ class TriangleIndex:
 
     @cached_property
     def below(self) -> npt.NDArray[np.int32]:
-        """The number of keys below each multiple of 2^RUN_BITS (f,), which finds runs without a search."""
+        """The number of keys below each multiple of 2^RUN_BITS (f,); it locates keys without a search."""
         run = self.key >> np.uint32(RUN_BITS)
         count = np.bincount(run, minlength=2 * CELLS * CELLS << (SIZE_BITS - RUN_BITS))
         return np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
 
 
 def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
-    """Return for each star (n,), the brightest first, the chord to the `rank`-th nearest brighter star.
+    """Return the reach of each star (n,), which is the chord to its `rank`-th nearest brighter star.
 
-    The chord is limited to `farthest`, which is also the value of stars with fewer than `rank` brighter ones.
+    The reach is at most `farthest`, which is also the reach of a star with fewer than `rank` brighter stars.
+    The unit vectors `direction` (n, 3) are in order of brightness, the brightest first.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
@@ -260,7 +263,7 @@ def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
     begin = 0
     while begin < count:
         end = min(max(2 * begin, 4 * rank), count)
-        # About half of the neighbours among twice as many stars are brighter: 4 x `rank` contain enough.
+        # About half of a star's neighbours are brighter, so that 4 x `rank` neighbours contain enough.
         neighbours = min(4 * rank, end)
         distance, number = cKDTree(direction[:end]).query(direction[begin:end], neighbours)
         brighter = number < np.arange(begin, end)[:, None]
@@ -276,10 +279,14 @@ def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
 
 
 def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, few: int) -> TriangleIndex:
-    """Return the index of the triangles of stars `direction` (n, 3), the brightest first.
+    """Return the index of the triangles of stars.
 
-    Triangles whose longest side is a chord between sizes[i] and sizes[i + 1], (b + 1,), are those of rank
-    ranks[i], (b,). The triangles of the `few` brightest stars of circles of these radii are added.
+    Args:
+        direction: unit vectors to the stars (n, 3), the brightest first.
+        sizes: limits of the longest sides of b bands of triangles (b + 1,), as chords.
+        ranks: rank that defines the reach of the stars in each band (b,).
+        few: number of the brightest stars of a circle whose triangles are added. The circles cover the sky
+            and have the radii `sizes`.
     """
     bands = zip(sizes[:-1], sizes[1:], ranks, strict=True)
     found = [np.sort(_band(direction, *band), axis=1) for band in bands]
@@ -291,13 +298,12 @@ def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, f
 def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int) -> IntArray:
     """Return the triangles (m, 3) of the `few` brightest stars of each of the circles that cover the sky.
 
-    Their longest sides are chords between `smallest` and the diameter.
+    The circles have the radius `radius`. The longest side of a triangle is at least `smallest`.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     centres = evenly_spread(math.ceil(4.0 * math.pi / (_CIRCLES_APART * radius) ** 2))
-    # Most circles contain enough of the brightest stars of the sky; for other circles, all stars are
-    # searched.
+    # Most circles contain enough of the brightest stars of the sky; all stars are searched for other circles.
     brightest = min(math.ceil(_ENOUGH * few * 4.0 / radius**2), len(direction))
     chosen = np.full((len(centres), few), len(direction))
     for count in sorted({brightest, len(direction)}):
@@ -316,7 +322,7 @@ def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int)
 
 
 def evenly_spread(count: int) -> FloatArray:
-    """Return unit vectors (count, 3) spread evenly over the sphere: a spiral by the golden angle."""
+    """Return unit vectors (count, 3) that cover the sphere evenly (a Fibonacci lattice)."""
     place = np.arange(count) + 0.5
     z = 1.0 - 2.0 * place / count
     turn = place * math.pi * (3.0 - math.sqrt(5.0))
@@ -325,12 +331,15 @@ def evenly_spread(count: int) -> FloatArray:
 
 
 def _band(direction: FloatArray, smallest: float, largest: float, rank: int) -> IntArray:
-    """Return the triangles (m, 3) of one band of sizes."""
+    """Return the triangles (m, 3) whose longest side is between `smallest` and `largest`.
+
+    The reach of each star of a triangle, for `rank`, is at least the longest side.
+    """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     limit = reach(direction, rank, largest)
     able = np.flatnonzero(limit >= smallest)
-    # Sorted by reach, so that each triangle is found once: from its last star, which has the smallest reach.
+    # Stars are sorted by reach, so that each triangle is found once, from the star with the smallest reach.
     able = able[np.argsort(-limit[able], kind="stable")]
     limit, place = limit[able] * (1.0 + TIE), direction[able]
     first, last = np.sort(cKDTree(place).query_pairs(largest, output_type="ndarray"), axis=1).T
@@ -378,14 +387,14 @@ def _indexed(direction: FloatArray, corners: IntArray) -> TriangleIndex:
 
 
 def cell(ratio: FloatArray) -> IntArray:
-    """Return the numbers of the cells that contain side ratios."""
+    """Return the indices of the cells that contain given side ratios."""
     return np.clip(np.floor(ratio * CELLS), 0, CELLS - 1).astype(np.int64)
 
 
 def keys(
     short: IntArray, middle: IntArray, left: npt.NDArray[np.bool_], size: FloatArray
 ) -> npt.NDArray[np.uint32]:
-    """Return the keys of triangles from the cells of both ratios, the orientation, and the longest chord."""
+    """Return the keys of triangles from cells of the side ratios, the orientation and the longest side."""
     form = ((left * CELLS + short) * CELLS + middle).astype(np.int64)
     step = np.clip(size / SIZE_UNIT, 0, (1 << SIZE_BITS) - 1).astype(np.int64)
     return ((form << SIZE_BITS) | step).astype(np.uint32)
@@ -401,17 +410,17 @@ KIND = TableKind(
 PATH = (
     Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "knightcube" / f"sky-{_VERSION}.index"
 )
-"""Path of the default index."""
+"""Path of the default sky index."""
 
 
 @dataclass(frozen=True, eq=False)
 class SkyIndex:
-    """Guide stars and the triangles of the locally bright among them.
+    """Guide stars, and triangles of those guide stars that are bright in their surroundings.
 
     Attributes:
-        stars: the guide stars at the index's epoch.
-        motion: (n, 3) float32 rad/yr, each direction's change: proper motion.
-        triangles: numbers of guide stars by the shape and size of the triangle that they form.
+        stars: guide stars at the epoch of the index.
+        motion: proper motion of each guide star as the change of its unit vector (n, 3), rad/yr, float32.
+        triangles: triangles of guide stars, sorted by shape and size.
     """
 
     stars: GuideStars
@@ -420,14 +429,14 @@ class SkyIndex:
 
     @cached_property
     def coarse(self) -> npt.NDArray[np.float32]:
-        """The directions of the stars by axis (3, n), float32, for a fast search near a boresight."""
+        """The unit vectors to the guide stars as (3, n), float32, for a fast search near a boresight."""
         return np.ascontiguousarray(self.stars.direction.T, dtype=np.float32)
 
     def at(self, epoch: float) -> SkyIndex:
-        """Return the index with the stars moved to Julian year `epoch`.
+        """Return the index with the directions of the stars at the Julian year `epoch`.
 
-        The triangles stay: in a century a star of 1"/yr moves by 0.03 deg. Raises ValueError when `epoch` is
-        not finite.
+        The triangles are not changed, because a star with a proper motion of 1"/yr moves by only 0.03 deg in
+        a century. Raises ValueError if `epoch` is not finite.
         """
         if not np.isfinite(epoch):
             raise ValueError(f"epoch = {epoch!r}: give a finite Julian year, such as 2030.5")
@@ -438,7 +447,7 @@ class SkyIndex:
 
 
 def save(sky: SkyIndex, path: Path) -> None:
-    """Write the index to `path` atomically: a partly written file is never left there."""
+    """Write the sky index atomically to the file `path`."""
     columns: Columns = {
         "hip": sky.stars.hip,
         "direction": sky.stars.direction.astype(np.float32),
@@ -451,7 +460,7 @@ def save(sky: SkyIndex, path: Path) -> None:
 
 
 def load(path: Path = PATH) -> SkyIndex:
-    """Return the index of a file; its triangles are memory-mapped.
+    """Return the sky index in a file; the triangles are memory-mapped.
 
     Raises InputError if the file is missing, damaged, or of another version.
     """
@@ -465,5 +474,8 @@ def load(path: Path = PATH) -> SkyIndex:
 
 @cache
 def load_once(path: Path) -> SkyIndex:
-    """Return the index of a file, which is read once per process. Raises InputError as `load`."""
+    """Return the sky index in a file, which is read once per process.
+
+    Raises InputError if the file is missing, damaged, or of another version.
+    """
     return load(path)
