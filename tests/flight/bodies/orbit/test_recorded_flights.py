@@ -1,0 +1,19 @@
+"""The body in orbit estimates and detumbles as in the recorded flights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.support.recorded_flights import unlike_record
+
+
+def test_a_detumbling_flight_is_as_recorded(tmp_path: Path) -> None:
+    assert unlike_record("detumbling", tmp_path) == []
+
+
+def test_a_flight_that_navigates_in_orbit_is_as_recorded(tmp_path: Path) -> None:
+    assert unlike_record("navigation", tmp_path) == []
+
+
+def test_a_flight_with_failing_receivers_is_as_recorded(tmp_path: Path) -> None:
+    assert unlike_record("receivers", tmp_path) == []

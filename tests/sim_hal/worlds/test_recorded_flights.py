@@ -1,0 +1,15 @@
+"""The simulated worlds move as in the recorded flights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.support.recorded_flights import unlike_record
+
+
+def test_a_flight_in_the_cage_is_as_recorded(tmp_path: Path) -> None:
+    assert unlike_record("cage", tmp_path) == []
+
+
+def test_a_detumbling_flight_is_as_recorded(tmp_path: Path) -> None:
+    assert unlike_record("detumbling", tmp_path) == []
