@@ -88,7 +88,7 @@ CLEAR = telecommand(
     0x205,
     "Clear a latched event",
     Field("event", "S32", "-", "name of the event, as in the log"),
-    hazard="uses again what the event excluded, for example a broken coil",
+    hazard="uses a device again that the event excluded, for example a broken coil",
 )
 POINT = telecommand(
     "point",
@@ -305,7 +305,7 @@ def _table(fields: Mapping[str, Any]) -> LoadParameters:
     """
     values = tuple(fields[field.name] for field in PARAMETER_FIELDS)
     if fields["crc"] != crc_of(values):
-        raise CommandError(f"crc = {fields['crc']:08x}, but that of the values is {crc_of(values):08x}")
+        raise CommandError(f"crc = {fields['crc']:08x}, but the CRC of the values is {crc_of(values):08x}")
     return LoadParameters(fields["replaced"], values)
 
 
@@ -383,7 +383,10 @@ def unpack(data: bytes) -> Command:
         raise MalformedError(f"no command begins with 0x{int.from_bytes(data[:2], 'big'):04x}")
     stated = int.from_bytes(data[4:HEADER_BYTES], "big") + HEADER_BYTES + 1
     if not len(data) == stated == layout.length:
-        raise MalformedError(f"{len(data)} bytes, {stated} stated, {layout.packet.name} has {layout.length}")
+        raise MalformedError(
+            f"{layout.packet.name} has {layout.length} bytes, but {len(data)} were received"
+            f" and the header states {stated}"
+        )
     if crc16(data) != 0:
         raise MalformedError("its CRC is wrong")
     if data[HEADER_BYTES] != layout.packet.version:

@@ -62,7 +62,7 @@ def open_telecommand(frame: bytes, spacecraft: int) -> bytes:
         raise FrameError("its length is wrong")
     first = int.from_bytes(frame[:2], "big")
     if first != _BYPASS | spacecraft:
-        raise FrameError("it is for another spacecraft, or of another type than BD")
+        raise FrameError("the frame is for another spacecraft, or not of type BD")
     return frame[:-CRC_BYTES]
 
 

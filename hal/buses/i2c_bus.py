@@ -156,7 +156,7 @@ class LinuxI2cBus:
 
     def _transact(self, address: int, action: Callable[[SMBus], _Answer]) -> _Answer:
         if not self._lock.acquire(timeout=self._patience):
-            raise OSError(errno.ETIMEDOUT, f"{self.name} is held by a transaction that does not end")
+            raise OSError(errno.ETIMEDOUT, f"a transaction on {self.name} does not end")
         try:
             if self._closed:
                 raise OSError(errno.EBADF, os.strerror(errno.EBADF))
@@ -194,8 +194,8 @@ def _how_to_find_a_bus() -> str:
         return "no such bus, and the kernel knows no adapter: enable one in the firmware, modprobe i2c-dev"
     listing = ", ".join(f"i2c-{number} ({name})" for number, name in known)
     return (
-        f"no such bus; the kernel knows {listing}. Is i2c-dev loaded? Numbers change between boots: let a"
-        ' udev rule on SUBSYSTEM=="i2c-dev", ATTR{name} make a lasting name with SYMLINK+= and give that'
+        f"no such bus; the kernel knows {listing}. Is i2c-dev loaded? Numbers change between boots: use"
+        ' the permanent name of a udev rule with SUBSYSTEM=="i2c-dev", ATTR{name} and SYMLINK+='
     )
 
 

@@ -93,7 +93,7 @@ class PySerialPort:
         try:
             self._serial.baudrate = baud_rate
         except _PORT_ERRORS as error:
-            raise NotResponding(self._device, f"does not take {baud_rate} baud ({error})") from error
+            raise NotResponding(self._device, f"does not support {baud_rate} baud ({error})") from error
 
     def close(self) -> None:
         """Stop the thread and close the port. Calling this method again has no effect."""

@@ -71,7 +71,7 @@ class AdsSolarStrings:
         self._parts = sorted({wiring.address for wiring in wirings})
         self._counts = dict.fromkeys(((w.address, w.channel) for w in wirings), 0)
         if len(self._counts) != len(self._wirings) or not wirings:
-            raise OutOfRange(self.name, "strings on channels of their own", len(self._counts), 1, 16, "")
+            raise OutOfRange(self.name, "number of different channels", len(self._counts), 1, 16, "")
         for wiring in wirings:
             if not 0 <= wiring.channel < CHANNELS:
                 raise OutOfRange(self.name, "channel", wiring.channel, 0, CHANNELS - 1, "")

@@ -103,7 +103,7 @@ class AravisCamera:
             found = [aravis.get_device_id(index) for index in range(aravis.get_n_devices())]
             raise NotResponding(
                 self.name,
-                f"{error}; there is {', '.join(found) or 'no camera at all'}: is it plugged in, and "
+                f"{error}; found {', '.join(found) or 'no camera'}: is it plugged in, and "
                 "may this user open it (udev rule for USB3 Vision)?",
             ) from error
         with self._during("setting it up"):
@@ -164,7 +164,7 @@ class AravisCamera:
     def _set_up(self, aravis: Any, camera: Any) -> None:
         settings = self._settings
         if not camera.is_software_trigger_supported():
-            raise Refused(self.name, f"{camera.get_model_name()} takes no software trigger")
+            raise Refused(self.name, f"{camera.get_model_name()} does not support software triggers")
         offered = camera.dup_available_pixel_formats_as_strings()
         if settings.pixel_format not in offered:
             raise Refused(
@@ -186,7 +186,7 @@ class AravisCamera:
     def _start_stream(self, aravis: Any, camera: Any) -> None:
         stream = camera.create_stream(None, None)
         if stream is None:
-            raise NotResponding(self.name, "opens no stream: has another program the camera?")
+            raise NotResponding(self.name, "cannot open a stream: does another program use the camera?")
         payload = camera.get_payload()
         for _ in range(self._settings.buffers):
             stream.push_buffer(aravis.Buffer.new_allocate(payload))
@@ -207,7 +207,7 @@ class AravisCamera:
         width, height = camera.get_sensor_size()
         if columns > width or rows > height:
             raise Refused(
-                self.name, f"its sensor has {width} x {height} pixels; {columns} x {rows} are asked for"
+                self.name, f"its sensor has {width} x {height} pixels; {columns} x {rows} are requested"
             )
         step_x, step_y = camera.get_x_offset_increment(), camera.get_y_offset_increment()
         x, y = (width - columns) // 2, (height - rows) // 2
@@ -215,7 +215,7 @@ class AravisCamera:
         region = camera.get_region()
         if (region[2], region[3]) != (columns, rows):
             raise Refused(
-                self.name, f"reads {region[2]} x {region[3]} pixels, not {columns} x {rows}: see its steps"
+                self.name, f"reads {region[2]} x {region[3]} pixels, not {columns} x {rows}: check its steps"
             )
 
     def _set_gain(self, aravis: Any, camera: Any) -> None:
@@ -225,7 +225,7 @@ class AravisCamera:
         if gain is None:
             return
         if not camera.is_gain_available():
-            raise Refused(self.name, "has no gain to set: leave `gain` out")
+            raise Refused(self.name, "has no adjustable gain: omit `gain`")
         low, high = camera.get_gain_bounds()
         if not low <= gain <= high:
             raise OutOfRange(self.name, "gain", gain, low, high, "")

@@ -157,7 +157,7 @@ class Ina219:
         self._read(POWER)  # clears the ready flag, so that no conversion is counted twice
         self._flag_stays = self._flag_stays + 1 if self._read(BUS) & CONVERSION_READY else 0
         if self._flag_stays >= _SURE_STUCK:
-            raise NotResponding(self.name, "its registers are stuck: a conversion that was read stays new")
+            raise NotResponding(self.name, "its registers are stuck: the ready flag stays set after reading")
         self._conversion_ns = self._clock.now_ns()
         signed = shunt - 0x10000 if shunt & 0x8000 else shunt
         full_scale = _SHUNT_RANGES_V[self._range_bits]

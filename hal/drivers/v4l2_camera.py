@@ -497,7 +497,7 @@ class ExposureTiming:
         Raises CorruptData if the time stamp is not from the monotonic clock.
         """
         if filled.flags & STAMP_MASK != STAMP_MONOTONIC:
-            raise CorruptData(self._name, "stamps its frames by another clock than the monotonic one")
+            raise CorruptData(self._name, "the time stamps of its frames are not from the monotonic clock")
         ahead_ns = filled.stamp_ns - self._clock.now_ns()
         if ahead_ns > _STAMP_AHEAD_NS:
             raise CorruptData(
@@ -562,7 +562,7 @@ def meaning(name: str, error: OSError, doing: str) -> DeviceError:
     if error.errno in {errno.ENODEV, errno.ENXIO}:
         return NotResponding(name, f"gone while {doing}: was it unplugged?")
     if error.errno == errno.EBUSY:
-        return Refused(name, f"busy while {doing}: another program has the camera")
+        return Refused(name, f"busy while {doing}: another program uses the camera")
     if error.errno == errno.ENOTTY:
         return Refused(name, f"is not a V4L2 device (found {doing})")
     return NotResponding(name, f"failed while {doing}: {os.strerror(error.errno or errno.EIO)}")
@@ -572,7 +572,7 @@ def identity(name: str, device: VideoDevice) -> tuple[str, str]:
     """Return the driver name and the camera name. Raises Refused if the device cannot capture video."""
     driver, card, can = device.capability()
     if not (can & CAP_VIDEO_CAPTURE and can & CAP_STREAMING):
-        raise Refused(name, f"{card} ({driver}) delivers no video here: give its capture node")
+        raise Refused(name, f"{card} ({driver}) cannot capture video: use its capture device")
     return driver, card
 
 
@@ -590,7 +590,7 @@ def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelL
             f"{settings.rows}: `v4l2-ctl --list-formats-ext` lists its sizes",
         )
     if layout.stride < layout.columns * settings.kind.itemsize:
-        raise CorruptData(name, f"{card} claims rows of {layout.stride} bytes for {layout.columns} pixels")
+        raise CorruptData(name, f"{card} reports rows of {layout.stride} bytes for {layout.columns} pixels")
     return layout
 
 
@@ -608,7 +608,7 @@ def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
                 raise OutOfRange(settings.path, "gain", gain, known.minimum, known.maximum, "")
             device.set_control(control, gain)
             return
-    raise Refused(settings.path, "has no gain to set: leave `gain` out")
+    raise Refused(settings.path, "has no adjustable gain: omit `gain`")
 
 
 def manual_exposures(name: str, device: VideoDevice, card: str) -> ControlRange:

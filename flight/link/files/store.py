@@ -99,7 +99,7 @@ def problem_of_name(name: str) -> str:
     if len(name.encode()) >= LONGEST_NAME or len(parts) > _MOST_PARTS:
         return f"{name[:LONGEST_NAME]!r} is too long for the name of a file"
     if not all(_PART.fullmatch(part) for part in parts):
-        return f"{name!r} is not an allowed name: its parts have letters, digits and . _ + -, no dot first"
+        return f"{name!r} is not an allowed name: use letters, digits and . _ + -, but no leading . + -"
     return ""
 
 

@@ -423,7 +423,7 @@ class Receiver:
         known = self.record.size if self.record.name is not None else self._most
         if end > known:
             if self.record.name is not None:
-                self.stop(Condition.SIZE_ERROR, f"bytes beyond the {known} of the file")
+                self.stop(Condition.SIZE_ERROR, f"received data beyond the {known} bytes of the file")
             return
         try:
             if self._file < 0:
@@ -467,7 +467,8 @@ class Receiver:
         checksum, size = self.record.end
         # Data received before the metadata could not be checked against the size of the file.
         if size != self.record.size or self._ranges.end > size:
-            self.stop(Condition.SIZE_ERROR, f"bytes up to {self._ranges.end}, {size} by its end")
+            why = f"received bytes up to {self._ranges.end}, but the EOF states {size}"
+            self.stop(Condition.SIZE_ERROR, why)
             return
         if self._sum is None:
             self._naks.clear()
@@ -599,7 +600,7 @@ class Entity:
         if problem := problem_of_name(name):
             raise FileError(problem)
         if not path.is_file() or facts.st_size > LONGEST_FILE:
-            raise FileError(f"{name}: no file, or one of more than {LONGEST_FILE} bytes")
+            raise FileError(f"{name}: not a file, or longer than {LONGEST_FILE} bytes")
         same = self._open(str(path), name, destination)
         # A log file only grows, so its first bytes up to the announced size are unchanged.
         if same is not None and (
@@ -612,7 +613,7 @@ class Entity:
         if same is not None:
             same.cancel(why="the file has changed")
         if len(self._out) >= MOST_OPEN:
-            raise FileError(f"{MOST_OPEN} files are sent already: cancel one")
+            raise FileError(f"{MOST_OPEN} files are already being sent: cancel one")
         number = self._store.new_number(utc_ns)
         record = Outgoing(
             number, destination, str(path), name, facts.st_size, facts.st_mtime_ns, kind, None, origin

@@ -156,30 +156,30 @@ def unpack(data: bytes) -> tuple[Transaction, Content]:
     Raises PduError if the bytes are not a valid unit.
     """
     if len(data) < _FIXED_BYTES or data[0] & 0b111 << 5 != _PDU_VERSION:
-        raise PduError("no unit of version 1 of CFDP")
+        raise PduError("the bytes are not a CFDP unit of version 1")
     if data[0] & (_UNACKNOWLEDGED | _CRC | _LARGE):
-        raise PduError("a unit of class 1, with a CRC, or of a large file")
+        raise PduError("units of class 1, with a CRC or of large files are not supported")
     entity, number = (data[3] >> 4 & 7) + 1, (data[3] & 7) + 1
     begin = _FIXED_BYTES + 2 * entity + number
     end = begin + int.from_bytes(data[1:3], "big")
     if len(data) < end or end == begin:
-        raise PduError(f"{len(data)} bytes of a unit of {end}")
+        raise PduError(f"the unit has {end} bytes, but only {len(data)} were received")
     transaction = Transaction(
         int.from_bytes(data[4 : 4 + entity], "big"),
         int.from_bytes(data[4 + entity : 4 + entity + number], "big"),
         int.from_bytes(data[begin - entity : begin], "big"),
     )
     if max(transaction.source, transaction.destination) >= 1 << 16 or transaction.number > HIGHEST_NUMBER:
-        raise PduError("an entity or a number beyond 2 and 4 bytes")
+        raise PduError("the entity exceeds 2 bytes or the transaction number 4 bytes")
     body = data[begin:end]
     try:
         if data[0] & _FILE_DATA:
             if data[3] & _METADATA_OF_SEGMENT:
-                raise PduError("segments with metadata are not known")
+                raise PduError("segments with metadata are not supported")
             return transaction, FileData(_LONG.unpack_from(body)[0], body[_LONG.size :])
         return transaction, _directive(body)
     except (struct.error, IndexError) as error:
-        raise PduError("it ends before its last field") from error
+        raise PduError("the unit ends before its last field") from error
 
 
 def _body(transaction: Transaction, content: Content) -> tuple[bytes, int]:
@@ -210,7 +210,7 @@ def _directive(body: bytes) -> Content:
             first, second = 5, 6 + rest[5]
             end = second + 1 + rest[second]
             if len(rest) < end:
-                raise PduError("it ends before its last name")
+                raise PduError("the unit ends before its last file name")
             names = (rest[first + 1 : second], rest[second + 1 : end])
             source_name, name = (raw.decode("utf-8", "replace") for raw in names)
             return Metadata(size, source_name, name, rest[0] & 15)

@@ -384,7 +384,7 @@ class Scheduling:
 
     def beginning(self) -> list[Report]:
         """Return the reports to be sent at the start of the link process."""
-        text = "both copies of the schedule are lost: it is empty"
+        text = "both copies of the schedule are lost, so the schedule is empty"
         return [Report(0, 0, Stage.FAILED, SCHEDULE.name, text)] if self._timetable.lost else []
 
     def followed(self, packet: bytes) -> None:
@@ -441,7 +441,7 @@ class Scheduling:
         if utc_ns - entry.at_ns > LATEST_NS:
             return f"it is {_utc(utc_ns)}"
         if self._mode == Mode.SAFE:
-            return "in SAFE the ground decides"
+            return "only the ground may decide in mode SAFE"
         try:
             command_of_words(entry.command)
         except CommandError as error:  # the entry was scheduled by another software release

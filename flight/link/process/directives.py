@@ -250,7 +250,7 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
     try:
         return Packer(LAYOUTS).pack(packet, utc_ns, values)
     except TelemetryError as error:
-        raise CommandError("these values fit no directive of the link") from error
+        raise CommandError("the values do not fit into the directive") from error
 
 
 def unpack(data: bytes) -> Directive | None:

@@ -179,14 +179,14 @@ class Filing:
 
     def _received(self, name: str) -> Path:
         if not name.startswith("received/"):
-            raise FileError(f"{name}: no received file; their names begin with received/")
+            raise FileError(f"{name}: use the name of a received file, which begins with received/")
         return self._path(name)
 
     def _may_come(self, metadata: Metadata) -> str:
         """Return why an incoming file is rejected, or an empty text if it is accepted."""
         kind, _, rest = metadata.name.partition("/")
         if kind not in KINDS or not rest or "/" in rest:
-            return f"{metadata.name}: names are KIND/NAME, KIND one of {', '.join(KINDS)}"
+            return f"{metadata.name}: use a name KIND/NAME with KIND one of {', '.join(KINDS)}"
         taken = sum(path.stat().st_size for path in self._store.received.rglob("*") if path.is_file())
         if taken + metadata.size > MOST_RECEIVED:
             return f"{taken} of {MOST_RECEIVED} bytes are in use: delete files that are not needed"

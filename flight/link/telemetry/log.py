@@ -253,7 +253,7 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
         make_lasting(archive)
     except OSError as error:
         if error.errno not in DISK_TROUBLE:
-            raise UsageError(f"{archive}: no run can be begun there: {error.strerror or error}") from error
+            raise UsageError(f"{archive}: a run cannot begin there: {error.strerror or error}") from error
     return NewRun(folder, dropped)
 
 
@@ -368,7 +368,7 @@ class FlightLog:
             self._store = begin()
         except OSError as error:
             if not patient:
-                problem = f"{folder}: no log can be written there: {error.strerror or error}"
+                problem = f"{folder}: a log cannot be written there: {error.strerror or error}"
                 raise UsageError(problem) from error
             self._fail(error)
         self._synced_ns = clock.now_ns()

@@ -150,7 +150,7 @@ def set_up(settings: Vn100Settings) -> Dialogue:
     """Yield the questions that configure the unit. The flash memory of the unit is not written."""
     model = yield Question("RRG", (1,))
     if not model or not model[0].startswith("VN-100"):
-        raise Refused(DEVICE, f"the unit reports the model {','.join(model)!r}: this line needs a VN-100")
+        raise Refused(DEVICE, f"the unit reports the model {','.join(model)!r}, but a VN-100 is needed")
     yield from _write(6, 0)
     # The unit's hard and soft iron estimation is disabled, because the coils would disturb it.
     yield from _write(44, 0, 1, 5)
@@ -671,7 +671,8 @@ class Vn100:
         )
         if received == 0:
             return NotResponding(
-                DEVICE, f"{tried}, not one byte: check power, the cable, the port's name, and the baud rate"
+                DEVICE,
+                f"{tried}, no byte received: check power, the cable, the port's name, and the baud rate",
             )
         if self._unit_error:
             return CorruptData(DEVICE, f"{tried} but {self._unit_error}: the line to the unit is noisy")

@@ -89,7 +89,7 @@ def rotation_between(starts: FloatArray, ends: FloatArray, weights: FloatArray) 
     weighted = cross * weights[:, None, None]
     normal = np.einsum("nji,njk->ik", weighted, cross)
     if np.linalg.cond(normal) > _WORST_CONDITION:
-        raise np.linalg.LinAlgError("the directions do not fix a rotation")
+        raise np.linalg.LinAlgError("the directions do not determine a rotation")
     rodrigues = np.linalg.solve(normal, np.einsum("nji,nj->i", weighted, differences))
     residuals = np.einsum("nij,j->ni", cross, rodrigues) - differences
     quaternion = normalise(np.append(rodrigues, 1.0))

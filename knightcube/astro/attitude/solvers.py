@@ -157,7 +157,7 @@ def _by_eigenvalue(
     def check(root: float) -> None:
         b, c, _ = _characteristic(profile)
         if (4.0 * root**2 + 2.0 * b) * root + c <= _MINIMUM_SLOPE:
-            raise AttitudeError("the directions fit several attitudes equally well: they determine none")
+            raise AttitudeError("several attitudes fit the directions equally well")
 
     root = largest_eigenvalue(profile)
     check(root)
@@ -354,7 +354,7 @@ def field_observation(field: FloatArray, reference: FloatArray, covariance: Floa
     """
     strength = float(np.linalg.norm(reference))
     if not float(np.sqrt(np.trace(covariance))) < strength:
-        raise AttitudeError(f"a field of {strength:.2e} T gives no direction within its errors")
+        raise AttitudeError(f"a field of {strength:.2e} T is too weak to give a direction")
     return VectorObservation(
         field / np.linalg.norm(field), reference / strength, np.asarray(covariance / strength**2)
     )

@@ -188,7 +188,7 @@ def best_pair(seen: Sightings, sigma: FloatArray) -> tuple[int, int]:
         trace = squared[:, None] + (squared[:, None] + squared) / sines
     first, second = np.unravel_index(np.argmin(trace), trace.shape)
     if not sines[first, second] > 0.0:
-        raise AttitudeError("no two directions differ in both frames: they determine no attitude")
+        raise AttitudeError("the attitude is undefined: no two directions differ in both frames")
     return int(first), int(second)
 
 
@@ -261,11 +261,11 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
             quaternion = normalise(multiply(from_rotation_vector(step), quaternion))
             continue
         if not is_minimum:
-            raise AttitudeError("the directions fit several attitudes equally well: they determine none")
+            raise AttitudeError("several attitudes fit the directions equally well")
         x, y, z = step.tolist()
         # The quaternion is not normalised, because its length error is below the rounding error.
         return multiply(np.array([0.5 * x, 0.5 * y, 0.5 * z, 1.0]), quaternion), loss
-    raise AttitudeError(f"no attitude within {_MAXIMUM_STEPS} steps: no attitude fits the directions")
+    raise AttitudeError(f"no convergence in {_MAXIMUM_STEPS} steps: the directions may fit no attitude")
 
 
 def adjugate(rows: Rows) -> Rows:
@@ -313,4 +313,4 @@ def _cofactors(gram: FloatArray, n: int, name: str) -> tuple[Rows, float]:
 
 
 def _on_one_line(n: int, name: str) -> AttitudeError:
-    return AttitudeError(f"{n} {name} directions on one line fix no attitude: two distinct ones do")
+    return AttitudeError(f"{n} {name} directions on one line do not determine an attitude")

@@ -63,7 +63,7 @@ def test_an_exposure_beyond_the_cameras_is_refused_with_its_limits() -> None:
     [
         ({"name": "Fake_7"}, "there is .*is it plugged in"),
         ({"pixel_format": "Mono12"}, "no pixel format Mono12; it offers .*Mono8"),
-        ({"columns": 4096}, "sensor has 2048 x 2048 pixels; 4096 x 256 are asked for"),
+        ({"columns": 4096}, "sensor has 2048 x 2048 pixels; 4096 x 256 are requested"),
         ({"gain": 99.0}, "gain = 99.0"),
         ({"exposure_ns": 20_000 * MILLISECOND_NS}, "exposure = 20.0 s"),
     ],

@@ -199,7 +199,10 @@ def test_a_camera_that_does_not_expose_as_long_as_it_says_is_refused(
 
 @pytest.mark.parametrize(
     ("clock_flag", "offset_ns", "message"),
-    [(0, 0, "another clock"), (v4l2.STAMP_MONOTONIC, 10**18, "ahead of the monotonic clock: has uvcvideo")],
+    [
+        (0, 0, "not from the monotonic clock"),
+        (v4l2.STAMP_MONOTONIC, 10**18, "ahead of the monotonic clock: has uvcvideo"),
+    ],
 )
 def test_stamps_of_another_clock_are_refused(
     kernel: IoctlCamera, clock: ManualClock, clock_flag: int, offset_ns: int, message: str
@@ -348,13 +351,13 @@ def test_a_path_that_is_not_a_video_device_is_refused(tmp_path: Path, clock: Man
 
 def test_a_node_that_captures_nothing_is_refused(kernel: IoctlCamera, clock: ManualClock) -> None:
     kernel.capabilities = v4l2.CAP_STREAMING  # as the metadata node of a UVC camera
-    with pytest.raises(Refused, match="delivers no video here: give its capture node"):
+    with pytest.raises(Refused, match="cannot capture video: use its capture device"):
         video_rig(kernel, clock)
 
 
 def test_a_camera_that_another_program_has_is_refused(kernel: IoctlCamera, clock: ManualClock) -> None:
     kernel._count = 4
-    with pytest.raises(Refused, match="another program has the camera"):
+    with pytest.raises(Refused, match="another program uses the camera"):
         video_rig(kernel, clock)
 
 
@@ -377,7 +380,7 @@ def test_what_the_camera_cannot_do_is_said(
 
 @pytest.mark.parametrize(
     ("missing", "message"),
-    [(v4l2.EXPOSURE_ABSOLUTE, "no exposure to be set in units of time"), (v4l2.GAIN, "leave `gain` out")],
+    [(v4l2.EXPOSURE_ABSOLUTE, "no exposure to be set in units of time"), (v4l2.GAIN, "omit `gain`")],
 )
 def test_a_camera_without_the_control_is_refused(
     kernel: IoctlCamera, clock: ManualClock, missing: int, message: str

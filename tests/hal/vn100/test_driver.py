@@ -157,7 +157,7 @@ def test_a_unit_set_up_beforehand_is_taken_as_it_is() -> None:
 def test_silence_is_not_responding_and_names_what_was_tried() -> None:
     bench = bench_line()
     bench.line.to_host.faults = LineFaults(silent=True)
-    with pytest.raises(NotResponding, match=r"VNASY,0 in 3 tries of 100 ms at 115200 baud, not one byte"):
+    with pytest.raises(NotResponding, match=r"VNASY,0 in 3 tries of 100 ms at 115200 baud, no byte received"):
         bench.driver.configure()
     assert bench.clock.now_ns() == 300_000_000
     assert bench.driver.link().last_byte_ns == -1

@@ -105,7 +105,7 @@ def test_safe_suspends_the_schedule(link: BothEnds) -> None:
     link.record(link.mode_packet(Mode.SAFE, "commanded"))
     link.turn(8.0)
     assert link.obeyed == []
-    assert "in SAFE the ground decides" in texts(link, counter)[-1]
+    assert "only the ground may decide in mode SAFE" in texts(link, counter)[-1]
 
 
 def test_what_cannot_be_scheduled_is_refused_with_the_reason(link: BothEnds) -> None:
@@ -165,7 +165,7 @@ def test_a_lost_schedule_is_reported_and_a_full_disk_refuses(
         path.write_bytes(b"x")
     link.restart()
     link.turn()
-    assert link.reports()[-1].text == "both copies of the schedule are lost: it is empty"
+    assert link.reports()[-1].text == "both copies of the schedule are lost, so the schedule is empty"
     monkeypatch.setattr(commanding, "overwrite", lambda *_: False)
     with pytest.raises(TimetableError, match="could not be stored"):
         Timetable(link.sky.folder).add(5, 1, 9, "ping 1")

@@ -84,7 +84,7 @@ def test_a_budget_below_the_coming_run_and_a_place_that_cannot_be_written_are_cl
     with pytest.raises(UsageError, match="archive budget of 10 bytes: it must hold the logs of one run, 11"):
         begin_run(tmp_path, 10, 11)
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UsageError, match="no run can be begun there: Not a directory"):
+    with pytest.raises(UsageError, match="a run cannot begin there: Not a directory"):
         begin_run(tmp_path / "file" / "runs", 10, 1)
 
 

@@ -127,7 +127,7 @@ def test_an_old_log_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UsageError, match="file/run: no log can be written there: Not a directory"):
+    with pytest.raises(UsageError, match="file/run: a log cannot be written there: Not a directory"):
         FlightLog(tmp_path / "file" / "run", clock=ManualClock())
 
 

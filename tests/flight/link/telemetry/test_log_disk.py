@@ -218,7 +218,7 @@ def test_a_patient_log_begins_without_its_disk_and_writes_all_when_it_comes(tmp_
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return disk.open(path)
 
-    with pytest.raises(UsageError, match=f"no log can be written there: {os.strerror(errno.ENOSPC)}"):
+    with pytest.raises(UsageError, match=f"a log cannot be written there: {os.strerror(errno.ENOSPC)}"):
         FlightLog(tmp_path, clock=clock, opener=opener)
     log = FlightLog(tmp_path, clock=clock, patient=True, opener=opener)
     for packet in packets:
