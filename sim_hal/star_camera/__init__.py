@@ -1,13 +1,13 @@
-"""The star camera's image model: chapter 2 of Sease 2013, corrected, along the true attitude.
+"""Image model of the star camera: a corrected version of Sease 2013, chapter 2, along the true attitude.
 
     model = StarCameraModel(field_of_view=np.radians(20.0))
     stars = catalogue.load()
     frame = render(model, stars.directions_at(2030.5), stars.magnitude, times, quaternions, rng)
 
-`times` and `quaternions` are the camera's attitude over the exposure, sampled at the steps of the simulation.
-`image` has the camera's parameters, interpolates the attitude and makes the counts. `exposure` integrates the
-light of each source along its path, with a global or a rolling shutter (`line_time`). `objects` adds moving
-objects and the view from an orbit.
+`times` and `quaternions` give the camera's attitude at the simulation's steps during the exposure. The module
+`image` holds the camera's parameters, interpolates the attitude and converts charge to counts. The module
+`exposure` integrates the flux of each source along its path on the detector, for a global or a rolling
+shutter. The module `objects` adds moving objects and the effects of the camera's orbit.
 """
 
 from sim_hal.star_camera.image import (

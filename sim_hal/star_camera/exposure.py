@@ -1,15 +1,16 @@
-"""The light of point sources, integrated along their paths with a global or a rolling shutter.
+"""Charge from point sources, integrated along their paths with a global or a rolling shutter.
 
-Sease renders a still image for each of many short steps of the exposure and adds the images. Here each path
-is divided into spans of a few pixels. In a span the light is integrated over time by Gauss-Legendre
-quadrature. The samples are cheap because the point spread function is separable: the light of all samples on
-a small patch of pixels is one product of two thin matrices, (down, samples) by (samples, across).
+Sease renders a still image for each of many short steps of the exposure and adds the images. This module
+divides each path into spans of a few pixels and integrates the charge of a span over time by Gauss-Legendre
+quadrature. Because the point spread function is separable, the charge of all samples on a small patch of
+pixels is one product of two thin matrices, (rows, samples) by (samples, columns), so many samples are cheap.
 
-With a rolling shutter, row r exposes r line times later than row 0: light on row r at time t counts if u = t
-- start - r * line_time is within the exposure. A source is followed in u along its own path: at u it is at
-row y, at the time start + u + y * line_time. The neighbouring rows are exposed a few line times earlier or
-later, when the source was at another point of its path, so the image of the source is sheared and stretched.
-The quadrature is as smooth as for a global shutter, because no sample is at the edge of the shutter.
+A rolling shutter starts row r r line times after row 0. Light that reaches row r at time t is collected if
+the row time u = t - start - r * line_time is within the exposure. The integration over a source's path uses u
+as its variable: the source is on row y at the time start + u + y * line_time. The neighbouring rows see the
+source a few line times earlier or later, at another point of its path, so the image of the source is sheared
+and stretched. The quadrature converges as fast as for a global shutter, because no sample lies at the edge of
+the shutter's opening.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from knightcube.vision.camera.lens import Pinhole
 DEVICE = "star camera model"
 
 STEPS = 256
-"""Table entries per pixel; interpolation between entries errs by less than 1e-5 of the peak."""
+"""Entries per pixel of the point-spread table; linear interpolation errs by less than 1e-5 of the peak."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,10 +38,11 @@ class PointSpread:
     """A separable point spread function.
 
     Attributes:
-        profile: fraction of the light on a pixel, by the distance (px) of its centre from the point.
-        reach: distance (whole px) from the point's pixel beyond which no light falls.
-        patch: length (px) of a path that is integrated at once.
-        quadrature: number of samples for a path, by its length (px).
+        profile: function from the distance (px) between a pixel's centre and the source to the fraction of
+            the source's charge on that pixel.
+        reach: largest distance (whole px) from the source's pixel at which charge is deposited.
+        patch: longest path (px) that is integrated as one span.
+        quadrature: function from the length (px) of a path to the number of quadrature samples.
     """
 
     profile: Callable[[FloatArray], FloatArray]
@@ -49,7 +51,7 @@ class PointSpread:
     quadrature: Callable[[float], int]
 
     def shares(self, positions: FloatArray, size: int) -> Float32Array:
-        """Return the light (..., size) on pixels 0 .. size - 1 in a line, of points at `positions` (...)."""
+        """Return the charge fractions (..., size) on a line of pixels for sources at `positions` (...)."""
         table, rise = _table(self, size)
         entry, beyond = _entries(positions)
         shares = table.take(entry, axis=0)
@@ -57,7 +59,7 @@ class PointSpread:
         return np.asarray(shares)
 
     def own_shares(self, positions: FloatArray) -> Float32Array:
-        """Return the light (..., size) on pixels 0 .. size - 1, each from its own point of `positions`."""
+        """Return the charge fraction (..., size) on each pixel of a line from its source in `positions`."""
         pixel = np.arange(positions.shape[-1])
         table, rise = _table(self, len(pixel))
         entry, beyond = _entries(positions)
@@ -66,13 +68,13 @@ class PointSpread:
 
 @lru_cache(maxsize=8)
 def integrated_gaussian(sigma: float) -> PointSpread:
-    """Return a Gaussian of `sigma` px integrated over each pixel."""
+    """Return a Gaussian point spread function of `sigma` px, integrated over each pixel."""
 
     def profile(offset: FloatArray) -> FloatArray:
         return np.asarray(ndtr((offset + 0.5) / sigma) - ndtr((offset - 0.5) / sigma))
 
     def quadrature(length: float) -> int:
-        # Gauss-Legendre converges at about one sample a sigma; this many leave 1e-4 of the streak's peak.
+        # Gauss-Legendre needs about one sample per sigma; this number gives errors of 1e-4 of the peak.
         return 1 if length < 0.02 * sigma else math.ceil(1.5 + 0.95 * length / sigma)
 
     return PointSpread(profile, math.ceil(4.0 * sigma), max(4.0, 8.0 * sigma), quadrature)
@@ -80,7 +82,11 @@ def integrated_gaussian(sigma: float) -> PointSpread:
 
 @lru_cache(maxsize=8)
 def bilinear_gaussian(sigma: float) -> PointSpread:
-    """Return the spread of the thesis: light on the nearest pixels (2.5, 2.6), blurred by a kernel (2.9)."""
+    """Return the point spread function of the thesis.
+
+    It places the charge on the four nearest pixels (Sease, eqs. 2.5 and 2.6) and blurs it by a 3 x 3 kernel
+    (Sease, eq. 2.9).
+    """
     taps = np.exp(-0.5 * (np.array([-1.0, 0.0, 1.0]) / sigma) ** 2)
     taps /= taps.sum()
 
@@ -89,14 +95,14 @@ def bilinear_gaussian(sigma: float) -> PointSpread:
         return np.asarray(np.clip(1.0 - distance, 0.0, None) @ taps)
 
     def quadrature(length: float) -> int:
-        # The profile has corners, so samples much closer than a pixel are needed.
+        # The slope of the profile is discontinuous, so samples much closer than a pixel are needed.
         return 1 if length < 1e-3 else math.ceil(2.0 + 8.0 * length)
 
     return PointSpread(profile, 2, 8.0, quadrature)
 
 
 def _entries(positions: FloatArray) -> tuple[IntArray, Float32Array]:
-    """Return the table entry before each of `positions`, and the fraction (0 .. 1) to the next entry."""
+    """Return the table index before each position, and the fraction (0 to 1) towards the next entry."""
     scaled = positions * STEPS
     entry = scaled.astype(np.intp)
     return entry, (scaled - entry).astype(np.float32)
@@ -104,27 +110,30 @@ def _entries(positions: FloatArray) -> tuple[IntArray, Float32Array]:
 
 @lru_cache(maxsize=32)
 def _table(spread: PointSpread, size: int) -> tuple[Float32Array, Float32Array]:
-    """Return the shares (size * STEPS + 1, size) of points 1/STEPS px apart, and their rises to the next."""
+    """Return the table (size * STEPS + 1, size) of charge fractions, and its differences between rows.
+
+    Successive rows are for sources 1/STEPS px apart.
+    """
     positions = np.arange(size * STEPS + 2) / STEPS
     table = spread.profile(np.arange(size) - positions[:, None])
-    # Normalised, so that the light beyond the reach is not lost.
+    # Each entry is normalised, so that the charge beyond the reach of the spread is not lost.
     shares = np.asarray(table / table.sum(axis=1, keepdims=True), dtype=np.float32)
     return shares[:-1], np.diff(shares, axis=0)
 
 
 Vectors = Callable[[FloatArray], FloatArray]
-"""Directions (m, n, 3) of n sources in the camera frame at times (m,)."""
+"""Function that returns the directions (m, n, 3) of n sources in the camera frame at times (m,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A short part of the exposure and its samples (m,); it consists of segments of smooth motion.
+    """Quadrature samples (m,) of a short interval of the exposure, in segments of smooth motion.
 
     Attributes:
-        starts: s, start of the segment of each sample.
-        ends: s, end of the segment of each sample.
-        nodes: position of each sample in its segment, 0 .. 1.
-        weights: quadrature weight of each sample; those of a segment add up to 1.
+        starts: start time of each sample's segment, s.
+        ends: end time of each sample's segment, s.
+        nodes: position of each sample in its segment, from 0 to 1.
+        weights: quadrature weight of each sample; the weights of a segment add up to 1.
     """
 
     starts: FloatArray
@@ -134,12 +143,12 @@ class Span:
 
     @property
     def times(self) -> FloatArray:
-        """Times (m,) of the samples (s)."""
+        """Times (m,) of the quadrature samples (s)."""
         return self.starts + self.nodes * (self.ends - self.starts)
 
     @property
     def durations(self) -> FloatArray:
-        """Time (m,) that each sample represents (s)."""
+        """Durations (m,) that the samples represent (s)."""
         return self.weights * (self.ends - self.starts)
 
 
@@ -151,9 +160,9 @@ def expose(
     electrons: FloatArray,
     knots: FloatArray,
 ) -> None:
-    """Add to `image` (rows, columns) the e- of sources that move smoothly between `knots` (j,) s.
+    """Add the charge (e-) of sources that move smoothly between `knots` (j,), s, to `image` (rows, columns).
 
-    `electrons` (n,) is the light of each source over the whole exposure, `knots[0]` to `knots[-1]`.
+    `electrons` (n,) is the charge from each source over the whole exposure, from `knots[0]` to `knots[-1]`.
     """
     rate = electrons / (knots[-1] - knots[0])
     for span in spans(knots, path_lengths(camera, spread, vectors(knots)), spread):
@@ -165,7 +174,7 @@ def spans(knots: FloatArray, lengths: FloatArray, spread: PointSpread) -> Iterat
     """Divide the exposure into spans in which no path is longer than a patch.
 
     `lengths` (j - 1,) px is the longest path between consecutive `knots` (j,) s. Long intervals are divided
-    and short ones combined; a segment never crosses a knot.
+    and short intervals are combined, but no segment crosses a knot.
     """
     segments: list[tuple[float, float, FloatArray, FloatArray]] = []
     covered = 0.0
@@ -192,13 +201,13 @@ def _span(segments: list[tuple[float, float, FloatArray, FloatArray]]) -> Span:
 
 @lru_cache(maxsize=128)
 def _gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return nodes (count,) on 0 .. 1 and weights that add up to 1."""
+    """Return the Gauss-Legendre nodes (count,) between 0 and 1 and the weights, which add up to 1."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return 0.5 * (nodes + 1.0), 0.5 * weights
 
 
 def path_lengths(camera: Pinhole, spread: PointSpread, vectors: FloatArray) -> FloatArray:
-    """Return the longest path (j - 1,) px between knots of any source on the detector."""
+    """Return the longest path (j - 1,), px, of any source on the detector between consecutive knots."""
     points = camera.project(vectors)
     start, end = points[:-1], points[1:]
     low, high = np.minimum(start, end), np.maximum(start, end)
@@ -208,14 +217,17 @@ def path_lengths(camera: Pinhole, spread: PointSpread, vectors: FloatArray) -> F
 
 
 def touches(low: FloatArray, high: FloatArray, columns: int, rows: int, margin: float) -> BoolArray:
-    """Return which boxes with corners (..., 2) are within `margin` px of the detector; NaN is outside."""
+    """Return which boxes with corners `low` and `high` (..., 2) are within `margin` px of the detector.
+
+    A box with a NaN corner counts as outside.
+    """
     x = (high[..., 0] >= -margin) & (low[..., 0] <= columns - 1 + margin)
     y = (high[..., 1] >= -margin) & (low[..., 1] <= rows - 1 + margin)
     return np.asarray(x & y)
 
 
 def _deposit(image: Float32Array, spread: PointSpread, points: FloatArray, electrons: FloatArray) -> None:
-    """Add `electrons` (m, n) at `points` (m, n, 2); the points of each source are close together."""
+    """Add `electrons` (m, n) at `points` (m, n, 2), px, where the m points of a source are close together."""
     rows, columns = image.shape
     low = np.floor(points.min(axis=0) + 0.5)
     high = np.floor(points.max(axis=0) + 0.5)
@@ -232,7 +244,7 @@ def _deposit(image: Float32Array, spread: PointSpread, points: FloatArray, elect
 
 
 def add_patches(image: Float32Array, patches: Float32Array, corner: FloatArray) -> None:
-    """Add square `patches` (n, size, size), their top-left pixels at `corner` (n, 2) as x, y, to `image`."""
+    """Add `patches` (n, size, size) to `image` with their top-left pixels at `corner` (n, 2), x and y."""
     rows, columns = image.shape
     size = patches.shape[1]
     whole = np.all((corner >= 0.0) & (corner <= (columns - size, rows - size)), axis=1)
@@ -248,17 +260,17 @@ def add_patches(image: Float32Array, patches: Float32Array, corner: FloatArray) 
 
 
 OwnTimes = Callable[[FloatArray, IntArray], FloatArray]
-"""Directions (m, k, 3) of sources number (k,) in the camera frame, at times (m, k) or for all (m, 1)."""
+"""Function from times (m, k) or (m, 1) and source indices (k,) to camera-frame directions (m, k, 3)."""
 
 FASTEST = 0.25
-"""Largest speed of a source (px per line time); at 1 it would keep pace with the shutter."""
+"""Largest speed (px per line time) of a source; at 1 the source would move as fast as the rolling shutter."""
 SETTLED = 1e-4
-"""Convergence limit of the row passages (line times)."""
+"""Convergence limit (line times) of the times at which a source's row is exposed."""
 
 
 @dataclass(frozen=True, slots=True)
 class RollingShutter:
-    """Row r exposes from `start` + r `line_time` for `exposure` s."""
+    """A rolling shutter, which exposes row r from `start` + r * `line_time` for `exposure` s."""
 
     start: float
     exposure: float
@@ -274,9 +286,9 @@ def expose_rolling(
     knots: FloatArray,
     shutter: RollingShutter,
 ) -> None:
-    """Add to `image` (rows, columns) the e- of sources that move smoothly between `knots` (j,) s.
+    """Add the charge (e-) of sources that move smoothly between `knots` (j,), s, to `image` (rows, columns).
 
-    `electrons` (n,) is the light of each source over the exposure. Raises OutOfRange for a source on the
+    `electrons` (n,) is the charge from each source over the exposure. Raises OutOfRange for a source on the
     detector that moves more than a quarter of a pixel in a line time.
     """
     everyone = np.arange(len(electrons))
@@ -284,9 +296,9 @@ def expose_rolling(
     fastest = float(np.max(lengths / np.diff(knots))) * shutter.line_time
     if fastest > FASTEST:
         raise OutOfRange(DEVICE, "motion of a source in a line time", fastest, 0.0, FASTEST, "px")
-    # The stretched image is longer by the factor 1 / (1 - speed).
+    # A rolling shutter stretches the image of a moving source by the factor 1 / (1 - speed).
     reach = math.ceil(spread.reach / (1.0 - fastest))
-    # A source just above the first row or below the last row lights them but is itself on no row.
+    # A source just outside the first or last row still adds charge to that row.
     knots = knots.copy()
     knots[[0, -1]] += np.array([-1.0, 1.0]) * (reach + 1) * shutter.line_time
     first, last = (
@@ -301,7 +313,7 @@ def expose_rolling(
             times = starts + span.nodes[:, None] * (ends - starts)
             points = camera.project(vectors(times, near))
             shift = camera.project(vectors(times + shutter.line_time, near)) - points
-            # u grows more slowly than t while the source moves down, like the shutter.
+            # The row time u grows more slowly than t while a source moves down the image.
             light = span.weights[:, None] * (ends - starts) * (1.0 - shift[..., 1]) / shutter.exposure
             _deposit_rows(image, spread, reach, points, shift, light * electrons[near])
 
@@ -314,10 +326,10 @@ def _passes(
     shutter: RollingShutter,
     phase: float,
 ) -> FloatArray:
-    """Return the times (n,) s at which the row of each source is `phase` s into its exposure."""
+    """Return the times (n,), s, at which the row of each source has been exposed for `phase` s."""
     outside = reach + 1.0
     times = np.full(len(sources), shutter.start + phase + 0.5 * camera.rows * shutter.line_time)
-    # Each iteration reduces the error of sources on the detector to a quarter or less.
+    # Each iteration reduces the error to a quarter or less for sources on the detector.
     for _ in range(math.ceil(math.log(SETTLED / camera.rows) / math.log(FASTEST)) + 1):
         row = camera.project(vectors(times[None], sources))[0, :, 1]
         row = np.clip(np.nan_to_num(row, nan=-outside), -outside, camera.rows + outside)
@@ -328,7 +340,7 @@ def _passes(
 
 
 def _near(camera: Pinhole, margin: float, vectors: OwnTimes, sources: IntArray, span: Span) -> IntArray:
-    """Return the sources within `margin` px of the detector at an end of `span`."""
+    """Return the indices of sources whose path during `span` comes within `margin` px of the detector."""
     ends = camera.project(vectors(np.array([span.starts[:1], span.ends[-1:]]), sources))
     return np.flatnonzero(touches(ends.min(axis=0), ends.max(axis=0), camera.columns, camera.rows, margin))
 
@@ -341,7 +353,7 @@ def _deposit_rows(
     shift: FloatArray,
     electrons: FloatArray,
 ) -> None:
-    """Add `electrons` (m, k) at `points` (m, k, 2), shifted by `shift` (m, k, 2) px with every row."""
+    """Add `electrons` (m, k) at `points` (m, k, 2), px, moved by `shift` (m, k, 2), px, from row to row."""
     low = np.floor(points.min(axis=0) + 0.5)
     high = np.floor(points.max(axis=0) + 0.5)
     seen = np.flatnonzero(touches(low, high, image.shape[1], image.shape[0], reach))
@@ -351,7 +363,7 @@ def _deposit_rows(
     corner = low[seen] - reach
     size = int(np.max(high[seen] - low[seen])) + 2 * reach + 1
     place = points[:, seen] - corner
-    # Line times by which each row of the patch is exposed later than the source's row: (m, k, size).
+    # `later` (m, k, size) is the delay, in line times, of each patch row after the source's row.
     later = np.arange(size) - place[..., 1:]
     across = spread.shares(np.clip(place[..., :1] + later * shift[..., :1], 0.0, size), size)
     down = spread.own_shares(np.clip(place[..., 1:] + later * shift[..., 1:], 0.0, size))

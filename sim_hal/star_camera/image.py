@@ -1,9 +1,9 @@
-"""The star camera: its parameters, and its frames of stars and moving sources over an exposure.
+"""The star camera's parameters, and the frames it takes of stars and moving sources.
 
-The attitude during an exposure is interpolated between samples by a rotation at constant rate. Sease 2.12
-integrates one constant rate from the start of the exposure; here the true attitude is given, so that the
-acceleration of a slew or a jitter appears in the streak. The detector adds noise and saturation and gives
-counts (Sease 2.10, 2.11).
+The attitude during an exposure is interpolated between samples by a rotation at constant rate. Sease, eq.
+2.12, integrates one constant rate from the start of the exposure. This module uses samples of the true
+attitude, so that acceleration and jitter appear in the streaks. The detector adds noise, saturates and
+converts charge to counts (Sease, eqs. 2.10 and 2.11).
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from sim_hal.star_camera.exposure import (
 )
 
 HotPixel = tuple[int, int, float]
-"""Column, row, and dark current (e-/s) above that of the other pixels."""
+"""Column and row of a hot pixel, and its dark current (e-/s) in excess of the other pixels."""
 
-# Minimum, maximum and unit of each parameter.
+# Minimum, maximum and unit of each camera parameter.
 _LIMITS: dict[str, tuple[float, float, str]] = {
     "columns": (1, 16_384, "px"),
     "rows": (1, 16_384, "px"),
@@ -56,27 +56,31 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StarCameraModel:
-    """A star camera; the defaults are a CubeSat's, 1024 x 1024 over 20 degrees.
+    """A star camera; the defaults describe a CubeSat camera with 1024 x 1024 px over 20 degrees.
 
     Attributes:
-        columns: pixels across.
-        rows: pixels down.
-        field_of_view: rad, across the columns, edge to edge.
-        aperture: m, diameter.
-        zero_magnitude_flux: e-/s per m^2 of aperture for V = 0 (Sease 2.7 corrected: 19,000 is per mm^2).
-        read_noise: e-, standard deviation.
-        dark_current: e-/s per pixel.
-        gain: e- per count; the thesis calls it quantum efficiency.
-        pedestal: counts added before the conversion, so that negative noise is not clipped.
-        bits: resolution of the converter.
-        full_well: e-, capacity of a pixel.
-        psf_sigma: px, standard deviation of the Gaussian blur.
-        psf: "integrated" over each pixel, or "bilinear": placed on four pixels and blurred with a sampled
-            3 x 3 kernel, as in the thesis (2.5, 2.6, 2.9).
-        noise: "poisson" (with Gaussian read noise), or "uniform": the thesis's own draw (text at 2.11).
-        hot_pixels: pixels with a higher dark current.
-        line_time: s between the exposures of consecutive rows; 0 is a global shutter.
-        background_gradient: counts/px of stray light along x and y; it is zero in the darkest corner.
+        columns: number of pixel columns.
+        rows: number of pixel rows.
+        field_of_view: angle across the columns, from edge to edge, rad.
+        aperture: diameter of the aperture, m.
+        zero_magnitude_flux: charge rate from a source of V = 0, e-/s per m^2 of aperture (Sease, eq. 2.7,
+            where 19,000 is per mm^2).
+        read_noise: standard deviation of the read noise, e-.
+        dark_current: dark current of each pixel, e-/s.
+        gain: charge per count, e-, which the thesis calls quantum efficiency.
+        pedestal: counts added before the analogue-to-digital conversion, so that negative noise is not
+            clipped.
+        bits: resolution of the analogue-to-digital converter, bits.
+        full_well: charge capacity of a pixel, e-.
+        psf_sigma: standard deviation of the Gaussian point spread function, px.
+        psf: "integrated" integrates the Gaussian over each pixel. "bilinear" places the charge on four pixels
+            and blurs it with a sampled 3 x 3 kernel (Sease, eqs. 2.5, 2.6, 2.9).
+        noise: "poisson" is Poisson noise with Gaussian read noise. "uniform" is the uniform noise of Sease,
+            eq. 2.11.
+        hot_pixels: hot pixels, whose dark current is higher.
+        line_time: time between the exposures of consecutive rows, s; 0 is a global shutter.
+        background_gradient: gradient of the stray light along x and y, counts/px; the stray light is zero in
+            the darkest corner of the image.
     """
 
     columns: int = 1024
@@ -115,24 +119,24 @@ class StarCameraModel:
 
     @property
     def pinhole(self) -> Pinhole:
-        """The camera's geometry (Sease 2.3, 2.4 corrected)."""
+        """Pinhole geometry of the camera (Sease, eqs. 2.3 and 2.4, corrected)."""
         return Pinhole.from_field_of_view(self.columns, self.rows, self.field_of_view)
 
     @property
     def highest_count(self) -> int:
-        """The count at which the converter saturates."""
+        """Count at which the analogue-to-digital converter saturates."""
         return (1 << self.bits) - 1
 
     @property
     def count_type(self) -> type[np.uint8] | type[np.uint16]:
-        """The smallest unsigned integer that holds a count."""
+        """Smallest unsigned integer type that holds a count."""
         return np.uint8 if self.bits <= 8 else np.uint16
 
     def exposure_within(self, span: float) -> float:
         """Return the exposure (s) of each row if all rows together take `span` s.
 
-        A rolling shutter takes rows times line time longer than its exposure. Raises OutOfRange if no time is
-        left for the exposure.
+        With a rolling shutter, the frame takes the number of rows times the line time longer than the
+        exposure. Raises OutOfRange if this readout takes the whole `span`.
         """
         readout = self.rows * self.line_time
         if not span > readout:
@@ -140,7 +144,7 @@ class StarCameraModel:
         return span - readout
 
     def electrons(self, magnitudes: npt.ArrayLike, exposure: float) -> FloatArray:
-        """Return the e- of sources of Johnson V `magnitudes` in `exposure` s (Sease 2.8)."""
+        """Return the charge (e-) from sources of Johnson V `magnitudes` in `exposure` s (Sease, eq. 2.8)."""
         area = 0.25 * math.pi * self.aperture**2
         brightness = 10.0 ** (-0.4 * np.asarray(magnitudes, dtype=float))
         return np.asarray(self.zero_magnitude_flux * area * exposure * brightness)
@@ -149,7 +153,10 @@ class StarCameraModel:
 def scatter_hot_pixels(
     model: StarCameraModel, count: int, mean_current: float, rng: np.random.Generator
 ) -> StarCameraModel:
-    """Return `model` with `count` random hot pixels of exponential current; `mean_current` is in e-/s."""
+    """Return `model` with `count` random hot pixels.
+
+    The dark currents are exponentially distributed with the mean `mean_current` (e-/s).
+    """
     places = rng.choice(model.columns * model.rows, size=count, replace=False)
     currents = rng.exponential(mean_current, size=count)
     hot = tuple(
@@ -160,12 +167,12 @@ def scatter_hot_pixels(
 
 
 GREATEST_TURN = 0.5 * np.pi
-"""Largest rotation (rad) between two attitude samples; beyond pi the shorter rotation would be wrong."""
+"""Largest rotation (rad) between two attitude samples; beyond pi, interpolation takes the wrong way."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeHistory:
-    """Attitudes (k, 4), ICRS into camera, at `times` (k,) s; the first and the last bound the exposure."""
+    """Attitudes (k, 4), ICRS into camera, at `times` (k,), s, from the start to the end of the exposure."""
 
     times: FloatArray
     quaternions: FloatArray
@@ -198,18 +205,18 @@ class AttitudeHistory:
         return float(self.times[-1] - self.times[0])
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Return the attitudes (m, 4) at `times` (m,); extrapolated beyond the ends."""
+        """Return the attitudes (m, 4) at `times` (m,), s, extrapolated beyond the first and last sample."""
         return _interpolate(self.times, self.quaternions, times)
 
     def matrices_at(self, times: FloatArray) -> FloatArray:
-        """Return the attitude matrices (m, 3, 3), ICRS into camera, at `times` (m,)."""
+        """Return the attitude matrices (m, 3, 3), ICRS into camera, at `times` (m,), s."""
         return quaternion.attitude_matrix(self.at(times))
 
     def knots(self, tolerance: float, longest_turn: float) -> FloatArray:
-        """Return times (j,) from start to end between which the motion is smooth and short.
+        """Return the knots (j,), s: times from start to end between which the rotation is small and uniform.
 
         Between two knots the attitude is within `tolerance` rad of a rotation at constant rate, and the
-        rotation is `longest_turn` rad at most. The number of knots does not grow with that of the samples.
+        rotation is at most `longest_turn` rad. More samples of the same motion do not give more knots.
         """
         last = len(self.times) - 1
         kept = np.arange(last + 1)
@@ -241,18 +248,18 @@ def _turns(quaternions: FloatArray) -> FloatArray:
 
 
 FAINT_SHARE = 0.25
-"""Largest light of a faint pixel, as a fraction of the variance of the background."""
+"""Largest charge of a faint pixel, as a fraction of the background's variance."""
 GREATEST_SKEWNESS = 0.05
-"""Largest skewness of noise drawn as Gaussian; the distribution function errs by 0.004 (Edgeworth)."""
+"""Largest skewness of noise drawn as Gaussian, whose distribution then errs by 0.004 (Edgeworth)."""
 
 SLICES, OUTER_SLICES = 1 << 16, 64
-"""Slices of equal probability of the normal distribution, and the outermost ones of each tail."""
+"""Number of equally probable slices of the normal distribution, and of outermost slices in each tail."""
 
 
 def counts(
     model: StarCameraModel, electrons: Float32Array, exposure: float, rng: np.random.Generator
 ) -> Image:
-    """Return the frame (rows, columns) of counts for `electrons` (rows, columns) of light in `exposure` s."""
+    """Return the frame (rows, columns), counts, for `electrons` (rows, columns) after `exposure` s."""
     light = electrons
     if model.hot_pixels:
         light = electrons.copy()
@@ -263,7 +270,7 @@ def counts(
     draw = _uniform if model.noise == "uniform" else _poisson
     signal = draw(model, light, exposure, rng)
     signal *= np.float32(1.0 / model.gain)
-    signal += np.float32(model.pedestal + 0.5)  # truncation below then rounds to the nearest count
+    signal += np.float32(model.pedestal + 0.5)  # with 0.5, truncation rounds to the nearest count
     np.clip(signal, 0.0, model.highest_count, out=signal)
     return np.asarray(signal.astype(model.count_type))
 
@@ -277,9 +284,9 @@ def _stray_light(model: StarCameraModel) -> Float32Array:
 def _poisson(
     model: StarCameraModel, light: Float32Array, exposure: float, rng: np.random.Generator
 ) -> Float32Array:
-    """Return e- with shot noise of light and dark current, clipped at the full well, and read noise.
+    """Return the charge (e-) with shot noise and read noise, clipped at the full well.
 
-    Sease 2.10 and 2.11 corrected: Poisson and Gaussian noise instead of uniform noise. In pixels with little
+    Poisson and Gaussian noise replace the uniform noise of Sease, eqs. 2.10 and 2.11. In pixels with little
     light and nearly Gaussian background noise, one Gaussian with the total mean and variance is drawn.
     """
     dark = model.dark_current * exposure
@@ -300,10 +307,11 @@ def _poisson(
 
 
 def _normal(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
-    """Return standard normal draws, four times as fast as those of the generator.
+    """Return standard normal draws four times as fast as the generator of numpy.
 
     A 16-bit number selects one of 65,536 slices of equal probability, and the draw is the centre of the
-    slice. In the outermost slices, which are wide, the draw is a random point, so that the tails are right.
+    slice. In the outermost slices, which are wide, the draw is a random point of the slice, so that the tails
+    of the distribution are correct.
     """
     count = int(np.prod(shape))
     words = rng.integers(0, 2**64, size=(count + 3) // 4, dtype=np.uint64)
@@ -323,7 +331,7 @@ def _slice_middles() -> Float32Array:
 def _exact(
     model: StarCameraModel, light: Float32Array, dark: float, rng: np.random.Generator
 ) -> npt.NDArray[np.float32]:
-    # A mean of ten wells and a thousand electrons fills the well for certain; larger means overflow.
+    # A mean of ten full wells plus 1,000 e- always saturates, and a larger mean would overflow `rng.poisson`.
     mean = np.minimum(light.astype(np.float64) + dark, 10.0 * model.full_well + 1000.0)
     collected = np.minimum(rng.poisson(mean), model.full_well).astype(np.float32)
     collected += np.float32(model.read_noise) * rng.standard_normal(light.shape, dtype=np.float32)
@@ -333,7 +341,10 @@ def _exact(
 def _uniform(
     model: StarCameraModel, light: Float32Array, exposure: float, rng: np.random.Generator
 ) -> Float32Array:
-    """Return e- with the thesis's draw: sqrt(signal) and sqrt(RN^2 + DC T), each times a uniform 0 .. 1."""
+    """Return the charge (e-) with the uniform noise of the thesis.
+
+    The noise is the sum of sqrt(signal) and sqrt(RN^2 + DC T), each multiplied by a uniform draw from 0 to 1.
+    """
     rest = np.sqrt(model.read_noise**2 + model.dark_current * exposure)
     signal = light + np.sqrt(light) * rng.random(light.shape, dtype=np.float32)
     signal += np.float32(rest) * rng.random(light.shape, dtype=np.float32)
@@ -341,16 +352,16 @@ def _uniform(
 
 
 SMOOTHNESS = 0.01
-"""Largest error (px at the boresight) of smooth motion between knots."""
+"""Largest error (px at the boresight) of assuming a constant rate between knots."""
 LONGEST_TURN = 0.05
-"""Largest rotation (rad) between knots; an arc then exceeds its chord by 0.01 %."""
+"""Largest rotation (rad) between knots; an arc of this angle is 0.01 % longer than its chord."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceTrack:
-    """A point source that moves in the sky: directions (k, 3) ICRS at `times` (k,) s, and its Johnson V.
+    """A moving point source of Johnson V `magnitude`, with directions (k, 3), ICRS, at `times` (k,), s.
 
-    Between samples it moves evenly along the chord. The samples must cover the exposure.
+    Between two samples the source moves uniformly along the chord. The samples must cover the exposure.
     """
 
     times: FloatArray
@@ -374,7 +385,7 @@ class SourceTrack:
         object.__setattr__(self, "directions", directions)
 
     def directions_at(self, times: FloatArray) -> FloatArray:
-        """Return unit vectors (m, 3) at `times` (m,); extrapolated beyond the ends."""
+        """Return the unit vectors (m, 3) to the source at `times` (m,), s, with extrapolation."""
         before = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         share = (times - self.times[before]) / (self.times[before + 1] - self.times[before])
         start, end = self.directions[before], self.directions[before + 1]
@@ -390,12 +401,13 @@ def expected_electrons(
     quaternions: FloatArray,
     extra: Sequence[SourceTrack] = (),
 ) -> FloatArray:
-    """Return the light (rows, columns) of an exposure, e-, without noise, dark current and saturation.
+    """Return the charge (rows, columns) of an exposure, e-, without noise, dark current and saturation.
 
-    `directions` (n, 3) are ICRS unit vectors and `magnitudes` (n,) Johnson V. `times` (k,) s and
-    `quaternions` (k, 4), ICRS into camera, are the attitude from the start to the end of the exposure; with a
-    rolling shutter to the end of the last row's exposure. Sease 2.1-2.9 and 2.12, corrected. Raises
-    ValueError for arrays of the wrong shape or not finite, and OutOfRange for an invalid attitude.
+    `directions` (n, 3) are ICRS unit vectors to the stars and `magnitudes` (n,) their Johnson V magnitudes.
+    `quaternions` (k, 4), ICRS into camera, at `times` (k,), s, give the attitude from the start to the end of
+    the exposure, which for a rolling shutter is the end of the last row's exposure. The model is a corrected
+    version of Sease, eqs. 2.1 to 2.9 and 2.12. Raises ValueError for arrays of the wrong shape or with values
+    that are not finite, and OutOfRange for an invalid attitude.
     """
     history = AttitudeHistory(times, quaternions)
     return _light(model, directions, magnitudes, history, extra).astype(np.float64)
@@ -410,9 +422,9 @@ def render(
     rng: np.random.Generator,
     extra: Sequence[SourceTrack] = (),
 ) -> Image:
-    """Return the camera's frame (rows, columns): uint8 for up to 8 bits, else uint16.
+    """Return the camera's frame (rows, columns) as uint8 for up to 8 bits, else as uint16.
 
-    Arguments as for `expected_electrons`; all noise is drawn from `rng`.
+    The arguments are those of `expected_electrons`. All noise is drawn from `rng`.
     """
     history = AttitudeHistory(times, quaternions)
     light = _light(model, directions, magnitudes, history, extra)
@@ -429,7 +441,7 @@ def _light(
     directions, magnitude = np.asarray(directions, dtype=float), np.asarray(magnitudes, dtype=float)
     if directions.ndim != 2 or directions.shape[1] != 3 or magnitude.shape != directions.shape[:1]:
         raise ValueError(f"stars {directions.shape} and magnitudes {magnitude.shape}: give (n, 3) and (n,)")
-    # A sum is finite only if every term is, which needs no array of flags.
+    # A sum is finite only if every term is finite, so checking the sum avoids an array of flags.
     if not (np.isfinite(directions.sum()) and np.isfinite(magnitude.sum())):
         raise ValueError("star directions and magnitudes must be finite")
     camera = model.pinhole
@@ -464,7 +476,7 @@ def _light(
 
 def _stars_seen_by(history: AttitudeHistory, directions: FloatArray) -> Vectors:
     def vectors(times: FloatArray) -> FloatArray:
-        # One product for all times; the stars stay innermost in memory, where the arithmetic is fast.
+        # One matrix product serves all times, and the stars stay the innermost axis in memory, which is fast.
         seen = history.matrices_at(times).reshape(-1, 3) @ directions.T
         return np.swapaxes(seen.reshape(len(times), 3, -1), 1, 2)
 
@@ -472,7 +484,7 @@ def _stars_seen_by(history: AttitudeHistory, directions: FloatArray) -> Vectors:
 
 
 def _at_own_times(history: AttitudeHistory, directions: OwnTimes) -> OwnTimes:
-    """Return `directions` (..., 3), ICRS, of sources at their own times in the camera frame."""
+    """Return a function that gives ICRS `directions` (..., 3) in the camera frame at the sources' times."""
 
     def vectors(times: FloatArray, sources: IntArray) -> FloatArray:
         matrices = history.matrices_at(times.reshape(-1)).reshape(*times.shape, 3, 3)
@@ -490,7 +502,7 @@ def _alone(own: OwnTimes, times: FloatArray) -> FloatArray:
 
 
 def _near_the_field(camera: Pinhole, directions: FloatArray, boresights: FloatArray, margin: int) -> IntArray:
-    """Return the indices of the stars that the field may cross on its way along `boresights` (j, 3)."""
+    """Return the indices of the stars that the field of view may cross along `boresights` (j, 3)."""
     middle = boresights.sum(axis=0)
     length = float(np.linalg.norm(middle))
     if length < 0.5 * len(boresights):

@@ -1,8 +1,8 @@
-"""The star camera in orbit: objects that move in its sky, aberration, and light that spoils its frames.
+"""Effects of the star camera's orbit: moving objects, aberration, blinding and the Earth in view.
 
-An object on a line of sight moves on a great circle among the stars. An object in orbit is lit by the Sun and
-hidden by the Earth. Its magnitude does not depend on the observer, except for the part of the Sun that the
-Earth hides from it.
+An object with a line of sight moves along a great circle among the stars. An object in orbit is lit by the
+Sun and can be hidden by the Earth. The magnitude of an object changes only when the Earth covers part of the
+Sun for that object.
 
     camera = propagate(KeplerianElements(semi_major_axis=6748e3, inclination=0.497), 55_000.0)
     orbit = propagate(KeplerianElements(semi_major_axis=7078e3, inclination=1.553), 55_000.0)
@@ -10,11 +10,11 @@ Earth hides from it.
     tracks = source_tracks(camera, [debris], epoch=2_461_041.5, start=120.0, end=120.5)
     frame = render(model, directions, magnitudes, times, quaternions, rng, extra=tracks)
 
-Aberration by the camera's motion rotates the whole frame by its value at the boresight (26" at most); the
-change of scale across 20 deg, 4", is not modelled. An object in orbit shares the Earth's motion, so that the
-part of the aberration by the Earth's motion does not apply to it; its track is shifted back by that part.
-Sunlight beside the field, on ground in the field or through the baffle saturates the frame; the dark Earth
-hides the stars behind it.
+Stellar aberration by the camera's motion is modelled as a rotation of the whole frame by the aberration at
+the boresight (26" at most). The variation of the aberration across 20 deg, 4", is not modelled. An object in
+orbit shares the Earth's motion, so its track is shifted back by the aberration that the Earth's motion
+causes. The frame saturates if the Sun is near the field of view or if sunlit ground is in the field. The dark
+Earth hides the stars behind it.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ from sim_hal.worlds.orbit import Orbit, propagate, sun_position
 from sim_hal.worlds.world import OrbitEnvironment, OrbitingWorld, World, orbiting, utc_date
 
 Expose = Callable[[int, FloatArray, FloatArray, Sequence[SourceTrack]], Future[Image]]
-"""Renders a frame from its number, times (k,) s, camera attitudes (k, 4), and the tracks of objects."""
+"""Function that renders a frame from its number, times (k,), s, camera attitudes (k, 4) and object tracks."""
 
 DEVICE = "resident space object"
 TRACK_ERROR = 1e-7
-"""Error (rad) of a track between its samples: 3e-4 px of the standard camera."""
+"""Largest interpolation error (rad) of a track between its samples, 3e-4 px of the standard camera."""
 NEAREST = 1.0
 """Shortest distance (m) at which an object is modelled as a point."""
 _FIRST_DURATION = 1000.0
-"""Time (s) over which an object's orbit is integrated at first; it is doubled as needed."""
+"""Minimum duration (s) over which an object's orbit is integrated."""
 _SAMPLES = 17
-"""Samples of a track on a great circle; at 20 deg/s and 1 s the chords are within 6e-5 rad of it."""
+"""Number of samples of a great-circle track, whose chords err by 6e-5 rad at 20 deg/s over 1 s."""
 BAFFLE = np.radians(25.0)
-"""Angle (rad) outside the corner of the field within which the Sun blinds the camera."""
+"""Angle (rad) beyond the corner of the field within which the Sun blinds the camera."""
 
 
 def hidden_by_earth(position: FloatArray, target: FloatArray) -> BoolArray:
-    """Return for which pairs the Earth is between `position` and `target`, (m, 3) each."""
+    """Return whether (m,) the Earth is between `position` (m, 3) and `target` (m, 3), both geocentric, m."""
     way = target - position
     length = np.sum(way * way, axis=-1)
     nearest = np.clip(-np.sum(position * way, axis=-1) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
@@ -70,15 +70,15 @@ class BodyTrajectory(Protocol):
     """The trajectory of a body, such as an `Orbit`."""
 
     def states_at(self, times: FloatArray) -> FloatArray:
-        """Return positions (m) and velocities (m/s), (m, 6), at `times` (m,) s."""
+        """Return the states (m, 6), position (m) and velocity (m/s), at `times` (m,), s."""
 
     def positions_at(self, times: FloatArray) -> FloatArray:
-        """Return positions (m, 3) in m at `times` (m,) s."""
+        """Return the positions (m, 3), m, at `times` (m,), s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidentSpaceObject:
-    """An object on its `orbit`, of Johnson V `magnitude` in full sunlight."""
+    """An object in orbit whose Johnson V magnitude in full sunlight is `magnitude`."""
 
     orbit: Orbit
     magnitude: float
@@ -94,13 +94,13 @@ def source_tracks(
     zero: float = 0.0,
     shadow: Shadow = "conical",
 ) -> list[SourceTrack]:
-    """Return the tracks from `start` to `end` s of the objects that are visible.
+    """Return the tracks of the visible objects from `start` to `end` s.
 
-    `epoch` is the Julian date TT of the orbits' time 0. The times of the tracks count from `zero` s, so that
-    they agree with those of an attitude history. An object in the umbra or behind the Earth throughout is
-    left out; an object partly lit, or lit for part of the time, is fainter accordingly, evenly over the
-    track. For a rolling shutter, `end` is the end of the last row's exposure. Raises OutOfRange beyond the
-    ends of the orbits, and for an object within 1 m.
+    `epoch` is the Julian date (TT) at time 0 of the orbits. The times of the returned tracks count from
+    `zero` s, as those of an attitude history do. An object that is in the umbra or behind the Earth the whole
+    time is omitted. An object that is partly lit, or lit for part of the time, gets its mean brightness over
+    the track. For a rolling shutter, `end` is the end of the last row's exposure. Raises OutOfRange for times
+    outside the orbits, and for an object within 1 m of the camera.
     """
     if not start < end:
         raise OutOfRange(DEVICE, "end of the exposure", end, start, math.inf, "s")
@@ -119,16 +119,16 @@ def source_tracks(
 
 
 def directions(observer: FloatArray, position: FloatArray) -> FloatArray:
-    """Return unit vectors (m, 3) from `observer` to `position`, (m, 3) m each."""
+    """Return the unit vectors (m, 3) from `observer` (m, 3) to `position` (m, 3), both in m."""
     way = position - observer
     return np.asarray(way / np.linalg.norm(way, axis=-1, keepdims=True))
 
 
 def _track_times(camera: BodyTrajectory, orbit: Orbit, start: float, end: float) -> FloatArray:
-    """Return times between which linear interpolation of the direction is within `TRACK_ERROR`.
+    """Return times (s) between which linear interpolation of the direction errs by at most `TRACK_ERROR`.
 
-    The direction of an object that passes at speed v and distance d accelerates by 0.65 (v/d)^2 at most; the
-    error of a step h is an eighth of that, times h^2.
+    The direction of an object that passes at speed v and distance d accelerates by at most 0.65 (v/d)^2. An
+    angular acceleration a gives an interpolation error of a h^2 / 8 in a step of h s.
     """
     times = np.linspace(start, end, 9)
     apart = orbit.states_at(times) - camera.states_at(times)
@@ -141,10 +141,13 @@ def _track_times(camera: BodyTrajectory, orbit: Orbit, start: float, end: float)
 
 
 class SkyObjects:
-    """The objects of a simulated sky; mission time counts from `start_ns` until `begin` is called."""
+    """The moving objects of a simulated sky; until `begin` is called, mission time counts from `start_ns`."""
 
     def __init__(self, entries: Sequence[SkyObject], utc: str, start_ns: int, world: World) -> None:
-        """Take the objects; `utc` is the time of `start_ns`. Raises ConfigError for an invalid object."""
+        """Store the objects.
+
+        `utc` is the UTC at `start_ns`. Raises ConfigError for an invalid object.
+        """
         for number, entry in enumerate(entries):
             name = f"simulation.objects[{number}]"
             if (entry.line_of_sight is None) == (entry.state is None):
@@ -159,11 +162,14 @@ class SkyObjects:
         self._orbits = [None if entry.state is None else _GrowingOrbit(entry.state) for entry in entries]
 
     def begin(self, epoch_ns: int) -> None:
-        """Begin mission time at `epoch_ns`."""
+        """Set mission time zero to `epoch_ns`."""
         self._epoch_ns = epoch_ns
 
     def tracks(self, start_ns: int, times: FloatArray) -> list[SourceTrack]:
-        """Return the tracks over an exposure from `start_ns`; `times` (k,) s count from its start to now."""
+        """Return the tracks during the exposure that starts at `start_ns`.
+
+        `times` (k,), s, run from the start of the exposure to now.
+        """
         found: list[SourceTrack] = []
         for entry, orbit in zip(self._entries, self._orbits, strict=True):
             mission = (start_ns - self._epoch_ns) * 1e-9 + times[[0, -1]]
@@ -191,21 +197,21 @@ class SkyObjects:
             directions = track.directions - own
             directions /= np.linalg.norm(directions, axis=1, keepdims=True)
             at = track.times.copy()
-            at[0], at[-1] = times[0], times[-1]  # despite rounding the track must cover the exposure
+            at[0], at[-1] = times[0], times[-1]  # makes the track cover the exposure in spite of rounding
             shifted.append(SourceTrack(at, directions, track.magnitude))
         return shifted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FreeFall:
-    """A fall of about a second around the Earth, from position (3,) m and velocity (3,) m/s at time `at`."""
+    """Free fall for about a second from a position (3,), m, with a velocity (3,), m/s, at time `at`."""
 
     at: float
     position: FloatArray
     velocity: FloatArray
 
     def states_at(self, times: FloatArray) -> FloatArray:
-        """Return positions and velocities (m, 6); the error after a second is 0.03 mm."""
+        """Return the states (m, 6), whose position error after one second is 0.03 mm."""
         since = (np.asarray(times) - self.at)[:, None]
         pull = -GRAVITATIONAL_PARAMETER * self.position / np.linalg.norm(self.position) ** 3
         places = self.position + since * self.velocity + 0.5 * since**2 * pull
@@ -217,25 +223,25 @@ class _FreeFall:
 
 
 class _GrowingOrbit:
-    """The orbit of an object, integrated as far as needed."""
+    """The orbit of an object, integrated again for a longer time when needed."""
 
     def __init__(self, start: ObjectState) -> None:
         self._start = start
         self._orbit: Orbit | None = None
 
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """Return position (3,) m and velocity (3,) m/s at the start."""
+        """Return the position (3,), m, and the velocity (3,), m/s, at time zero."""
         return np.array(self._start.position), np.array(self._start.velocity)
 
     def until(self, end: float) -> Orbit:
-        """Return the orbit from 0 to at least `end` s."""
+        """Return the orbit from time 0 to at least `end` s."""
         if self._orbit is None or self._orbit.duration < end:
             self._orbit = propagate(self, max(2.0 * end, _FIRST_DURATION))
         return self._orbit
 
 
 def _on_circle(line: LineOfSight, magnitude: float, mission: float, times: FloatArray) -> SourceTrack:
-    """Return the track of an object on a great circle; the exposure starts at `mission` s."""
+    """Return the great-circle track of an object for an exposure that starts at mission time `mission` s."""
     right, up = math.radians(line.right_ascension_deg), math.radians(line.declination_deg)
     towards = math.radians(line.towards_deg)
     place = np.array([math.cos(up) * math.cos(right), math.cos(up) * math.sin(right), math.sin(up)])
@@ -248,14 +254,17 @@ def _on_circle(line: LineOfSight, magnitude: float, mission: float, times: Float
 
 
 def _dimming(tumble: Tumble, start: float, end: float) -> float:
-    """Return by how many magnitudes the mean light between two mission times is below the nominal light."""
+    """Return the dimming (mag) of a tumbling object's mean flux between two mission times."""
     middles = start + (end - start) * (np.arange(64) + 0.5) / 64
     phase = 2.0 * np.pi * middles / tumble.period + math.radians(tumble.phase_deg)
     return float(-2.5 * math.log10(np.mean(10.0 ** (-0.4 * tumble.amplitude * np.sin(phase)))))
 
 
 def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera) -> Expose:
-    """Return the exposure of a camera in orbit; `expose` renders the stars without Earth and Sun."""
+    """Return the exposure function of a camera in orbit.
+
+    The function `expose` renders the stars without Earth and Sun.
+    """
     pinhole = Pinhole.from_field_of_view(camera.columns, camera.rows, np.radians(camera.field_of_view_deg))
     top = (1 << camera.bits) - 1
 
@@ -288,9 +297,12 @@ def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera) -> Expose:
 
 
 def aberrated(attitudes: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return attitudes (k, 4) that shift the stars at the boresight towards `velocity` (3,) m/s."""
+    """Return attitudes (k, 4) with which the stars at the boresight appear shifted by aberration.
+
+    The stars are shifted towards `velocity` (3,), m/s.
+    """
     boresights = quaternion.attitude_matrix(attitudes)[:, 2, :]
-    # Aberration moves stars towards the velocity; the equivalent rotation of the camera is opposite.
+    # Aberration moves the stars towards the velocity, so the equivalent rotation of the camera is opposite.
     turn = np.cross(boresights, velocity / SPEED_OF_LIGHT)
     in_camera = np.einsum("kij,kj->ki", quaternion.attitude_matrix(attitudes), turn)
     return quaternion.multiply(quaternion.from_rotation_vector(-in_camera), attitudes)
@@ -312,8 +324,7 @@ def view(pinhole: Pinhole, to_camera: FloatArray, around: OrbitEnvironment) -> t
     hidden = rays @ down > np.cos(disc)
     if not hidden.any():
         return False, None
-    # The ground in view, sampled at about a thousand points; the upper air is lit to six degrees beyond the
-    # terminator.
+    # About 1,000 points of the visible ground are sampled; air is lit up to 6 deg beyond the terminator.
     sample = rays[hidden]
     sample = sample[:: max(1, len(sample) // 1000)]
     along = distance * (sample @ down)
