@@ -1,1 +1,1 @@
-"""Simulated worlds, and devices emulated at the wire."""
+"""Simulated worlds, and devices that are emulated at their bus or serial line."""

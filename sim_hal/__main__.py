@@ -1,6 +1,7 @@
-"""`python -m sim_hal`: the emulated devices, for any client.
+"""Command line of `python -m sim_hal`, which serves emulated devices to any client.
 
-`emulate` serves one device; `serve` serves the simulated hardware of a configuration in real time.
+The command `emulate` serves one device. The command `serve` serves the simulated hardware of a configuration
+in real time.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return the exit status: 0 done, 1 failed, 2 wrong use."""
+    """Run a command and return the exit status, 0 for success, 1 for a failure and 2 for wrong usage."""
     options = _parser().parse_args(arguments)
     command: Callable[[argparse.Namespace], int] = options.command
     try:
@@ -77,13 +78,13 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=raw,
     )
     add = vn100.add_argument
-    add("--rate-deg-s", type=_number, metavar="R", help="turn steadily at R degrees a second")
-    add("--amplitude-deg", type=_number, default=20.0, metavar="A", help="else swing by A (default 20)")
-    add("--period-s", type=_positive, default=20.0, metavar="S", help="period of the swing (default 20)")
+    add("--rate-deg-s", type=_number, metavar="R", help="rotate at a constant R degrees per second")
+    add("--amplitude-deg", type=_number, default=20.0, metavar="A", help="oscillation amplitude (default 20)")
+    add("--period-s", type=_positive, default=20.0, metavar="S", help="oscillation period (default 20)")
     add("--field", type=_number, default=4.5e-4, metavar="T", help="tesla (default 4.5e-4)")
-    add("--baud", type=int, choices=BAUD_RATES, default=115200, help="the unit's speed (default 115200)")
+    add("--baud", type=int, choices=BAUD_RATES, default=115200, help="baud rate of the unit (default 115200)")
     add("--noise", choices=sorted(PROFILES), default="thesis", help="noise profile (default thesis)")
-    add("--seed", type=_seed, default=1, help="seed of the noise (default 1)")
+    add("--seed", type=_seed, default=1, help="random seed of the sensor noise (default 1)")
     add("--link", type=Path, metavar="PATH", help="make PATH a symbolic link to the device")
     add("--duration", type=_positive, metavar="S", help="end after S seconds")
     add("--json", action="store_true", help="print one JSON object instead of the device's name")
@@ -118,10 +119,10 @@ def _parser() -> argparse.ArgumentParser:
     add = serve.add_argument
     text = f"YAML file with a simulation section, or one of {carried}"
     add("config", type=config_path, metavar="CONFIG", help=text)
-    add("--folder", type=Path, required=True, metavar="DIR", help="folder of the log of the true state")
-    add("--seed", type=int, metavar="N", help="seed, instead of that of the configuration")
-    add("--patience", type=float, metavar="S", help="end S seconds after the last client has left")
-    add("--facts", type=Path, metavar="FILE", help="write the object to FILE too, for `flight run --devices`")
+    add("--folder", type=Path, required=True, metavar="DIR", help="folder for the log of the true state")
+    add("--seed", type=int, metavar="N", help="random seed that replaces the seed of the configuration")
+    add("--patience", type=float, metavar="S", help="end S seconds after the last client has disconnected")
+    add("--facts", type=Path, metavar="FILE", help="copy of the JSON object, for `flight run --devices`")
     serve.set_defaults(command=_serve)
     return parser
 
@@ -148,7 +149,7 @@ def _seed(text: str) -> int:
 
 
 def _serve(options: argparse.Namespace) -> int:
-    """Serve until SIGINT or SIGTERM."""
+    """Serve the devices of a configuration until SIGINT or SIGTERM."""
     config = configuration.load(options.config)
     text = options.config.read_text(encoding="utf-8")
     section = configuration.simulation_section(text, str(options.config), Simulation)
@@ -182,7 +183,7 @@ def _serve(options: argparse.Namespace) -> int:
 
 
 def _emulate_vn100(options: argparse.Namespace) -> int:
-    """Serve a unit that turns or swings on the thread, until SIGINT, SIGTERM or the duration's end."""
+    """Serve a VN-100 that rotates or oscillates about the thread, until a signal or the duration's end."""
     if options.link is not None and options.link.exists() and not options.link.is_symlink():
         raise UsageError(f"--link {options.link} exists and is not a symbolic link: choose another path")
     clock, rng = SystemClock(), np.random.default_rng(options.seed)

@@ -1,8 +1,9 @@
-"""Builds the simulated hardware of a configuration: the world and the emulated devices in it.
+"""Assembly of the simulated hardware of a configuration, which is a world with emulated devices.
 
-The devices offer the same Protocols as the devices on Linux, so simulated flights exercise the flight
-drivers. Until its release the body is held still at its initial attitude. The camera models and the devices
-of an orbit are imported late: they take half a second, and a testbed flight has none.
+The emulated buses and lines implement the same Protocols as those on Linux, so simulated flights exercise the
+flight drivers. The body is held still at its initial attitude until its release. The modules of cameras and
+orbit devices are imported only where they are used, because the import takes half a second and a testbed
+flight does not need them.
 """
 
 from __future__ import annotations
@@ -49,20 +50,20 @@ if TYPE_CHECKING:
     from sim_hal.star_camera.objects import SkyObjects
 
 BUS_VOLTAGE = 5.0
-"""Supply of the coils (V) before the losses of the bridge [ch. 5: a 5 V power bus]."""
+"""Supply voltage (V) of the coils before the losses of the H-bridge (Sease, chapter 5: a 5 V power bus)."""
 GPS_LINE = 1
-"""Number of the GPS receiver's serial line in the random streams; that of the inertial unit has none."""
+"""Key of the random stream for faults of the GPS receiver's serial line."""
 READOUT_NS = 50_000_000
 _LINE_STREAM, _FAULT_STREAM, _ORBIT_STREAM = 0x11E, 0xFA017, 0x0B17
 _EARTH_RATE = 2.0 * math.pi * 1.002_737_909_35 / 86_400.0
 
 ExposeWide = Callable[["EarthCameraModel", "EarthScene", tuple[int, ...]], "Future[Image]"]
-"""Renders a scene with the noise of a seed."""
+"""Function that renders a scene of the Earth with noise drawn from a seed."""
 
 
 @dataclass(frozen=True, slots=True)
 class CoilHardware:
-    """The parts on the I2C bus and the circuit behind them; a configuration may have no monitor."""
+    """The chips on the coils' I2C bus and the coil circuit; `monitor` is None without a current monitor."""
 
     bus: EmulatedI2cBus
     pwm: EmulatedPca9685
@@ -72,7 +73,7 @@ class CoilHardware:
 
 @dataclass(frozen=True, slots=True)
 class OrbitDevices:
-    """The fitted devices that need an orbit; `wide` are the horizon cameras."""
+    """The configured devices that need an orbit; `wide` holds the horizon cameras."""
 
     gps: EmulatedGps | None = None
     cells: EmulatedSolarCells | None = None
@@ -81,7 +82,7 @@ class OrbitDevices:
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """All simulated parts. Drivers use `bus` and `camera`; faults and tests use the others."""
+    """All simulated devices. Drivers use `bus` and `camera`; only faults and tests use the rest."""
 
     simulation: TimedSimulation
     world: World
@@ -97,7 +98,7 @@ class Hardware:
     objects: SkyObjects | None
 
     def release(self, epoch_ns: int) -> None:
-        """Release the body at `epoch_ns`, mission time zero."""
+        """Release the body at mission time zero, which is `epoch_ns`."""
         self.world.release_at(epoch_ns)
         if self.objects is not None:
             self.objects.begin(epoch_ns)
@@ -117,9 +118,9 @@ def assemble(
 ) -> Hardware:
     """Build the hardware of `config` in the world of its simulation `section`.
 
-    `now_ns` returns the simulation's time; `line` and `gps_line` are the device ends of the serial lines;
-    `expose` and `expose_wide` replace the cameras' renderers (in real time a process of its own). Raises
-    ConfigError for an invalid world.
+    The function `now_ns` returns the simulation time. `line` and `gps_line` are the device ends of the serial
+    lines. `expose` and `expose_wide` replace the renderers of the cameras, which in real time run in another
+    process. Raises ConfigError for an invalid world.
     """
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
     coils = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns)
@@ -142,7 +143,7 @@ def assemble(
     faults = FaultTimeline()
     if truth is not None:
         truth.watch(world)
-    # At equal times devices run in this order.
+    # Devices whose events fall on the same time run in this order.
     devices: list[EmulatedDevice | None] = [unit, camera, orbit.gps, *orbit.wide, faults, truth]
     simulation = TimedSimulation(world.advance_to, [device for device in devices if device is not None])
     return Hardware(
@@ -167,7 +168,7 @@ def assemble_coils(
     generator: np.random.Generator,
     now_ns: Callable[[], int],
 ) -> CoilHardware:
-    """Build the coils; `now_ns` returns the simulation's time."""
+    """Build the coil hardware; the function `now_ns` returns the simulation time."""
     coils, truth = config.coils, section.truth
     pwm = EmulatedPca9685(coils.address, now_ns)
     wired = wirings(coils.channels, truth.resistance or coils.resistance, coils.signs)
@@ -190,13 +191,13 @@ def _unit(
     generator: np.random.Generator,
     now_ns: int,
 ) -> Vn100Emulator:
-    """Return the inertial unit; its magnetometer also measures the coils' field, and has a bias."""
+    """Return the inertial unit, whose magnetometer has a bias and also measures the field of the coils."""
     coil_field, bias = np.array(section.coil_field), np.array(section.imu.field_bias)
     sense = world.motion
     if coil_field.any() or bias.any():
 
         def sense(time_ns: int) -> BodyMotion:
-            # The unit averages its magnetometer over one control period, so the mean currents count.
+            # The unit averages its magnetometer over one control period, so the mean coil currents are used.
             motion = world.motion(time_ns)
             return replace(motion, field_body=motion.field_body + coil_field @ circuit.currents() + bias)
 
@@ -213,7 +214,7 @@ def _unit(
 
 
 def sky_objects(section: Simulation, now_ns: int, world: World) -> SkyObjects | None:
-    """Return the moving objects of a simulated sky; None if it has none. Raises ConfigError."""
+    """Return the moving objects of a simulated sky, or None. Raises ConfigError for an invalid object."""
     if not section.objects:
         return None
     from sim_hal.star_camera.objects import SkyObjects  # noqa: PLC0415 - see above
@@ -229,19 +230,19 @@ def emulated_camera(
     now_ns: Callable[[], int],
     objects: SkyObjects | None,
 ) -> EmulatedCamera:
-    """Return the star camera on a body with this motion."""
+    """Return the star camera on a body that moves as the function `motion` describes."""
     readout_ns, scan_ns = round(sky.readout * 1e9), round(sky.line_time * camera.rows * 1e9)
     tracks = no_objects if objects is None else objects.tracks
     return EmulatedCamera(motion, expose, now_ns, readout_ns, np.array(camera.mounting), scan_ns, tracks)
 
 
 def line_generator(seed: int, *line: int) -> np.random.Generator:
-    """Return the generator of a serial line's faults, independent of all others of the same seed."""
+    """Return the random generator for a serial line's faults, independent of the seed's other generators."""
     return np.random.default_rng([seed, _LINE_STREAM, *line])
 
 
 def fault_generator(seed: int) -> np.random.Generator:
-    """Return the generator of device faults, independent of all others of the same seed."""
+    """Return the random generator for device faults, independent of the seed's other generators."""
     return np.random.default_rng([seed, _FAULT_STREAM])
 
 
@@ -268,7 +269,7 @@ def camera_model(camera: Camera, sky: SkySection) -> StarCameraModel:
 
 
 class StarRenderer:
-    """Renders the frames of one star camera; the noise of frame k depends on the seed and k only."""
+    """Renderer of one star camera; the noise of a frame depends only on the seed and the frame number."""
 
     def __init__(self, camera: Camera, sky: SkySection, seed: int) -> None:
         self._model = camera_model(camera, sky)
@@ -280,7 +281,7 @@ class StarRenderer:
     def render(
         self, sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack] = ()
     ) -> Image:
-        """Return frame `sequence`, exposed along `attitudes` (k, 4) at `times` (k,) s."""
+        """Return frame number `sequence`, exposed along `attitudes` (k, 4) at `times` (k,), s."""
         from sim_hal.star_camera import render  # noqa: PLC0415 - see above
 
         generator = np.random.default_rng([self._seed, sequence])
@@ -288,7 +289,7 @@ class StarRenderer:
 
 
 def inline_exposure(renderer: StarRenderer) -> Expose:
-    """Return an exposure that renders at once, for lock-step."""
+    """Return an exposure function that renders synchronously, for lock-step."""
 
     def expose(
         sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]
@@ -312,7 +313,7 @@ def assemble_orbit(
     line: SerialEnd | None,
     expose: ExposeWide | None = None,
 ) -> OrbitDevices:
-    """Build the devices that need an orbit; `line` is the receiver's end of its serial line.
+    """Build the devices that need an orbit; `line` is the device end of the GPS receiver's serial line.
 
     `expose` replaces the renderer of the horizon cameras. Raises ConfigError in a world without an orbit.
     """
@@ -364,7 +365,7 @@ def _horizon_camera(
 
 
 def wide_model(camera: WideCamera, seed: int = 0) -> EarthCameraModel:
-    """Return optics and detector of a horizon camera."""
+    """Return the model of a horizon camera's optics and detector."""
     from sim_hal.earth_camera import EarthCameraModel  # noqa: PLC0415 - see above
 
     known = camera.lens
@@ -386,12 +387,12 @@ def wide_model(camera: WideCamera, seed: int = 0) -> EarthCameraModel:
 
 
 def render_wide(model: EarthCameraModel, scene: EarthScene, seed: tuple[int, ...]) -> Image:
-    """Return the frame of a scene."""
+    """Return the horizon camera's frame of a scene."""
     from sim_hal.earth_camera import render  # noqa: PLC0415 - see above
 
     return render(model, scene, np.random.default_rng(seed))
 
 
 def inline_wide(model: EarthCameraModel, scene: EarthScene, seed: tuple[int, ...]) -> Future[Image]:
-    """Render at once, for lock-step."""
+    """Render a horizon camera's frame synchronously, for lock-step."""
     return _finished(render_wide(model, scene, seed))

@@ -1,8 +1,8 @@
-"""Simulated time: the clock, the devices that act at their own event times, and a queue of timed actions.
+"""Simulated time: the clock, the scheduling of emulated devices, and a queue of timed actions.
 
-Sleeping advances the world to the deadline and returns at once. Due tickers run one after the other, in the
-order in which they were created, so a flight repeats bit for bit. A job that itself sleeps (a driver waiting
-for its chip) advances the world, but no other ticker runs meanwhile.
+A sleep on the simulated clock advances the world to the deadline and returns at once. Tickers that are due
+run one after the other, in the order in which they were created, so a flight repeats bit for bit. A job that
+sleeps, such as a driver that waits for its chip, advances the world, but no other ticker runs meanwhile.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from hal.buses.clock import ContainedJob
 from hal.interfaces.wires import Ticker
 
 NEVER = 1 << 62
-"""A time (ns) later than the end of any run: 146 years."""
+"""Time (ns) that is later than the end of any run, 146 years."""
 
 
 class EmulatedDevice(Protocol):
-    """A device on the simulation's time line."""
+    """An emulated device, which processes events at simulated times."""
 
     def next_event_ns(self) -> int:
-        """Return the time of the device's next event; NEVER if it has none."""
+        """Return the time of the device's next event, or NEVER."""
 
     def advance(self, now_ns: int) -> None:
-        """Process all events due at or before `now_ns`, in order, each at its own time."""
+        """Process all events of the device up to `now_ns` in order, each at its own time."""
 
 
 class SerialEnd(Protocol):
@@ -35,56 +35,56 @@ class SerialEnd(Protocol):
     baud_rate: int
 
     def write(self, data: bytes, now_ns: int) -> None:
-        """Send bytes from `now_ns` on, after all bytes that wait already."""
+        """Queue bytes at `now_ns`, to be sent after all bytes that already wait."""
 
     def read(self, now_ns: int) -> bytes:
         """Return unread bytes from the host that have arrived by `now_ns`."""
 
     def next_arrival_ns(self) -> int:
-        """Return when bytes from the host next arrive; NEVER if none are under way."""
+        """Return the time at which the next bytes from the host arrive, or NEVER."""
 
 
 class FaultTimeline:
-    """A queue of timed actions, as an emulated device."""
+    """A queue of timed fault actions, which runs like an emulated device."""
 
     def __init__(self) -> None:
         self._order = itertools.count()
         self._actions: list[tuple[int, int, Callable[[], None]]] = []
 
     def at(self, time_ns: int, action: Callable[[], None]) -> None:
-        """Run `action` at `time_ns` of the simulation."""
+        """Run `action` at the simulation time `time_ns`."""
         heapq.heappush(self._actions, (time_ns, next(self._order), action))
 
     def next_event_ns(self) -> int:
-        """Return when the next action is due."""
+        """Return the time at which the next action is due, or NEVER."""
         return self._actions[0][0] if self._actions else NEVER
 
     def advance(self, now_ns: int) -> None:
-        """Run the actions that are due."""
+        """Run the actions that are due by `now_ns`."""
         while self.next_event_ns() <= now_ns:
             heapq.heappop(self._actions)[2]()
 
 
 class TimedSimulation:
-    """Advances the world to each device's next event, then runs that device."""
+    """A world and its devices; the world advances to each device's next event, at which the device runs."""
 
     def __init__(self, advance_world: Callable[[int], None], devices: Sequence[EmulatedDevice]) -> None:
         self._advance_world = advance_world
         self._devices = tuple(devices)
 
     def next_event_ns(self) -> int:
-        """Return the time of the next event of any device."""
+        """Return the time of the earliest next event of all devices."""
         return min([device.next_event_ns() for device in self._devices], default=NEVER)
 
     def run_events(self, event_ns: int) -> None:
-        """Advance to the next event, and run the devices that are due then."""
+        """Advance the world to `event_ns`, and run the devices whose events are due."""
         self._advance_world(event_ns)
         for device in self._devices:
             if device.next_event_ns() <= event_ns:
                 device.advance(event_ns)
 
     def advance_to(self, time_ns: int) -> None:
-        """Process all events due at or before `time_ns`, in order."""
+        """Process all events up to `time_ns` in order."""
         while (event_ns := self.next_event_ns()) <= time_ns:
             self.run_events(event_ns)
         self._advance_world(time_ns)
@@ -97,17 +97,19 @@ class TimedWorld(Protocol):
         """Return the time of the next event."""
 
     def run_events(self, event_ns: int) -> None:
-        """Process the events at `event_ns`, the time of the next event."""
+        """Process the events at `event_ns`, which is the time of the next event."""
 
     def advance_to(self, time_ns: int) -> None:
-        """Process all events due at or before `time_ns`."""
+        """Process all events up to `time_ns`."""
 
 
 class SimClock:
-    """A Clock that jumps to each deadline. Time begins at `start_ns`; `utc_start_ns` is the UTC of time 0.
+    """A Clock that jumps to each deadline.
+
+    The clock begins at `start_ns`, and `utc_start_ns` is the UTC at time 0.
 
     Attributes:
-        tickers: the tickers that run, in the order in which they were created.
+        tickers: running tickers, in the order in which they were created.
     """
 
     def __init__(self, utc_start_ns: int = 0, start_ns: int = 0) -> None:
@@ -118,15 +120,15 @@ class SimClock:
         self._running_jobs = False
 
     def attach(self, world: TimedWorld) -> None:
-        """Advance this world and its devices from now on."""
+        """Set the world that advances together with this clock."""
         self._world = world
 
     def now_ns(self) -> int:
-        """Return the simulated time."""
+        """Return the simulated time, ns."""
         return self._now_ns
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Advance the world, event by event, to the deadline."""
+        """Advance the world to the deadline, event by event, and run the tickers that are due."""
         while self._now_ns < deadline_ns:
             next_ns = deadline_ns
             if not self._running_jobs:
@@ -137,13 +139,13 @@ class SimClock:
                 self._run_due_jobs()
 
     def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
-        """Run `job` every `period_ns` of simulated time, first one period from now."""
+        """Run `job` every `period_ns` of simulated time, for the first time after one period."""
         ticker = SimTicker(self, name, period_ns, job)
         self.tickers.append(ticker)
         return ticker
 
     def utc_ns(self) -> int:
-        """Return UTC in ns, a label for telemetry."""
+        """Return the simulated UTC in ns, which only labels telemetry."""
         return self._utc_start_ns + self._now_ns
 
     def _advance_world(self, time_ns: int) -> None:
@@ -167,7 +169,7 @@ class SimClock:
 
 
 class SimTicker(ContainedJob):
-    """A job on simulated time; a kick runs it at once."""
+    """A job that runs periodically on simulated time; a kick runs it at once."""
 
     def __init__(self, clock: SimClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
         super().__init__(name, job, clock.now_ns)

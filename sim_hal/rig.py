@@ -1,8 +1,8 @@
-"""The simulator's only interface to the flight application: rigs of emulated devices, and their faults.
+"""The simulator's only interface to the flight application, which opens emulated devices and their faults.
 
-In lock-step the devices run in the process of the flight and advance as its loop sleeps: the clock jumps, and
-runs repeat exactly. In real time they run in a server process (`sim_hal.serving.server`), with bus and
-cameras on a socket and the serial lines on pseudo-terminals.
+In lock-step the devices run in the flight process and advance while the flight loop sleeps. The clock then
+jumps from event to event, and runs repeat exactly. In real time the devices run in a server process
+(`sim_hal.serving.server`), with bus and cameras on a socket and the serial lines on pseudo-terminals.
 """
 
 from __future__ import annotations
@@ -58,25 +58,25 @@ from sim_hal.settings import Simulation
 from sim_hal.worlds.world import BodyMotion, TruthRecorder, WorldInputs, make_world
 
 PATIENCE_S = 5.0
-"""Time (s) after which the devices of a flight process that died end."""
+"""Time (s) after which the device server ends if the flight process has died."""
 _START_S = 20.0
-"""Longest start (s) of the server process."""
+"""Longest time (s) that the server process may take to start."""
 _FACTS = ("serial", "baud_rate", "socket", "camera", "gps", "gps_baud_rate", "wide")
 OPENER = "sim_hal.serving.device_link:open_bus"
 
 
 @dataclass(frozen=True, slots=True)
 class SimulationRequest:
-    """The requests of a run to the simulator, in addition to its configuration.
+    """Options of a simulated run in addition to its configuration.
 
     Attributes:
-        config_path: file of the configuration.
-        text: content of the configuration as flown.
-        out: folder of the run, for the log of the truth.
+        config_path: path of the configuration file.
+        text: text of the configuration, including faults that corrupt it.
+        out: folder of the run, in which the log of the true state is written.
         realtime: whether the devices run in a server process.
-        seed: replaces the seed of the configuration, if given.
-        devices: facts file of a device server that runs already; None starts a server.
-        faults: faults in addition to those of the configuration.
+        seed: random seed that replaces the seed of the configuration, or None.
+        devices: facts file of a device server that runs already, or None to start a server.
+        faults: faults that are injected in addition to the faults of the configuration.
     """
 
     config_path: Path
@@ -88,7 +88,7 @@ class SimulationRequest:
     faults: tuple[str, ...] = ()
 
     def section(self) -> Simulation:
-        """Return the `simulation` section. Raises ConfigError."""
+        """Return the `simulation` section. Raises ConfigError if the section is missing or invalid."""
         name = str(self.config_path)
         section = configuration.simulation_section(self.text, name, Simulation)
         if section is None:
@@ -97,7 +97,7 @@ class SimulationRequest:
 
 
 def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Rig:
-    """Open the emulated devices of a configuration with the requested faults; `stack` closes them.
+    """Open the emulated devices of a configuration with the requested faults; `stack` closes the devices.
 
     Raises UsageError or ConfigError before a device is opened, and DeviceError if a device fails.
     """
@@ -129,7 +129,7 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
 
 @dataclass(frozen=True, slots=True)
 class PosedCamera:
-    """A star camera, its clock, and its attitude (4,), ICRS into camera, at a time of that clock."""
+    """A star camera, its clock, and a function that returns its attitude (4,), ICRS into camera."""
 
     clock: Clock
     frames: FrameSource
@@ -137,17 +137,17 @@ class PosedCamera:
 
 
 def open_camera(request: SimulationRequest, config: Config, rate: FloatArray) -> PosedCamera:
-    """Return the emulated star camera of a configuration, alone and with a known motion.
+    """Return the emulated star camera of a configuration, without other devices and with a known motion.
 
-    It starts at the attitude of the body's release and turns at `rate` (3,) rad/s, camera axes. Raises
-    ConfigError for an invalid world.
+    The camera starts at the attitude at which the body is released and rotates at `rate` (3,), rad/s, camera
+    axes. Raises ConfigError for an invalid world.
     """
     section = request.section()
     return posed_camera(config, section, SimClock(utc_ns(section.utc)), rate)
 
 
 def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: FloatArray) -> PosedCamera:
-    """Return the star camera of `open_camera` on a clock."""
+    """Return the star camera that `open_camera` describes on the clock `clock`."""
     camera = config.camera
     assert camera is not None, "the caller checks that the configuration has a camera"
     begun_ns, mounting = clock.now_ns(), np.array(camera.mounting)
@@ -167,23 +167,23 @@ def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: Flo
 
 
 def fault_catalogue() -> tuple[str, str]:
-    """Return the syntax of faults, and a list of all faults."""
+    """Return the syntax of faults, and the text of a list of all faults."""
     return schedule.GRAMMAR, listing()
 
 
 def injected_faults(request: SimulationRequest) -> tuple[str, ...]:
-    """Return the faults of a flight as they are written, those of the configuration first."""
+    """Return the faults of a flight as text, with those of the configuration first."""
     faults = (*schedule.schedule(request.section().faults), *map(schedule.parse, request.faults))
     return tuple(map(str, faults))
 
 
 def corrupted_text(faults: tuple[str, ...], text: str, seed: int | None) -> str:
-    """Return the text of a configuration as the requested faults corrupt it."""
+    """Return the text of a configuration after the requested faults have corrupted it."""
     return corrupted_by(faults, text, seed)
 
 
 def with_host_faults(rig: Rig, section: Simulation) -> Rig:
-    """Return a rig with the faults inside the flight process, if there are any."""
+    """Return `rig` with the faults that act inside the flight process, if the section has any."""
     host = host_faults(section, rig.clock, rig.realtime)
     if host is None:
         return rig
@@ -197,7 +197,7 @@ def with_host_faults(rig: Rig, section: Simulation) -> Rig:
 
 @dataclass(frozen=True, slots=True)
 class LockStep:
-    """The devices in lock-step: clock, wires and release for the flight, the rest for faults and tests."""
+    """Lock-step devices. The flight uses clock, wires and release; faults and tests also use the rest."""
 
     clock: SimClock
     wires: Wires
@@ -208,14 +208,14 @@ class LockStep:
 
 
 def utc_ns(label: str) -> int:
-    """Return the time since 1970 (ns) of an ISO 8601 time. Raises ValueError."""
+    """Return the time since 1970 (ns) of an ISO 8601 time. Raises ValueError for invalid text."""
     return round(datetime.fromisoformat(label).timestamp()) * 1_000_000_000
 
 
 def build_lockstep(
     config: Config, section: Simulation, truth: TruthRecorder | None, clock: SimClock
 ) -> LockStep:
-    """Put the simulated hardware on a clock."""
+    """Assemble the simulated hardware and attach it to a clock."""
     line = EmulatedSerialLine(clock.now_ns, config.inertial_unit.baud_rate, line_generator(section.seed))
     gps_line = None
     if config.gps is not None:
@@ -238,7 +238,7 @@ def build_lockstep(
 
 @contextmanager
 def opened_lockstep(config: Config, section: Simulation, folder: Path) -> Iterator[LockStep]:
-    """Simulate in lock-step, with a log of the truth in `folder`."""
+    """Assemble the devices for lock-step, with a log of the true state in `folder`."""
     clock = SimClock(utc_ns(section.utc))
     log = FlightLog(folder, "truth", clock=clock, sync_period_ns=None)
     try:
@@ -248,24 +248,24 @@ def opened_lockstep(config: Config, section: Simulation, folder: Path) -> Iterat
 
 
 class RemoteFrameSource:
-    """A camera in the server process; it announces its frames, whose pixels are read from a file."""
+    """Client of a camera in the server process, which announces frames whose pixels are read from files."""
 
     def __init__(self, path: Path, clock: SystemClock, number: int = 0) -> None:
-        """Connect to the star camera, number 0, or to a horizon camera, number 1 or more."""
+        """Connect to the camera `number`, 0 for the star camera and 1 or more for a horizon camera."""
         self._number = number
         self._link = DeviceLink(path)
         self._folder = path.parent
         self._clock = clock
 
     def trigger(self, exposure_ns: int) -> None:
-        """Start an exposure without waiting for the answer."""
+        """Start an exposure without waiting for the server's answer."""
         try:
             self._link.send("trigger", exposure_ns, self._number)
         except OSError as error:
             raise NotResponding("camera", f"the emulated devices have ended ({error})") from error
 
     def poll(self) -> Frame | None:
-        """Return the newest frame announced since the last call. Raises NotResponding."""
+        """Return the newest frame announced since the last call, or None. Raises NotResponding."""
         newest: Frame | None = None
         try:
             while self._link.pending() or select.select([self._link], [], [], 0.0)[0]:
@@ -290,7 +290,7 @@ class RemoteFrameSource:
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """Devices in a server process."""
+    """Connections to the devices in a server process."""
 
     clock: SystemClock
     wires: Wires
@@ -304,13 +304,13 @@ class Served:
 
 @contextmanager
 def started_server(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
-    """Start a server for a configuration, connect to it, and end it afterwards. Raises NotResponding."""
+    """Start a device server for a configuration, and end it afterwards. Raises NotResponding."""
     command = [sys.executable, "-m", "sim_hal", "serve", str(config_path), "--folder", str(folder)]
     process = subprocess.Popen(
         [*command, "--seed", str(seed), "--patience", str(PATIENCE_S)],
         stdout=subprocess.PIPE,
         stdin=subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C is for the flight process, which then ends the server
+        start_new_session=True,  # Ctrl-C reaches only the flight process, which then ends the server
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )
     assert process.stdout is not None
@@ -333,9 +333,10 @@ def started_server(config_path: Path, seed: int, folder: Path) -> Iterator[Serve
 
 @contextmanager
 def running_server(facts_path: Path) -> Iterator[Served]:
-    """Connect to a server that runs already, and leave it running. Raises UsageError, NotResponding.
+    """Connect to a device server that runs already, and leave the server running.
 
-    `facts_path` is the file that `python -m sim_hal serve CONFIG --facts FILE` wrote.
+    `facts_path` is the file that `python -m sim_hal serve CONFIG --facts FILE` wrote. Raises UsageError for
+    an invalid file and NotResponding if no server answers.
     """
     with ExitStack() as stack:
         try:
@@ -354,7 +355,7 @@ def running_server(facts_path: Path) -> Iterator[Served]:
 
 @contextmanager
 def _connected(facts: dict[str, Any]) -> Iterator[Served]:
-    """Connect to the server with these facts."""
+    """Connect to the device server that a facts file describes."""
     clock = SystemClock()
     path = Path(facts["socket"])
     with ExitStack() as stack:

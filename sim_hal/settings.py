@@ -1,8 +1,8 @@
 """The `simulation` section of a configuration: the true properties of the world.
 
-A value that is left out is taken from the flight configuration; a value given here makes the world differ
-from the flight's model. Units are SI unless the name states another unit. In `free_body`, each disturbance is
-a multiple of its worst case, so that a number such as 0.1, 0.3 or 1 selects its size; zero switches it off.
+A true constant that this section omits is taken from the flight configuration. A constant given here makes
+the world differ from the flight software's model. Units are SI unless the name states another unit. In
+`free_body`, each disturbance is given as a multiple of its worst case, and zero switches the disturbance off.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
 
 
 class OrbitSection(Section, frozen=True, kw_only=True):
-    """The orbit at the simulation's time zero; `altitude` (m) is the semi-major axis less the Earth's radius.
+    """The orbit at simulation time zero; `altitude` (m) is the semi-major axis minus the Earth's radius.
 
     `local_time`, the mean local time of the ascending node in hours, overrides `ascending_node_deg`.
     """
@@ -34,9 +34,10 @@ class OrbitSection(Section, frozen=True, kw_only=True):
 
 
 class CraftSection(Section, frozen=True, kw_only=True):
-    """A craft other than the named ones: a box of `size` (3,) m with its origin at its centre.
+    """A custom craft: a box of `size` (3,), m, with the origin of the body axes at its centre.
 
-    `inertia` (3,) kg m^2 is that of the principal axes; `dipole_per_ampere` (m^2) is that of each coil.
+    `inertia` (3,), kg m^2, holds the principal moments of inertia. `dipole_per_ampere` (m^2) is the dipole
+    per current of each coil.
     """
 
     inertia: tuple[Positive, Positive, Positive]
@@ -45,9 +46,10 @@ class CraftSection(Section, frozen=True, kw_only=True):
 
 
 class TipOff(Section, frozen=True, kw_only=True):
-    """The release of the body: `speed` (rad/s) about a random axis, or `rate` (3,) rad/s, body axes.
+    """The release of a free body, with `speed` (rad/s) about a random axis or `rate` (3,), rad/s, body axes.
 
-    `attitude` is ICRS into body, scalar last; without it the attitude is random.
+    `attitude` is the quaternion from ICRS to body axes, scalar last; if it is omitted, the attitude is
+    random.
     """
 
     speed: NotNegative = 0.1745
@@ -56,14 +58,15 @@ class TipOff(Section, frozen=True, kw_only=True):
 
 
 class Disturbances(Section, frozen=True, kw_only=True):
-    """Multiples of the worst cases, and the errors of the coils.
+    """Disturbances as multiples of their worst cases, and the errors of the coils.
 
-    The worst case of `drag` and `solar_pressure` is a centre of pressure 2 cm from the centre of mass. That
-    of `residual_dipole` is a constant part of 1e-3 A m^2, a part of 3e-4 A m^2 in sunlight and a random walk
-    of 5e-5 A m^2. That of `ring_current` is 20 nT, changing within hours. `day_bulge` is the variation of the
-    air density about its mean; `walks` are the random walks of air density and dipole. The principal axes are
-    rotated by a third to the whole of `principal_turn_deg`. `coil_scale` and `coil_tilt_deg` are standard
-    deviations.
+    The worst case of `drag` and `solar_pressure` is a centre of pressure 2 cm from the centre of mass. The
+    worst case of `residual_dipole` is a constant part of 1e-3 A m^2, a part of 3e-4 A m^2 in sunlight and a
+    random walk of 5e-5 A m^2. The worst case of `ring_current` is a field of 20 nT that varies over hours.
+    `day_bulge` scales the variation of the air density between day and night. `walks` scales the random walks
+    of air density and residual dipole. The angle between body axes and principal axes is between a third of
+    `principal_turn_deg` and the whole of it. `coil_scale` and `coil_tilt_deg` are the standard deviations of
+    the coils' scale errors and axis tilts.
     """
 
     gravity_gradient: NotNegative = 1.0
@@ -79,7 +82,7 @@ class Disturbances(Section, frozen=True, kw_only=True):
 
 
 class FreeBodySection(Section, frozen=True, kw_only=True):
-    """The section `free_body`; `craft` is a key of `sim_hal.worlds.free_body.CRAFTS`, or a section."""
+    """The section `free_body`; `craft` is a key of `sim_hal.worlds.free_body.CRAFTS` or a `CraftSection`."""
 
     craft: Literal["knightcube", "cubesat_3u"] | CraftSection = "knightcube"
     orbit: OrbitSection = OrbitSection()
@@ -88,24 +91,26 @@ class FreeBodySection(Section, frozen=True, kw_only=True):
 
 
 class Release(Section, frozen=True, kw_only=True):
-    """The release of the testbed's body: q2 and rate (rad/s) about the thread at mission time zero."""
+    """The testbed's quaternion component q2 and rate (rad/s) about the thread at mission time zero."""
 
     q2: Annotated[float, Meta(ge=-0.7, le=0.7)]
     rate: Annotated[float, Meta(ge=-10.0, le=10.0)] = 0.0
 
 
 class Thread(Section, frozen=True, kw_only=True):
-    """Stiffness (N m/rad) and damping (N m s/rad) of the thread."""
+    """Torsional stiffness (N m/rad) and damping (N m s/rad) of the testbed's thread."""
 
     stiffness: NotNegative = 0.0
     damping: NotNegative = 0.0
 
 
 class ImuNoise(Section, frozen=True, kw_only=True):
-    """Noise of the inertial unit: uniform bounds on the quaternion and the rate, and a constant gyro bias.
+    """Errors of the inertial unit.
 
-    `profile: datasheet` adds the white noise of the unit's data sheet and a bias drawn at each start.
-    `field_bias` (3,) T is the bias of the magnetometer, body axes.
+    `quaternion_noise` and `rate_noise` (rad/s) bound the uniform noise of quaternion and rate. `profile:
+    datasheet` adds the white noise of the unit's data sheet and a random bias at each start. `gyro_bias`
+    (3,), rad/s, is the constant bias of the gyro, and `field_bias` (3,), T, body axes, is that of the
+    magnetometer.
     """
 
     profile: Literal["bounds", "datasheet"] = "bounds"
@@ -124,7 +129,7 @@ class Latency(Section, frozen=True, kw_only=True):
 
 
 class Truth(Section, frozen=True, kw_only=True):
-    """True constants that differ from those of the flight configuration."""
+    """True constants of the world that differ from those of the flight configuration."""
 
     inertia: Positive | None = None
     field: Positive | None = None
@@ -133,9 +138,9 @@ class Truth(Section, frozen=True, kw_only=True):
 
 
 class CageTruth(Section, frozen=True, kw_only=True):
-    """The field of the simulated cage; `orbit` is that at the simulation's time zero.
+    """The magnetic field of the simulated cage; `orbit` is the orbit at simulation time zero.
 
-    `gain` is the field of its coils relative to the commanded field; `ring_current` is a multiple of 20 nT.
+    `gain` is the ratio of the cage's field to the commanded field. `ring_current` is a multiple of 20 nT.
     """
 
     orbit: OrbitSection = OrbitSection()
@@ -144,7 +149,10 @@ class CageTruth(Section, frozen=True, kw_only=True):
 
 
 class SkySection(Section, frozen=True, kw_only=True):
-    """Sky and optics of the emulated star camera (Sease ch. 2); the thesis uses `bilinear` and `uniform`."""
+    """Sky and optics of the emulated star camera.
+
+    The thesis (Sease, chapter 2) uses `psf: bilinear` and `noise: uniform`.
+    """
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5
     year: Annotated[float, Meta(ge=1900.0, le=2100.0)] = 2026.5
@@ -159,7 +167,7 @@ class SkySection(Section, frozen=True, kw_only=True):
 
 
 class Tumble(Section, frozen=True, kw_only=True):
-    """A periodic variation of brightness by +-`amplitude` magnitudes with a period of `period` s."""
+    """A sinusoidal variation of the brightness by +-`amplitude` magnitudes with a period of `period` s."""
 
     period: Positive
     amplitude: Annotated[float, Meta(ge=0.0, le=5.0)]
@@ -167,10 +175,10 @@ class Tumble(Section, frozen=True, kw_only=True):
 
 
 class LineOfSight(Section, frozen=True, kw_only=True):
-    """A motion along a great circle among the stars, from a position at `at` s of mission time.
+    """A motion along a great circle among the stars; the position is given for mission time `at` (s).
 
-    `rate_deg` (deg/s) is the rate towards the position angle `towards_deg`, from north through east;
-    `acceleration_deg` (deg/s^2) is the acceleration along the circle.
+    `rate_deg` (deg/s) is the rate towards the position angle `towards_deg`, counted from north through east.
+    `acceleration_deg` (deg/s^2) is the acceleration along the great circle.
     """
 
     right_ascension_deg: Annotated[float, Meta(ge=-360.0, le=360.0)]
@@ -182,7 +190,7 @@ class LineOfSight(Section, frozen=True, kw_only=True):
 
 
 class ObjectState(Section, frozen=True, kw_only=True):
-    """Geocentric position (3,) m and velocity (3,) m/s of an object at `simulation.utc`, ICRS."""
+    """Geocentric position (3,), m, and velocity (3,), m/s, ICRS, of an object at `simulation.utc`."""
 
     position: Vector
     velocity: Vector
@@ -191,7 +199,7 @@ class ObjectState(Section, frozen=True, kw_only=True):
 class SkyObject(Section, frozen=True, kw_only=True):
     """An object in the sky of the star camera, with either a `line_of_sight` or the `state` of an orbit.
 
-    `magnitude` is Johnson V; for an object in orbit it is that in full sunlight.
+    `magnitude` is the Johnson V magnitude, which for an object in orbit holds in full sunlight.
     """
 
     magnitude: Annotated[float, Meta(ge=-10.0, le=20.0)]
@@ -201,11 +209,12 @@ class SkyObject(Section, frozen=True, kw_only=True):
 
 
 class OrbitDeviceTruth(Section, frozen=True, kw_only=True):
-    """Errors of the devices in orbit.
+    """Errors of the emulated GPS receiver and solar cells.
 
-    `gps_walk` and `gps_noise` (m) are the slow and the white error of each axis; `gps_start` (s) is the time
-    from power-on to the first fix. `string_gain` is the relative spread of the gains of the solar strings,
-    `string_noise` (A) their noise; `albedo` is that of the Earth.
+    `gps_walk` and `gps_noise` (m) are the standard deviations of the slow error and the white noise of each
+    axis. `gps_start` (s) is the time from power-on to the first fix. `string_gain` is the relative standard
+    deviation of the gains of the solar cell strings, and `string_noise` (A) the standard deviation of the
+    noise of their currents. `albedo` is the albedo of the Earth.
     """
 
     gps_walk: NotNegative = 2.0
@@ -217,9 +226,9 @@ class OrbitDeviceTruth(Section, frozen=True, kw_only=True):
 
 
 class FaultEntry(Section, frozen=True, kw_only=True):
-    """A fault that begins at `at` (s of mission time) and lasts `for` (s).
+    """A fault that begins at mission time `at` (s, by default 0) and lasts `for` s (by default to the end).
 
-    Without `at` it begins at 0, without `for` it lasts to the end. `sim_hal.faults.schedule` parses `fault`.
+    The module `sim_hal.faults.schedule` parses the text `fault`.
     """
 
     fault: str
@@ -228,9 +237,9 @@ class FaultEntry(Section, frozen=True, kw_only=True):
 
 
 class Simulation(Section, frozen=True, kw_only=True):
-    """The section `simulation`; `world` is a key of `sim_hal.worlds.world.WORLDS`, or `module:factory`.
+    """The section `simulation`; `world` is a key of `sim_hal.worlds.world.WORLDS` or `module:factory`.
 
-    `coil_field` (3, 3) T/A is the field of the coils at the magnetometer, from currents to body axes.
+    `coil_field` (3, 3), T/A, maps the coil currents to the coils' field at the magnetometer in body axes.
     """
 
     seed: Annotated[int, Meta(ge=0)] = 1

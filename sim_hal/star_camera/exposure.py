@@ -3,7 +3,8 @@
 Sease renders a still image for each of many short steps of the exposure and adds the images. This module
 divides each path into spans of a few pixels and integrates the charge of a span over time by Gauss-Legendre
 quadrature. Because the point spread function is separable, the charge of all samples on a small patch of
-pixels is one product of two thin matrices, (rows, samples) by (samples, columns), so many samples are cheap.
+pixels is one product of two thin matrices, (rows, samples) by (samples, columns), so a large number of
+samples is cheap.
 
 A rolling shutter starts row r r line times after row 0. Light that reaches row r at time t is collected if
 the row time u = t - start - r * line_time is within the exposure. The integration over a source's path uses u
