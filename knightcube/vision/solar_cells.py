@@ -85,7 +85,7 @@ class SolarStringModel:
         if not np.all(np.abs(np.linalg.norm(normals, axis=1) - 1.0) < 1e-6):
             raise UsageError("solar strings: normals must be finite unit vectors")
         if peaks.shape != (len(normals),) or not np.all((peaks > 0.0) & np.isfinite(peaks)):
-            raise UsageError(f"solar strings: peaks {peaks}: give one positive current a string, in A")
+            raise UsageError(f"solar strings: peaks {peaks}: give one positive current per string, in A")
         for name in ("sigma", "albedo", "albedo_sigma", "dark"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise UsageError(f"solar strings: {name} {getattr(self, name)}: must lie between 0 and 1")
@@ -164,7 +164,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     # The limit is the chi-square that one reading in a thousand exceeds (Wilson and Hilferty 1931).
     ninth = 2.0 / (9.0 * freedom)
     if square > float(freedom * (1.0 - ninth + _RARE * np.sqrt(ninth)) ** 3):
-        reason = f"the currents fit no Sun: chi-square {square:.0f} of {freedom}"
+        reason = f"no Sun direction explains the currents: chi-square {square:.0f} of {freedom}"
         return CoarseSun(CoarseSunStatus.UNCERTAIN, reason=reason)
     return CoarseSun(CoarseSunStatus.FOUND, direction, basis, np.asarray(inverse))
 
@@ -301,10 +301,10 @@ class FieldAndStrings:
         against = np.maximum(without / fewer, (without - least[:, None]) / one)
         self._against = np.maximum(self._against, np.minimum(against, _MOST_VIOLATION))
         if whole.min() > all_:
-            self.wrong = f"string {least.argmin() + 1} does not fit the others, or the field"
+            self.wrong = f"string {least.argmin() + 1} contradicts the other strings or the field"
         possible = np.flatnonzero((self._against <= 1.0).any(axis=0))
         if not len(possible):
-            self.wrong = self.wrong or "no turn about the field explains the strings"
+            self.wrong = self.wrong or "no rotation about the field explains the string currents"
             self.forget()
             return None
         # The attitude is the middle of the shortest arc that contains all possible rotations.

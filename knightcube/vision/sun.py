@@ -74,7 +74,7 @@ class SunSettings:
         if not 0.0 < self.least_radius < self.greatest_radius < 0.5:
             raise UsageError(
                 f"least_radius {self.least_radius} and greatest_radius {self.greatest_radius}: "
-                "give rad that grow, the greatest below 0.5"
+                "give increasing values below 0.5 rad"
             )
         for name in ("level", "tolerance", "rim_sigma", "floor_sigma"):
             if not 0.0 < getattr(self, name) < math.inf:
@@ -374,7 +374,7 @@ def _flaw(disc: _Disc, settings: SunSettings) -> str:
     if circle.radius > settings.greatest_radius:
         return f"a patch of {radius:.2f} deg radius, too large,"
     if used < settings.least_agreement * (len(rim.points) + rim.endless):
-        return f"a rim that is round in {used} of {len(rim.points) + rim.endless} places only"
+        return f"a rim that is round in only {used} of {len(rim.points) + rim.endless} places"
     if used * 2.0 * np.pi / _SPOKES < settings.least_arc:
         return f"too short an arc of a rim, {used * 360 // _SPOKES} deg,"
     residual = circle.residual * disc.pixels_per_radian
@@ -626,7 +626,7 @@ def sun_of_cameras(
             covariance = sun.covariance + (_CUT**2 * across if sun.cut else 0.0)
             covariance = np.asarray(camera.to_camera.T @ covariance @ camera.to_camera)
             return SunOfCameras(direction, covariance, choice.index, each)
-        reason = f"camera {choice.index}: a Sun where the strings have none"
+        reason = f"camera {choice.index}: the Sun contradicts the solar strings"
     if strings.direction is None or strings.basis is None or strings.tangent_covariance is None:
         return SunOfCameras(None, None, None, each, reason or strings.reason)
     covariance = strings.basis.T @ strings.tangent_covariance @ strings.basis

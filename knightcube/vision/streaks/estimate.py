@@ -560,7 +560,7 @@ def _rejection(
             not result.misfit < settings.worst_misfit and not known.aside < settings.worst_displacement,
             f"the streaks do not fit the model: misfit {result.misfit:.1f}",
         ),
-        (verdict is StreakVerdict.REJECTED, "the motion divides streaks into pieces, or joins several"),
+        (verdict is StreakVerdict.REJECTED, "the motion divides streaks into segments or joins several"),
         (
             max(common.across, common.along) > settings.worst_shaking,
             f"the body shook: all streaks vary in common by {common.across:.2f} px across and "

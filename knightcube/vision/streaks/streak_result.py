@@ -42,9 +42,9 @@ class StreakStatus(Enum):
 
 
 REASONS = {
-    StreakStatus.FAILED: "no motion is consistent with enough of the light",
+    StreakStatus.FAILED: "no motion explains enough of the light in the frame",
     StreakStatus.TOO_FEW: "too few streaks are significant",
-    StreakStatus.TOO_SHORT: "the stars hardly moved",
+    StreakStatus.TOO_SHORT: "the stars moved too little for a rate",
     StreakStatus.BLACK: "all pixels of the frame are equal",
     StreakStatus.SATURATED: "the frame is overexposed",
     StreakStatus.FROZEN: "the frame is the same as the previous one",
