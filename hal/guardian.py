@@ -278,7 +278,7 @@ class GuardianLine:
             )
 
     def beat(self) -> None:
-        """Send a heartbeat after a successful control cycle. Never blocks, never raises."""
+        """Send a heartbeat after a successful control cycle, without blocking or raising errors."""
         if self._lost:
             return
         try:
@@ -301,7 +301,7 @@ class GuardianLine:
         return news
 
     def close(self) -> None:
-        """End the guardian, which sets the coils to zero once more. A further call has no effect."""
+        """End the guardian, which sets the coils to zero once more. A second call changes nothing."""
         try:
             self._line.send(BYE, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
             self._process.wait(_END_TIMEOUT_S)

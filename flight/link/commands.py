@@ -490,16 +490,16 @@ class Channel(Protocol):
     name: str
 
     def poll(self) -> list[tuple[bytes, Any]]:
-        """Return the received datagrams with their senders, oldest first. Never blocks, never raises."""
+        """Return received datagrams with their senders, oldest first, without blocking or raising errors."""
 
     def news(self) -> str:
         """Return a description of events since the last call, or an empty text."""
 
     def answer(self, data: bytes, sender: Any) -> None:
-        """Send an answer to a sender that has an address. Never blocks, never raises."""
+        """Send an answer to a sender that has an address, without blocking or raising errors."""
 
     def close(self) -> None:
-        """Close the channel. Calling this method again has no effect."""
+        """Close the channel. Calling `close` again has no effect."""
 
 
 class DatagramChannel:

@@ -127,7 +127,7 @@ class LinuxI2cBus:
         self._transact(address, lambda bus: bus.write_i2c_block_data(address, register, list(values)))
 
     def close(self) -> None:
-        """Close the bus. Calling this method again has no effect."""
+        """Close the bus. Calling `close` again has no effect."""
         self._closed = True
         # The bus is closed even without the lock, because a hung transaction must not delay the exit.
         locked = self._lock.acquire(timeout=self._patience)

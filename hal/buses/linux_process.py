@@ -138,7 +138,7 @@ class ServiceManager:
         self._notify("STOPPING=1")
 
     def close(self) -> None:
-        """Close the socket to the service manager. Calling this method again has no effect."""
+        """Close the socket to the service manager. Calling `close` again has no effect."""
         line, self._line = self._line, None
         if line is not None:
             line.close()

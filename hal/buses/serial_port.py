@@ -96,7 +96,7 @@ class PySerialPort:
             raise NotResponding(self._device, f"does not support {baud_rate} baud ({error})") from error
 
     def close(self) -> None:
-        """Stop the thread and close the port. Calling this method again has no effect."""
+        """Stop the thread and close the port. Calling `close` again has no effect."""
         if self._closing.is_set():
             return
         self._closing.set()
@@ -135,7 +135,7 @@ class PySerialPort:
     def _open_again(self) -> None:
         """Try to reopen the port until this succeeds or `close` is called.
 
-        It runs in the receiving thread.
+        The receiving thread calls this method.
         """
         self._serial.close()
         while not self._closing.wait(_REOPEN_S):

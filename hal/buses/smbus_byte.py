@@ -46,7 +46,7 @@ class ByteBus:
         fcntl.ioctl(self._descriptor, I2C_SMBUS, call)
 
     def close(self) -> None:
-        """Close the adapter. Calling this method again has no effect."""
+        """Close the adapter. Calling `close` again has no effect."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)

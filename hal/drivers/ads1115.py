@@ -99,7 +99,7 @@ class AdsSolarStrings:
             return self._error
 
     def close(self) -> None:
-        """Stop reading. Calling this method again has no effect."""
+        """Stop reading. Calling `close` again has no effect."""
         self._ticker.stop()
 
     def _serve(self) -> None:

@@ -132,7 +132,7 @@ class ServedCamera:
             return frame
 
     def close(self) -> None:
-        """Close the camera. Calling this method again has no effect."""
+        """Close the camera. Calling `close` again has no effect."""
         with self._lock:
             if self._closed:
                 return

@@ -190,7 +190,8 @@ def inputs_for(counts: int) -> tuple[PwmCounts, PwmCounts]:
 def brake() -> tuple[PwmCounts, PwmCounts]:
     """Return the PWM counts of both bridge inputs for braking, so that the coil current is zero.
 
-    Both ends of the coil are then at the supply voltage, even if one leg of the bridge is stuck high.
+    While braking, both ends of the coil are at the supply voltage, even if one leg of the bridge is stuck
+    high.
     """
     return FULL_ON, FULL_ON
 
@@ -528,7 +529,7 @@ class PwmTorqueCoils:
     def close(self) -> None:
         """Stop the job and set the coils to zero, while the shared bus stays open.
 
-        Calling this method again has no effect.
+        Calling `close` again has no effect.
         """
         with self._mailbox.lock:
             was_running, self._running = self._running, False

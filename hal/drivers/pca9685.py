@@ -133,8 +133,9 @@ class Pca9685:
     def write_channels(self, first: int, counts: Sequence[PwmCounts]) -> None:
         """Write the counts of consecutive channels, at most 8, in one block.
 
-        The outputs change simultaneously at the end of the block. Raises OutOfRange for counts without a
-        defined effect, such as equal on and off counts, and NotResponding if the chip does not answer.
+        All written outputs change simultaneously at the end of the block transfer. Raises OutOfRange for
+        counts without a defined effect, such as equal on and off counts, and NotResponding if the chip does
+        not answer.
         """
         if not (1 <= len(counts) <= BLOCK_CHANNELS and 0 <= first <= CHANNELS - len(counts)):
             raise OutOfRange(self.name, "last channel", first + len(counts) - 1, 0, CHANNELS - 1, "")

@@ -388,7 +388,7 @@ class VideoDevice:
         return view.astype(kind.newbyteorder("="), order="C")
 
     def close(self) -> None:
-        """Stop streaming and close the device. Calling this method again has no effect."""
+        """Stop streaming and close the device. Calling `close` again has no effect."""
         if self._descriptor < 0:
             return
         if self._streaming:

@@ -78,7 +78,7 @@ class CoilGuardian(Protocol):
     """Running guardian process, which sets the coils to zero when the heartbeats stop."""
 
     def beat(self) -> None:
-        """Send a heartbeat after a successful control cycle. Never blocks, never raises."""
+        """Send a heartbeat after a successful control cycle, without blocking or raising errors."""
 
     def tend(self, now_ns: int) -> list[GuardianNews]:
         """Replace a lost guardian and return the events since the last call."""

@@ -40,7 +40,7 @@ class Ticker(Protocol):
         """Run the job as soon as possible, without waiting for the next period."""
 
     def stop(self) -> None:
-        """Stop the job and return when no run is in progress. Calling this method again has no effect."""
+        """Stop the job and return when no run is in progress. Calling `stop` again has no effect."""
 
 
 class Clock(Protocol):
@@ -88,7 +88,7 @@ class SerialPort(Protocol):
         """Change the baud rate of the port."""
 
     def close(self) -> None:
-        """Close the port. Calling this method again has no effect."""
+        """Close the port. Calling `close` again has no effect."""
 
 
 class I2cBus(Protocol):
@@ -114,7 +114,7 @@ class I2cBus(Protocol):
         """Write at most 32 bytes to consecutive registers of a device."""
 
     def close(self) -> None:
-        """Close the bus. Calling this method again has no effect."""
+        """Close the bus. Calling `close` again has no effect."""
 
 
 @dataclass(frozen=True, slots=True)

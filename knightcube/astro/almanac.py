@@ -186,8 +186,8 @@ def propagate_orbit(
 def propagate_elements(elements: tuple[str, str], times: Sequence[datetime]) -> tuple[FloatArray, FloatArray]:
     """Return positions (n, 3), m, and velocities (n, 3), m/s, in ICRS axes from a two-line element set.
 
-    The propagator is SGP4. Its error is one to three kilometres near the epoch of the elements, and grows by
-    one to three kilometres per day.
+    The propagator is SGP4. The position error of SGP4 is one to three kilometres near the epoch of the
+    elements, and grows by one to three kilometres per day.
 
     Args:
         elements: the two lines of the element set.

@@ -51,7 +51,7 @@ def tangent_basis(direction: Iterable[float]) -> FloatArray:
 
 
 def cross_product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the cross product a x b of vectors (3,). This function is ten times as fast as numpy.cross."""
+    """Return the cross product a x b of vectors (3,), ten times as fast as numpy.cross."""
     ax, ay, az = a.tolist()
     bx, by, bz = b.tolist()
     return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))

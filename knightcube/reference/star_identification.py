@@ -282,7 +282,7 @@ def _best(
 def attitudes(observed: FloatArray, reference: FloatArray) -> FloatArray:
     """Return the attitude matrices (k, 3, 3) that rotate pairs of reference directions onto observed pairs.
 
-    Both arguments (k, 2, 3) contain the unit vectors of k pairs.
+    The arguments `observed` and `reference` (k, 2, 3) contain the unit vectors of k pairs.
     """
     return np.swapaxes(_frames(observed), -1, -2) @ _frames(reference)
 

@@ -14,13 +14,13 @@ Michalski is replaced by a margin relative to the size of the keys.
 Triangle tables: Triangles of the brighter guide stars are described by area and polar moment. Planar
 triangles have chords as sides (Michalski, eq. 35-48, and Cole & Crassidis, Fast star-pattern recognition
 using planar triangles, Journal of Guidance, Control, and Dynamics 29, 2006). Equation 47a of Michalski is
-corrected to the sides a, b and c. The covariance of a direction b is sigma^2 (1 - b b^T) (Michalski, eq. 25).
-Spherical triangles have great-circle arcs as sides (Michalski, eq. 32-34, and Cole & Crassidis, Fast star
-pattern recognition using spherical triangles, AIAA 2004). Instead of the recursive subdivision of the source,
-Gaussian quadrature computes the polar moment as the integral of theta^2 over the triangle, where theta is the
-angle from the mean direction of the corners. Each table contains all triangles whose sides fit into one
-frame, sorted by area with a k-vector. The corners of a triangle are ordered by the length of the opposite
-side, so that matching triangles also have matching corners.
+corrected to contain the sides a, b and c. The covariance of a direction b is sigma^2 (1 - b b^T) (Michalski,
+eq. 25). Spherical triangles have great-circle arcs as sides (Michalski, eq. 32-34, and Cole & Crassidis, Fast
+star pattern recognition using spherical triangles, AIAA 2004). Instead of the recursive subdivision of the
+source, Gaussian quadrature computes the polar moment as the integral of theta^2 over the triangle, where
+theta is the angle from the mean direction of the corners. Each table contains all triangles whose sides fit
+into one frame, sorted by area with a k-vector. The corners of a triangle are ordered by the length of the
+opposite side, so that matching triangles also have matching corners.
 
 Grid table (Padgett & Kreutz-Delgado 1997): The grid pattern of a star is the set of cells occupied by its
 neighbours. The star is the origin of a tangent plane, and the nearest neighbour outside a buffer radius
@@ -405,7 +405,7 @@ def build_triangles(
 def locally_bright(pairs: PairTable, radius: float, rank: int) -> BoolArray:
     """Return for each guide star (n,) whether fewer than `rank` brighter stars lie within `radius`, rad.
 
-    This selection has about the same star density in sparse and in dense regions of the sky.
+    The selected stars have about the same density in sparse and in dense regions of the sky.
     """
     start, stop = pairs.angle.ranges(0.0, radius)
     # The second star of a pair has the larger index and is therefore fainter than the first star.
@@ -588,7 +588,7 @@ class KnownSky:
 
     def _triangles(self, shape: Shape) -> TriangleTable:
         side = 2.0 * math.atan(min(self.half_width))
-        # This is the radius of a circle with the same solid angle as the field of view.
+        # Radius (rad) of a circle with the same solid angle as the field of view.
         radius = math.acos(1.0 - self.solid_angle / (2.0 * math.pi))
         chosen = locally_bright(self.pairs, radius, TRIANGLE_STARS_IN_FIELD)
         return build_triangles(self.stars.direction, self.pairs, chosen, side, shape)

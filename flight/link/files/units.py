@@ -4,7 +4,7 @@ A unit (protocol data unit) consists of a header and either file data or a direc
 1, entity numbers of 2 bytes and transaction numbers of 4 bytes; the decoder also accepts other lengths. The
 units contain no CRC, because the frame that carries a unit is authenticated. The large-file option is not
 used. Each unit is sent in a space packet of variable length, with the same headers as the other packets and a
-16-bit CRC. These packets are not listed in the tables of packet definitions.
+16-bit CRC. The tables of packet definitions do not list the packets that carry units.
 """
 
 from __future__ import annotations

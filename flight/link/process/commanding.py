@@ -54,7 +54,7 @@ class Stage(IntEnum):
 
     @property
     def final(self) -> bool:
-        """Whether this is the last stage of a command."""
+        """Whether the stage is the last stage of a command."""
         return self in {Stage.REFUSED, Stage.COMPLETED, Stage.FAILED}
 
 

@@ -86,7 +86,7 @@ class Line(Protocol):
         """Send frames to all listeners. Never raises."""
 
     def close(self) -> None:
-        """Close the line. Calling this method again has no effect."""
+        """Close the line. Calling `close` again has no effect."""
 
 
 class UdpLine:

@@ -415,7 +415,7 @@ class FlightLog:
     def close(self) -> None:
         """Write the queue, sync and close the log.
 
-        The call waits at most five seconds for a hung disk. Calling this method again has no effect.
+        The call waits at most five seconds for a hung disk. Calling `close` again has no effect.
         """
         if self._closed:
             return

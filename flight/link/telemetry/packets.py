@@ -251,7 +251,7 @@ def _explain(layout: Layout, time_ns: int, given: Mapping[str, object]) -> Telem
 
 
 BY_IDENTIFIER = {layout.identifier.to_bytes(2, "big"): layout for layout in LAYOUTS.values()}
-# This pattern matches a known identifier, or the first byte of an identifier at the end of the data.
+# Pattern of a known packet identifier, or of the first byte of an identifier at the end of the data.
 _START = re.compile(
     b"|".join(re.escape(i) + b"|" + re.escape(i[:1]) + rb"\Z" for i in BY_IDENTIFIER), re.DOTALL
 )

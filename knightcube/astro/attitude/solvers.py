@@ -89,7 +89,7 @@ In a narrow field of view, two of the three eigenvalue differences are of the or
 def skew_part(profile: FloatArray) -> FloatArray:
     """Return z (3,), the weighted sum of b x r, from the profile matrix B.
 
-    This is Michalski, eq. 72, in which the second component is corrected to B31 - B13.
+    The formula is Michalski, eq. 72, in which the second component is corrected to B31 - B13.
     """
     (_, xy, xz), (yx, _, yz), (zx, zy, _) = profile.tolist()
     return np.array([yz - zy, zx - xz, xy - yx])

@@ -238,7 +238,7 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
         quaternion: (4,) initial attitude.
     """
     weight = seen.weight[:, None]
-    # This is of the order of 1/spread^2, where spread (rad) is the angular extent of the directions.
+    # The narrowness is of the order of the inverse squared angular extent of the directions, 1/rad^2.
     narrowness = seen.total * float(seen.covariance.trace())
     smallest = max(_CONVERGED**2, _ROUNDING**2 * narrowness)
     for _ in range(_MAXIMUM_STEPS):

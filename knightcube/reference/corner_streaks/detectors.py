@@ -66,7 +66,8 @@ def trajkovic_response(
 ) -> FloatArray:
     """Return the interpixel cornerness of pixels that pass both thresholds, and zero for other pixels.
 
-    Both thresholds are relative to the largest simple cornerness in the image (Sease, text at eq. 3.10).
+    The thresholds T1 and T2 are relative to the largest simple cornerness in the image (Sease, text at eq.
+    3.10).
 
     Args:
         image: (rows, columns) image intensities.

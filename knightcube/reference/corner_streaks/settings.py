@@ -1,6 +1,6 @@
 """Settings and result of the streak estimator based on corner detectors.
 
-This module does not import scipy.
+The module `settings` does not import scipy, so that it is fast to load.
 """
 
 from __future__ import annotations
