@@ -13,8 +13,8 @@ axes and BITPIX 8, 16, 32, -32 or -64, and applies BZERO and BSCALE. The reader 
 extensions, tables, compressed images and cubes.
 
 The vision worker keeps its newest frames on disk (`keep_frame`). A kept frame is a PGM file (Netpbm), which
-most image programs can open. The file contains the unchanged grey counts of the frame, of 8 or 16 bits, and
-metadata in JSON as a comment.
+most image programs can open. The PGM file contains the unchanged grey counts of the frame, of 8 or 16 bits,
+and metadata in JSON as a comment.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def primary_image(content: bytes, name: str) -> Image:
     columns, rows = axes[:2]
     kind = np.dtype(KINDS[bits])
     if len(content) < start + rows * columns * kind.itemsize:
-        raise UsageError(f"{name}: ends before its {columns} x {rows} pixels do: it was cut short")
+        raise UsageError(f"{name}: ends before the last of {columns} x {rows} pixels: it was cut short")
     stored = np.frombuffer(content, dtype=kind, count=rows * columns, offset=start).reshape(rows, columns)
     if bits > 0 and "BLANK" in header and np.any(stored == _whole(header, "BLANK", name)):
         raise UsageError(f"{name}: has blank pixels: fill them first")
@@ -173,7 +173,7 @@ def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
     wanted = columns * rows * kind.itemsize
     if len(content) < wanted:
         raise UsageError(
-            f"{path}: {len(content)} bytes, but {columns} x {rows} pixels of {bits} bits are {wanted}"
+            f"{path}: has {len(content)} bytes, but {columns} x {rows} pixels of {bits} bits need {wanted}"
         )
     pixels = np.frombuffer(content, kind, columns * rows, len(content) - wanted)
     return pixels.reshape(rows, columns).astype(kind.newbyteorder("="))

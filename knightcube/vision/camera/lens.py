@@ -238,7 +238,7 @@ class Lens:
         return self.reach * (1.0 + square * (self.k1 + square * self.k2)) if square < np.inf else np.inf
 
     def _undistorted(self, stretched: FloatArray) -> FloatArray:
-        """Return the undistorted tangents of distorted tangents (...); NaN beyond the fold of the distortion.
+        """Return the undistorted tangents of distorted tangents (...), or NaN beyond the distortion's fold.
 
         Newton's method starts at the distorted tangent, or at the inflection point of the distortion curve if
         that is nearer to the axis. From this start Newton's method passes the root at most once and then
@@ -267,7 +267,7 @@ class Lens:
 def _reach(k1: float, k2: float) -> float:
     """Return the smallest tangent r at which the distorted radius stops growing.
 
-    It is the smallest positive root of 1 + 3 k1 r^2 + 5 k2 r^4 = 0, or infinite if there is none.
+    The tangent r is the smallest positive root of 1 + 3 k1 r^2 + 5 k2 r^4 = 0, or infinite if none exists.
     """
     discriminant = 9.0 * k1 * k1 - 20.0 * k2
     if discriminant < 0.0 or (k1 >= 0.0 and k2 >= 0.0):

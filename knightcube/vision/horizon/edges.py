@@ -2,9 +2,9 @@
 
 Columns and rows of the image are normalised, thresholded and filtered as in Meller et al., section 3.1. Each
 change from dark to bright is then located at the maximum slope of the brightness smoothed by a Gaussian. The
-width of the Gaussian is doubled as long as the edge is wider than the Gaussian (Lindeberg 1998, Int. J.
-Comput. Vision 30, 117), so that limbs of one pixel and of a hundred pixels are both located at their steepest
-points.
+width of the Gaussian is doubled as long as the edge is wider than the Gaussian (Lindeberg 1998, International
+Journal of Computer Vision 30, 117). Therefore a limb of one pixel and a limb of a hundred pixels are both
+located at the steepest point.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _PROFILE: IntArray = np.arange(-9, 6)
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """Mean brightness of dark pixels, median of bright pixels, and standard deviation of dark pixels."""
+    """Brightness levels of an image: mean and noise of dark pixels, and median of bright pixels."""
 
     dark: float
     bright: float
@@ -117,8 +117,8 @@ class ScanEdges:
         sigma: standard deviation of the edge position along the scan line before a fit (n,), px.
         background: brightness of the dark side (n,), which is low at the limb and the terminator, and higher
             at a coast or a cloud.
-        profile: brightness along the scan line around the edge, from dark to bright (n, m); NaN outside the
-            image.
+        profile: brightness along the scan line around the edge, from dark to bright (n, m), or NaN outside
+            the image.
     """
 
     points: FloatArray

@@ -46,7 +46,7 @@ _GRAZING = 0.3
 _LOWEST_SUN = np.radians(1.0)
 """Minimum elevation of the Sun at a limb point (rad); below it the limb appears too high."""
 _FINE = SCALE_HEIGHT / 6.0
-"""Pixel size at the limb (m) below which profiles are not fitted, because they exceed the stored samples."""
+"""Pixel size at the limb (m) below which brightness profiles are too long for the stored samples."""
 _CORRELATED = 10.0
 """Correlation length (px) of the brightness behind the limb."""
 _PIXEL_SIGMA = 12.0**-0.5
@@ -88,7 +88,7 @@ def near_limb(view: LimbView, observation: Observation, tolerance: float) -> Boo
 def _limb_points(
     view: LimbView, observation: Observation, members: BoolArray, sun: FloatArray | None
 ) -> LimbPoints:
-    """Return the limb points of the `members` (n,) in daylight whose scan lines are not too oblique."""
+    """Return the limb points of those `members` (n,) that are sunlit and whose scan lines are not oblique."""
     chosen = np.flatnonzero(members)
     rays = observation.rays.rays[chosen]
     if sun is not None:
@@ -265,7 +265,7 @@ def examine(
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> Hypothesis | None:
-    """Return the horizon hypothesis fitted from an initial guess; None if no limb can be fitted."""
+    """Return the horizon hypothesis fitted from an initial guess, or None if no limb can be fitted."""
     place, stand = guess.place, guess.orientation
     sun = sun_from(place, knowledge)
     prior = Prior(min(stand.sigma, _UNKNOWN_TURN), settings.limb_height_sigma, place.altitude_sigma)
@@ -318,7 +318,7 @@ def _fitted(
     settings: HorizonSettings,
     prior: Prior,
 ) -> tuple[FittedLimb, LimbPoints] | None:
-    """Return the limb fitted to the edges of an initial guess, and the limb points; None if the fit fails.
+    """Return the limb fitted to the edges of an initial guess, and the limb points, or None if the fit fails.
 
     The first Gauss-Newton step uses the steepest points of the edges. The following fit uses limb positions
     from the brightness profiles of the edges.

@@ -5,11 +5,11 @@ edges along its entire length. A view that is fitted to the terminator does not 
 3.3, do not state how to distinguish the limb from the terminator.
 
 If no image shows a limb, the Earth fills one camera and the other cameras are dark (Meller et al., section
-4.1). In this case, `coarse_nadir` tries nadir directions that cover the sphere. For each nadir direction it
-predicts which samples of the images are bright, namely samples on the sunlit part of the Earth's disc. The
-nadir is the mean of the tried directions, weighted by their likelihood given the samples, and the covariance
-of nadir is the spread of the weighted directions. If the Sun's direction is unknown, any sample on the disc
-may be dark.
+4.1). In this case, `coarse_nadir` tries nadir directions that cover the sphere. For each nadir direction, the
+function predicts which samples of the images are bright, namely samples on the sunlit part of the Earth's
+disc. The nadir is the mean of the tried directions, weighted by their likelihood given the samples, and the
+covariance of nadir is the spread of the weighted directions. If the Sun's direction is unknown, any sample on
+the disc may be dark.
 
 `why_false` compares an image with a known attitude. An image is false if it is mostly dark where sunlit
 ground must be, or mostly bright where only sky or night can be. Such an image comes from a camera that is
@@ -169,12 +169,12 @@ def image_brightness(image: Image, camera: MountedCamera, bright: float) -> Imag
 def coarse_nadir(
     looks: Sequence[ImageBrightness], altitude: float, sun: FloatArray | None = None
 ) -> CoarseNadir | None:
-    """Return the nadir that explains the brightness of all images; None if it is too uncertain.
+    """Return the nadir that explains the brightness of all images, or None if it is too uncertain.
 
     Args:
         looks: brightness of the samples of each image.
         altitude: height of the cameras above the Earth's mean radius, m.
-        sun: unit vector (3,) to the Sun in body axes, accurate to ten degrees; None if unknown.
+        sun: unit vector (3,) to the Sun in body axes, accurate to ten degrees, or None if unknown.
     """
     rays = np.concatenate([look.rays for look in looks])
     bright = np.concatenate([look.bright for look in looks])

@@ -6,12 +6,12 @@ rho is unknown, three rays determine n and rho. Every pair of edges gives a cone
 altitude is unknown. If there are too many pairs or triples, an evenly spaced selection is used. An edge
 agrees with a cone if the edge lies near the cone and its bright side is towards nadir. The edges of the best
 cone are removed and the search continues, so that the terminator, a coast or a band of clouds gives a cone of
-its own. This is sample consensus (Fischler & Bolles 1981) without random choice.
+its own. The search is sample consensus (Fischler & Bolles 1981) without random selection.
 
-A horizon does not determine the rotation about nadir. The rotation is needed because the Earth's flattening
-depends on the direction of the pole, and the illumination depends on the direction of the Sun. A rough
-attitude, the coarse direction of the Sun or the magnetic field gives this rotation. The angle between nadir
-and each such direction is also known, so a nadir at a different angle is rejected.
+A horizon does not determine the rotation about nadir. The rotation about nadir is needed because the Earth's
+flattening depends on the direction of the pole, and the illumination depends on the direction of the Sun. A
+rough attitude, the coarse direction of the Sun or the magnetic field gives this rotation. The angle between
+nadir and each such direction is also known, so a nadir at a different angle is rejected.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class ConeCandidate:
 def best_cone(
     edges: EdgeRays, free: BoolArray, cosines: tuple[float, float], tolerance: float, tries: int
 ) -> ConeCandidate | None:
-    """Return the cone with which most of the `free` edges agree; None if no cone can be formed.
+    """Return the cone with which most of the `free` edges agree, or None if no cone can be formed.
 
     Args:
         edges: edges of the image as directions.
@@ -299,7 +299,7 @@ def above_sphere(altitude: float, sigma: float = 0.0) -> Place:
 
 
 def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | None:
-    """Return the position of the camera from prior knowledge; None if the altitude is unknown."""
+    """Return the position of the camera from prior knowledge, or None if the altitude is unknown."""
     if knowledge.position is not None:
         position = np.asarray(knowledge.position, dtype=float)
         return Place(position, earth(knowledge.pole), settings.altitude_sigma, True)
@@ -309,7 +309,7 @@ def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | 
 
 
 def sun_from(place: Place, knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the unit vector (3,) to the Sun in inertial axes; None if the Sun or the position is unknown."""
+    """Return the unit vector (3,) to the Sun, inertial axes, or None if Sun or position are unknown."""
     if knowledge.sun is None or not place.located:
         return None
     return np.asarray(knowledge.sun / np.linalg.norm(knowledge.sun))
@@ -337,8 +337,9 @@ def initial_guess(
 ) -> InitialGuess:
     """Return the initial guess of a horizon from a cone; `place` is None if the altitude is unknown.
 
-    If the rotation about nadir is unknown, the Earth is assumed to be a sphere. If the Sun is known, the
-    rotation is then the trial rotation that explains the brightness of the image best.
+    If the rotation about nadir is unknown, the Earth is assumed to be a sphere. If the direction of the Sun
+    is known, several trial rotations about nadir are compared with the brightness of the image, and the best
+    is used.
     """
     if place is None:
         sine = float(np.sqrt(max(1.0 - candidate.cosine**2, 1e-6)))

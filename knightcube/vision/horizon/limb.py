@@ -3,22 +3,23 @@
 Limb cone: a scaling along the axes of an ellipsoid transforms it into the unit sphere, whose limb is a
 circular cone about the direction of the centre. The scaling transforms rays into rays, so a ray lies on the
 ellipsoid's limb if and only if the scaled ray lies on the cone (Christian & Robinson 2016, "Noniterative
-Horizon-Based Optical Navigation by Cholesky Factorization", J. Guid. Control Dyn. 39, 2757). The residual of
-a ray is the angle between the scaled ray and the scaled centre minus the half-angle of the cone. The residual
-is 0 on the limb and positive outside. The gradient of the residuals is analytic.
+Horizon-Based Optical Navigation by Cholesky Factorization", Journal of Guidance, Control, and Dynamics 39,
+2757). The residual of a ray is the angle between the scaled ray and the scaled centre minus the half-angle of
+the cone. The residual is 0 on the limb and positive outside. The gradient of the residuals is analytic.
 
-Fit of the cone: the fit is a Gauss-Newton iteration. Huber's weights, and zero weight beyond five standard
-deviations, exclude clouds, glare and the ends of the terminator. The standard deviation is estimated from the
-median of the residuals if this estimate exceeds the stated standard deviation. The limb height, the rotation
-about nadir and the altitude, which the limb does not determine, have a prior, so that the covariance includes
-their uncertainty.
+Fit of the cone: the cone is fitted by a Gauss-Newton iteration. Huber's weights, and zero weight beyond five
+standard deviations, exclude clouds, glare and the ends of the terminator. The standard deviation is estimated
+from the median of the residuals if this estimate exceeds the stated standard deviation. The limb height, the
+rotation about nadir and the altitude, which the limb does not determine, have a prior, so that the covariance
+includes their uncertainty.
 
-Brightness profile: a line of sight with tangent height h passes the optical depth t(h) = t0 exp(-h/H) with
-t0 = t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's radius
-and H the scale height of the air. A line of sight with h < 0 ends on the ground, where its elevation has the
-sine sqrt(-2h/R). The brightness of sunlit air is 1 - exp(-t), and the air attenuates the ground by exp(-t).
+Brightness profile: a line of sight with tangent height h passes the optical depth t(h) = t0 exp(-h/H) with t0
+= t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's radius and
+H the scale height of the air. A line of sight with h < 0 ends on the ground, where its elevation has the sine
+sqrt(-2h/R). The brightness of sunlit air is 1 - exp(-t), and the air attenuates the ground by exp(-t).
 Without blur, the brightness falls fastest where t = 1, at a tangent height of 15.4 km. Refraction is
-neglected. It lowers the apparent limb by 1 to 2 km, which is within `HorizonSettings.limb_height_sigma`.
+neglected. Refraction lowers the apparent limb by 1 to 2 km, which is within
+`HorizonSettings.limb_height_sigma`.
 
 Fit of the profile: the brightness profile across an edge is background + a air(h) + b ground(h), where the
 tangent height h falls by a known number of metres per pixel. The position of unit optical depth is fitted
@@ -294,7 +295,7 @@ def shared_error(
     _, gradients = limb_gradients(fit.view, rays)
     weighted = gradients * _weights(fit.residuals, sigma)[0][:, None]
     inverse = _solved(weighted.T @ gradients + _information(fit.view, prior), np.eye(PARAMETERS))
-    assert inverse is not None  # the fit has solved these equations
+    assert inverse is not None  # the fit has already solved the same equations
     moved = np.array([inverse @ weighted[groups == k].sum(axis=0) for k in range(len(error))])
     return np.asarray((moved * (error**2)[:, None]).T @ moved)
 
@@ -354,7 +355,7 @@ def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray)
 
 
 def _solved(normal: FloatArray, right: FloatArray) -> FloatArray | None:
-    """Return the solution of normal equations whose unknowns have different units; None if singular."""
+    """Return the solution of normal equations whose unknowns have different units, or None if singular."""
     diagonal = normal.diagonal()
     if not diagonal.min() > 0.0:
         return None
@@ -377,7 +378,7 @@ def _is_outside(view: LimbView) -> bool:
 SCALE_HEIGHT = 8000.0
 """Scale height of the lower air, m (US Standard Atmosphere 1976: 8.4 km at the ground, 6.4 km at 15 km)."""
 _VERTICAL_DEPTH = 0.097
-"""Vertical optical depth of the atmosphere at 550 nm (Bucholtz 1995, Appl. Opt. 34, 2765, Table 3)."""
+"""Vertical optical depth of the atmosphere at 550 nm (Bucholtz 1995, Applied Optics 34, 2765, Table 3)."""
 UNIT_DEPTH_HEIGHT = SCALE_HEIGHT * math.log(
     _VERTICAL_DEPTH * math.sqrt(2.0 * math.pi * SEMI_MAJOR_AXIS / SCALE_HEIGHT)
 )
@@ -461,7 +462,7 @@ def fit_profiles(
     """Return the limb positions on n scan lines, px, their standard deviations, px, and which are valid.
 
     Args:
-        profiles: brightness along n scan lines (n, m); NaN for missing samples.
+        profiles: brightness along n scan lines (n, m), or NaN for missing samples.
         steps: positions of the samples (n, m), px, towards the bright side, relative to the edge.
         metres: change of the tangent height per pixel on each scan line (n,), m.
         blur: standard deviation of the blur on each scan line (n,), m.

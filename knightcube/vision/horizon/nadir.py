@@ -65,11 +65,11 @@ class HorizonStatus(Enum):
 
     FOUND = "found"
     AMBIGUOUS = "ambiguous"
-    """Several horizons fit the image; `HorizonSolution.candidates` lists them."""
+    """Several horizons fit the image."""
     NO_HORIZON = "no-horizon"
     """The image has too few edges, or its edges do not lie on a common horizon."""
     REFUSED = "refused"
-    """A horizon was fitted but contradicts the image or prior knowledge; `reason` states how."""
+    """A horizon was fitted but contradicts the image or prior knowledge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,13 +115,13 @@ class HorizonSolution:
     Attributes:
         status: outcome of the search.
         reason: why no nadir was found, in one sentence; empty if a nadir was found.
-        nadir: the measured nadir; None unless the status is FOUND.
+        nadir: the measured nadir, or None unless the status is FOUND.
         candidates: the horizons that were not selected, or all horizons if no nadir was found.
         points: positions of all edges from dark to bright (n, 2), px.
         on_horizon: which edges lie on the best horizon (n,).
         limb: unit vectors (k, 3) to the limb points on the best horizon, camera axes.
         limb_sigma: standard deviations of the limb points normal to the limb (k,), rad.
-        view: position and attitude of the camera from the best fit, even if refused; None without a fit.
+        view: position and attitude of the camera from the best fit, even if refused, or None without a fit.
         pixels_read: number of pixels that the search read.
     """
 
@@ -142,11 +142,11 @@ class HorizonSolution:
 
 
 _WIDER = 2.0
-"""Factor by which the altitude range for cones is wider, because a cone through three edges is inaccurate."""
+"""Factor that widens the altitude range of the search for cones; a cone through three edges is inaccurate."""
 _MOST_ALTITUDE = 3.0
 """Largest distance of a fitted altitude from `HorizonSettings.altitudes`, in standard deviations."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
-"""Limits of the tests of a horizon.
+"""Thresholds of the tests that a horizon must pass.
 
 The values are the largest fraction of bright samples in the sky and on the night side, the minimum coverage
 of the sunlit limb by edges, and the largest fraction of limb points on the night side.
@@ -171,15 +171,16 @@ def find_nadir(
 ) -> HorizonSolution:
     """Return the nadir from the Earth's limb in an image, or the reason why no nadir is found.
 
-    The first search reads few columns and rows. If it finds a horizon of few edges, more columns and rows are
-    read near this horizon; if it finds no horizon, more are read in the whole image.
+    The first search reads few columns and rows. If the first search finds a horizon with few edges, more
+    columns and rows are read near this horizon. If the first search finds edges but no horizon, more columns
+    and rows are read in the whole image.
 
     Args:
         image: pixel values (rows, columns) of any integer or floating type; a larger value is brighter.
         camera: camera model of the image, a `Pinhole` or `Lens` of `knightcube.vision.camera.lens`.
         knowledge: prior knowledge of position, altitude, Sun and attitude. If it contains neither position
             nor altitude, the altitude is fitted too.
-        settings: settings of the search; None for the defaults.
+        settings: settings of the search, or None for the defaults.
 
     Raises:
         ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
@@ -400,10 +401,10 @@ class JointNadir:
 
     Attributes:
         status, reason: outcome of the search, and why no nadir was found.
-        nadir: the measured nadir in body axes; None unless the status is FOUND.
+        nadir: the measured nadir in body axes, or None unless the status is FOUND.
         cameras: indices of the cameras whose limb was used.
         each: solution of each image by the index of its camera, in camera axes.
-        limb_height: fitted height of the limb above the ellipsoid, m; NaN if no nadir was found.
+        limb_height: fitted height of the limb above the ellipsoid, m, or NaN if no nadir was found.
     """
 
     status: HorizonStatus
@@ -443,7 +444,7 @@ def nadir_of_cameras(
         images: images (rows, columns) taken at the same instant, by the index of the camera.
         cameras: all cameras of the body.
         knowledge: prior knowledge as for `find_nadir`, but in body axes instead of camera axes.
-        settings: settings of the search; None for the defaults.
+        settings: settings of the search, or None for the defaults.
 
     Raises:
         ValueError: if an image does not have the size of its camera, or has pixels that are not finite.

@@ -96,7 +96,10 @@ class LogarithmicResponse:
 
 
 def light_of(counts: Image, response: LogarithmicResponse | None) -> FloatArray:
-    """Return the light intensity for counts (...), in arbitrary units; `response` None means proportional."""
+    """Return the light intensity for counts (...), in arbitrary units.
+
+    Without a `response` of the detector, the intensity is proportional to the counts.
+    """
     if response is None:
         return np.asarray(counts, dtype=float)
     if counts.dtype == np.uint8:
@@ -119,7 +122,7 @@ class EdgeSettings:
             level.
         most: maximum number of edges per scan line; the edges with the darkest dark side are kept.
         psf_sigma: standard deviation of the blur of the optics, px.
-        response: response of the detector; None for a linear detector.
+        response: response of the detector, or None for a linear detector.
     """
 
     lines: int = 32

@@ -4,8 +4,8 @@
 
 In camera axes, all stars rotate about the same axis by the same angle. Three indicators show that a streak is
 not a star: the bisector of its chord misses the common centre of rotation, the streak subtends a different
-angle at this centre, or its OLAE residual is large (Sease, eq. (4.11) to (4.15), with corrections; OLAE is
-the Optimal Linear Attitude Estimator). If the rotation axis is nearly normal to the boresight, the centre
+angle at this centre, or its residual in the Optimal Linear Attitude Estimator (OLAE) is large (Sease, eq.
+(4.11) to (4.15), with corrections). If the rotation axis is nearly normal to the boresight, the centre
 recedes to infinity, and the chord's slope and length are used instead of centre and angle. In a wide field,
 the pinhole projection changes slopes and lengths by far more than their errors. Each indicator is therefore
 compared with that of a star at the same position, in units of the expected error of an endpoint. The rule of
@@ -139,7 +139,7 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     return np.stack([middle @ half.T for half in halves], axis=1)
 
 
-# Distance of the rotation centre from the boresight, in focal lengths, beyond which it is degenerate.
+# Distance of the rotation centre from the boresight, in focal lengths, beyond which the centre is not used.
 # The rotation axis decides, because errors make a least-squares centre appear nearer than it is.
 _FARTHEST_CENTRE = 3.0
 
@@ -188,7 +188,7 @@ def evaluate(
     fired = np.zeros((0, 3), dtype=np.bool_)
     if len(deviations):
         # The median absolute deviation is used, because an object itself increases the standard deviation.
-        # For this reason, no value among ten can exceed 2.85 standard deviations of the ten values.
+        # The largest of ten values can never exceed 2.85 standard deviations of the ten values.
         spread = MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0)
         fired = np.abs(deviations) > np.maximum(bounds, strict * spread)
     return Indicators(endpoints, deviations, fired, centre, degenerate)
@@ -329,7 +329,7 @@ class Judge:
     def streak(self, ends: FloatArray, fired: tuple[str, ...]) -> tuple[Verdict, SpaceObject | None]:
         """Classify a streak or point; `fired` names the indicators that exceed their thresholds.
 
-        If it is an object, the object is returned too.
+        The second value of the result is the object, or None if the streak is not an object.
         """
         if not fired:
             return Verdict.STAR, None
@@ -351,7 +351,7 @@ class Judge:
         lines = extend(pairs, chord_outward(pairs), self.settings.endpoint_bias) if len(pairs) else pairs
         try:
             light = self._light(corners)
-            # A line reduces chi-square by at most about its excess over the number of pixels.
+            # Adding a line cannot reduce chi-square to much less than the number of pixels.
             hopeless = light.chi_square - light.pixels < self.objects.improvement
             tried = [] if hopeless else [(ends, light.explain(ends)) for ends in lines]
         except FlightError:
@@ -478,7 +478,7 @@ def detect(
     settings: EndpointSettings,
     objects: ObjectSettings,
 ) -> ObjectReport | None:
-    """Search an image (rows, columns) for objects and return a report; None if it has too few streaks.
+    """Search an image (rows, columns) for objects and return a report, or None if it has too few streaks.
 
     The camera rotates by `rotation` (3,), rad, during the `exposure`, s. If the sign of the rotation is
     unknown, all directions of motion may be reversed together.
@@ -531,7 +531,7 @@ def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Str
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedObjects:
-    """The objects in one image, which are true in a condition if there is at least one object.
+    """The objects in one image; the result is true (`if found:`) if the image shows an object.
 
     Attributes:
         objects: the n objects, the brightest first.
@@ -557,7 +557,7 @@ def detect_objects(
     exposure: float,
     settings: ObjectSettings | None = None,
 ) -> DetectedObjects:
-    """Return the objects in an image whose stars are streaks, which are objects that move unlike the stars.
+    """Return the objects that move relative to the stars, in an image whose stars are streaks.
 
     Args:
         image: pixel values (rows, columns) of an unsigned integer type, with streaks of 20 px or more.
@@ -567,7 +567,7 @@ def detect_objects(
             from the streaks of the image. If the sign of the rate is unknown, all motions of objects may be
             reversed together.
         exposure: exposure time, s.
-        settings: thresholds, gain and saturation; None for the defaults.
+        settings: thresholds, gain and saturation, or None for the defaults.
 
     Raises:
         ValueError: if the image does not have the size of the camera, or has pixels that are not finite.

@@ -118,7 +118,7 @@ def _patch_reach(half: FloatArray, psf: float) -> float:
 def _fit_object(
     patch: ObjectPatch, middle: FloatArray, half: FloatArray, flux: float, stars: Trails
 ) -> FittedObject | None:
-    """Return the object fitted to a patch together with known stars; None if the fit fails.
+    """Return the object fitted to a patch together with known stars, or None if the fit fails.
 
     `middle` (2,), px, `half` (2,), px, and `flux`, counts, are the initial guess.
     """
@@ -232,7 +232,7 @@ class FramePatches:
         self._trails = Trails(stars.middle, stars.half, 10.0 ** (0.4 * (zero - stars.magnitude)))
 
     def measured(self, point: FloatArray, half: FloatArray, flux: float) -> FittedObject | None:
-        """Return the object fitted near `point` (2,), px; None if the fit fails.
+        """Return the object fitted near `point` (2,), px, or None if the fit fails.
 
         `half` (2,), px, and `flux`, counts, are the initial guess of half extent and flux.
         """
@@ -240,7 +240,7 @@ class FramePatches:
         return None if patch is None else _fit_object(patch, point, half, flux, self._near(point, patch))
 
     def beside(self, point: FloatArray, length: float, significance: float) -> FittedObject | None:
-        """Return an object whose light is merged with that of known stars; None if no object is found.
+        """Return an object whose light is merged with that of known stars, or None if no object is found.
 
         The fit of the object starts at the brightest pixel after the stars are subtracted.
 
@@ -281,7 +281,7 @@ class FramePatches:
         return Trails(trails.middle[near], trails.half[near], trails.flux[near])
 
     def _patch(self, point: FloatArray, reach: float) -> ObjectPatch | None:
-        """Return the patch within `reach` px of a point (2,) along each axis; None at the image border."""
+        """Return the patch within `reach` px of a point (2,) along each axis, or None at the image border."""
         rows, columns = self._light.shape
         x, y = np.rint(point).astype(int)
         size = int(np.ceil(reach))
@@ -311,14 +311,15 @@ def measure_objects(
     detection: DetectionSettings,
     settings: ObjectMeasurementSettings,
 ) -> MeasuredObjects | None:
-    """Return the possible objects in an image; None if the attitude of the image is unknown.
+    """Return the possible objects in an image, or None if the attitude of the image is unknown.
 
     Args:
         pixels: counts of the image (rows, columns).
         solution: star tracker solution of the image.
         exposure: exposure time, s.
         epoch: Julian year of the positions of the stars.
-        velocity: velocity of the camera (3,), m/s, which corrects directions for aberration; None for none.
+        velocity: velocity of the camera (3,), m/s, which corrects directions for aberration, or None for
+            none.
         detection: settings of the survey of the image.
         settings: settings of the measurement of objects.
     """

@@ -19,7 +19,7 @@ class EndpointSettings:
             the image mean as threshold, as Sease does.
         least_area: minimum number of pixels in a region; a noise peak fills nine pixels of the 3 x 3 sum.
         most_streaks: maximum number of regions that are measured, strongest first.
-        saturation: counts at which a pixel saturates; None for the maximum of the integer type.
+        saturation: counts at which a pixel saturates, or None for the maximum of the integer type.
         gain: electrons per count.
         smoothing_sigma: standard deviation of the Gaussian that smooths the image before the corner detector,
             px; 0 for no smoothing.
@@ -74,7 +74,7 @@ class ObjectSettings:
             2.5 as in Sease.
         psf_sigma: standard deviation of the camera's point spread function (PSF), px.
         gain: electrons per count.
-        saturation: counts at which a pixel saturates; None for the maximum of the integer type.
+        saturation: counts at which a pixel saturates, or None for the maximum of the integer type.
         most_streaks: maximum number of regions that are examined as streaks.
         most_points: maximum number of short regions that are examined as points.
         most_merged: maximum number of regions that are searched again after their stars are removed.
@@ -139,7 +139,7 @@ class MeasuredObjects:
         points: positions at mid-exposure (n, 2), px.
         directions: unit vectors to the objects (n, 3), ICRS, corrected for stellar aberration.
         covariance: covariances of the directions due to the errors of the positions (n, 3, 3), rad^2, ICRS.
-        magnitudes: V magnitudes of the objects relative to the stars of the image (n,); NaN if unknown.
+        magnitudes: V magnitudes of the objects relative to the stars of the image (n,), or NaN if unknown.
         attitude: covariance of the attitude (3, 3), rad^2, ICRS axes, an error that all objects share.
     """
 

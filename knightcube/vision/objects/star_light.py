@@ -10,7 +10,7 @@ explained by stars. Light that is not on the path of any star, or that ends wher
 not explained by stars.
 
 A star's streak has the same brightness from end to end. Therefore the brightness of a star is at most the
-minimum of the image along the star's path, which an erosion of the image by this path gives for every
+minimum of the image along the star's path. An erosion of the image by this path gives the minimum for every
 position. Objects that cross the streaks, and points on the streaks, nearly vanish in the eroded image. Stars
 are removed one by one, the brightest first. The positions and brightnesses of all stars found are fitted
 together, without pixels that are brighter than these stars. The brightest remainder is then fitted as a point
@@ -36,7 +36,7 @@ from knightcube.vision.frame import Background, label_pixels, line_of
 from knightcube.vision.objects.streak_ends import Regions, Segmented
 
 # Number of trial star paths per path length along a region.
-# The longest chain of stars in a region is given in path lengths.
+# Maximum length of a chain of successive star streaks in a region, in path lengths.
 _PATHS_PER_LENGTH, _LONGEST_CHAIN = 8, 5.0
 # Spacing (px) of the Gaussians whose sum models a streak.
 # This sum has a ripple of 0.2 % for a PSF of 0.6 px.
@@ -347,7 +347,7 @@ class Patch:
 
     @property
     def smoothed_noise(self) -> float:
-        """The standard deviation of a background pixel after `smoothed`, counts."""
+        """The standard deviation of a background pixel after convolution with the PSF, counts."""
         return self.noise / (2.0 * float(np.sqrt(np.pi)) * self.psf_sigma)
 
 
@@ -468,7 +468,7 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
 
 
 def _continued(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2), px, of a line that is extended across gaps; None if the line does not continue.
+    """Return the ends (2, 2), px, of a line extended across gaps, or None if the line does not continue.
 
     A star that crosses the line leaves a gap, because the star is removed together with the line's light.
     """

@@ -1,4 +1,4 @@
-"""The star tracker: identifies the stars of a frame and determines its attitude (Michalski chapter 3).
+"""The star tracker: identifies the stars of a frame and determines its attitude (Michalski, chapter 3).
 
 `detection` finds and measures stars. `lost_in_space` identifies the stars without a prior attitude, and
 `verification` with a prior attitude; both use the guide stars of `index`. `attitude_fit` fits the attitude to

@@ -41,7 +41,7 @@ class StarField:
         half_width: tangents of half the field of view along x and along y (2,).
         scale: lowest and highest possible factor that corrects the tangents x/z, y/z for the true focal
             length; (1, 1) for a calibrated camera.
-        magnitude: instrumental magnitudes of the points (n,); None if only their order is known.
+        magnitude: instrumental magnitudes of the points (n,), or None if only their order is known.
     """
 
     direction: FloatArray
@@ -90,7 +90,7 @@ class StarMatch:
     Attributes:
         status: outcome of the identification; the other attributes are valid for IDENTIFIED only.
         star: index of the guide star of each point (n,); -1 for a point without a guide star.
-        fix: attitude from all matched stars, ICRS to camera, with its covariance; None unless identified.
+        fix: attitude from all matched stars, ICRS to camera, with its covariance, or None unless identified.
         scale: factor that corrects the tangents of the observed directions for the true focal length.
         scale_sigma: standard deviation of the scale; 0 if the scale was given.
         log10_false_alarm: log10 of the probability that random stars would match as well anywhere in the sky;
@@ -122,7 +122,7 @@ _CROSS = np.array(
 _SETTLED = 1e-4
 _MOST_STEPS = 6
 # Minimum reciprocal condition number of the normal equations.
-# It is reached if all stars lie within 1e-6 rad of one direction.
+# This minimum is reached if all stars lie within 1e-6 rad of one direction.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -133,8 +133,8 @@ class Refinement:
     Attributes:
         matrix: attitude matrix (3, 3) from ICRS to camera axes.
         scale: factor that corrects the tangents of the observed directions.
-        covariance: covariance of the rotation about the camera axes, rad^2, and of ln scale (4, 4); without
-            ln scale (3, 3) if the scale was fixed.
+        covariance: covariance of the rotation about the camera axes (rad) and of ln scale (4, 4), or of the
+            rotation alone (3, 3) if the scale was fixed.
         squares: squared residual of each star divided by its variance (n,).
     """
 
@@ -261,9 +261,9 @@ _MOST = 0.25
 _GROWTH_ROUNDS = 12
 _DISTORTION_STEPS = 6
 _DISTORTION_SETTLED = 1e-6
-# Half-width of the gate while the match grows: the larger of two limits.
-# One limit is in standard deviations of a star, and the other is relative to the corner's tangent.
+# Half-width of the gate within which a star matches, in standard deviations of the star.
 _GATE_SIGMAS = 8.0
+# Minimum half-width of the gate within which a star matches, relative to the corner's tangent.
 _GATE_SHARE = 0.004
 # Residual above which a star is excluded from the final fit, in standard deviations of the scatter.
 _OUTLIER = 4.0
@@ -371,8 +371,8 @@ class _DistortedPose:
     def ratio(self, direction: FloatArray, corner: float) -> FloatArray:
         """Return the ratios r (n,) of true to observed tangents.
 
-        A ratio solves r (1 + c s^2 r^2) = 1, with distortion c and observed tangent s in units of the
-        corner's.
+        A ratio solves r (1 + c s^2 r^2) = 1, where c is the distortion and s is the observed tangent divided
+        by the corner's tangent.
         """
         squared = self.distortion * _squared_tangent(direction) / corner**2
         ratio = np.ones(len(direction))

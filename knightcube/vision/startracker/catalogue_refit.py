@@ -1,12 +1,12 @@
 """Refit of the streaks of an identified frame with all stars of the catalogue, including faint stars.
 
-In a frame of long streaks, most stars are fainter than the noise of a pixel. Their light overlaps the bright
-streaks and displaces the measured positions, and a close pair of stars is measured as one star. After a frame
-is identified, the catalogue gives the positions of all stars. The catalogue also gives their brightness,
-scaled by the measured stars. Stars that are too faint, or too near to a brighter star, to be fitted are
-subtracted from the frame, and the uncertainty of their brightness is added to the noise. The fit of the other
-stars starts at their catalogue positions. Objects that are not in the catalogue are fitted but do not affect
-the motion.
+In a frame of long streaks, most stars are fainter than the noise of a pixel. The light of these faint stars
+overlaps the bright streaks and displaces the measured positions, and a close pair of stars is measured as one
+star. After a frame is identified, the catalogue gives the positions of all stars. The catalogue also gives
+the brightness of all stars, which is scaled to the measured stars. Stars that are too faint, or too near to a
+brighter star, to be fitted are subtracted from the frame, and the uncertainty of their brightness is added to
+the noise. The fit of the other stars starts at their catalogue positions. Objects that are not in the
+catalogue are fitted but do not affect the motion.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def refit_motion(
     settings: SolveSettings,
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
-    """Return `motion` refitted with all catalogue stars; None if the fit fails or gives a different rate."""
+    """Return `motion` refitted with all catalogue stars, or None if the fit fails or the rate changes."""
     # With a rolling shutter, an ambiguous rate lies between two possible rates and is not a valid start.
     between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
@@ -203,7 +203,7 @@ def _known_stars(
     course: CameraMotion,
     most: int,
 ) -> _Known | None:
-    """Return the catalogue stars in the frame; None if no fitted star is identified.
+    """Return the catalogue stars in the frame, or None if no fitted star is identified.
 
     The identified stars give the counts of a star of magnitude zero.
     """

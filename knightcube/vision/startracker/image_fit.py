@@ -4,8 +4,8 @@ The position of a streaked star is accurate across its path and inaccurate along
 which is the difference between observed and predicted unit vector, is resolved in two directions normal to
 the star and whitened by the covariance of the position. A Gauss-Newton iteration minimises the sum of
 squares, which is the maximum likelihood estimate for Gaussian errors. A streak that overlaps another star has
-a wrong position. Such outliers are found with Huber's weights, which bound the influence of any star, and are
-excluded.
+a wrong position. Streaks with wrong positions are found with Huber's weights, which bound the influence of
+any star, and are excluded.
 
 Tilt, decentring and distortion of an inexact lens (the bend, see `sky_map`) are also fitted, with a prior
 from the calibration or from typical lenses. The covariance of the attitude includes the remaining uncertainty
@@ -182,7 +182,7 @@ class _Seen:
 
     @property
     def before(self) -> FloatArray:
-        """The reciprocal prior variances of the bend and of the delay, the last of the parameters."""
+        """The reciprocal prior variances of the bend and of the delay, which are the last parameters."""
         return np.append(self.unknowns.bend, np.ones(min(len(self.late), 1)))
 
     @property

@@ -1,8 +1,8 @@
 """Conversion between pixels and directions in the sky, for a camera of known attitude.
 
 The conversion includes stellar aberration, which displaces stars towards the camera's direction of motion by
-up to 20.8". It is computed by the exact formula of special relativity (Green, Spherical Astronomy, 1985,
-section 8.3; Explanatory Supplement, section 7.2.3).
+up to 20.8". Aberration is computed by the exact formula of special relativity (Green, Spherical Astronomy,
+1985, section 8.3, and Explanatory Supplement, section 7.2.3).
 
 The conversion also includes lens errors: tilt and decentring, which displace the optical axis from the image
 centre, and distortion. These errors displace a tangent u by (u . a) u + |u|^2 b + k |u|^2 u + l |u|^4 u, with
@@ -158,8 +158,8 @@ class SkyMap:
         quaternion: attitude quaternion (4,) from ICRS to camera axes.
         bend: tilt, decentring and distortion that the camera model does not include (6,); zeros if the lens
             is exact.
-        velocity: velocity of the camera (3,), m/s, by which directions are corrected for aberration; None for
-            no correction.
+        velocity: velocity of the camera (3,), m/s, by which directions are corrected for aberration, or None
+            for no correction.
     """
 
     camera: CameraModel
@@ -168,13 +168,13 @@ class SkyMap:
     velocity: FloatArray | None = None
 
     def directions(self, points: FloatArray) -> FloatArray:
-        """Return the directions (unit vectors (n, 3), ICRS) of pixels (n, 2)."""
+        """Return the ICRS directions of pixels (n, 2), as unit vectors (n, 3)."""
         seen = bent(self.camera.unit_vectors(points), self.bend) @ attitude_matrix(self.quaternion)
         # The aberration of the opposite velocity is the inverse, accurate to (v/c)^2 or 0.002".
         return seen if self.velocity is None else apparent(seen, -self.velocity)
 
     def pixels(self, directions: FloatArray) -> FloatArray:
-        """Return the pixels (n, 2) of unit vectors (n, 3), ICRS; NaN for directions that are not imaged."""
+        """Return the pixels (n, 2) of unit vectors (n, 3), ICRS, or NaN for directions not imaged."""
         if self.velocity is not None:
             directions = apparent(directions, self.velocity)
         wanted = self.camera.project(directions @ attitude_matrix(self.quaternion).T)

@@ -65,14 +65,14 @@ class FrameSolution:
         late: displacement of the points (n, 2), px, due to an error of one standard deviation of the
             shutter's line time; (0, 2) if the line time is exact.
         star: index of the guide star of each point (n,); -1 for a point without a guide star.
-        expected: predicted positions of the guide stars (n, 2), px; NaN for a point without a guide star.
+        expected: predicted positions of the guide stars (n, 2), px, or NaN for a point without a guide star.
         fix: attitude from ICRS to camera axes and its covariance; the quaternion's scalar is not negative.
         scale_sigma: relative standard deviation of the focal length; 0 if the focal length was given.
         bend: fitted tilt, decentring and distortion of the lens (6,), see `sky_map`; zeros if the lens is
             exact.
         log10_false_alarm: log10 of the probability that a frame of random points would have been solved.
         tracked: whether the stars were identified near the prior attitude.
-        motion: motion of the camera from the streaks, camera frame; None for points.
+        motion: motion of the camera from the streaks, camera frame, or None for points.
         mirrored: whether the image shows the mirrored sky. In this case `fix` is the attitude of the image
             with left and right exchanged about the optical axis, but points are those of the original image.
     """
@@ -106,7 +106,7 @@ class FrameSolution:
         return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
 
     def sky_map(self, velocity: FloatArray | None = None) -> SkyMap | None:
-        """Return the conversion between pixels and directions; None if the frame was not solved.
+        """Return the conversion between pixels and directions, or None if the frame was not solved.
 
         `velocity` (3,), m/s, is the camera's velocity with which the frame was solved.
         """
@@ -216,11 +216,11 @@ class SolveSettings:
         detection: settings of the detection of points.
         likelihood: settings of the streak estimator for images from files; flight uses other settings.
         identification: settings of the default identification method.
-        method: function that replaces the default identification method; None for the default.
-        attitude: solver of Wahba's problem for the attitude; None for the fit of the image positions.
+        method: function that replaces the default identification method, or None for the default.
+        attitude: solver of Wahba's problem for the attitude, or None for the fit of the image positions.
         velocity: velocity of the camera relative to the solar system barycentre (3,), m/s, for the correction
-            of aberration; None for no correction.
-        lens: accuracy of a lens of known focal length; None if the lens is exact.
+            of aberration, or None for no correction.
+        lens: accuracy of a lens of known focal length, or None if the lens is exact.
         uncalibrated_lens: whether a lens of uncertain focal length may also have a displaced optical axis and
             distortion.
     """
@@ -255,7 +255,7 @@ class RatePrior:
     Attributes:
         rate: angular velocity (3,), rad/s, camera axes.
         sigma: standard deviation of each component of the angular velocity, rad/s.
-        course: rotation of the camera as a function of time during the exposure; None if unknown.
+        course: rotation of the camera as a function of time during the exposure, or None if unknown.
     """
 
     rate: FloatArray
@@ -363,7 +363,7 @@ def solve_near(
     prior: AttitudePrior,
     trails: ShortTrails | None = None,
 ) -> FrameSolution | None:
-    """Return the attitude from stars near their predicted positions; None if the stars do not agree with it.
+    """Return the attitude from stars near their predicted positions, or None if the stars do not agree.
 
     `trails` describes the motion of the stars during the exposure, as for `points_near`.
     """

@@ -213,7 +213,7 @@ def verify(
 
 
 def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> StarMatch:
-    """Return the identification with the lens distortion fitted; NO_MATCH if bright stars are displaced."""
+    """Return the identification with the distortion fitted, or NO_MATCH if bright stars are displaced."""
     expected = _expected_in(field, sky, refined.matrix, refined.scale)
     found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
     if found is None or _share_displaced(field, sky, expected, found) > _MOST_DISPLACED:
@@ -263,8 +263,8 @@ def expected_stars(
     """Return the indices of the `count` brightest guide stars in the field, the brightest first."""
     across, down = half_width
     cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
-    # Twice the stars are searched that give `count` stars in an average field.
-    # The factor is needed because the density of stars is lower near the galactic poles.
+    # The search covers twice the number of stars that gives `count` stars in an average field.
+    # The factor of two is needed because the density of stars is lower near the galactic poles.
     brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
     near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse[:, :brightest] > cosine)
     x, y, z = matrix @ sky.stars.direction[near].T
@@ -288,8 +288,8 @@ def _settle(
 ) -> tuple[_Matching, Refinement] | None:
     """Return the matched stars and the attitude after repeated matching and refinement.
 
-    Matching and refinement are repeated until the matched stars no longer change. Returns None if they
-    diverge.
+    Matching and refinement are repeated until the matched stars no longer change. Returns None if the
+    refinement diverges.
     """
     refined, previous = start, None
     for _ in range(settings.rounds):
@@ -390,7 +390,7 @@ def track(
     sigma: float,
     settings: VerificationSettings = _DEFAULT,
 ) -> StarMatch:
-    """Return the identification of a frame near a prior attitude; NO_MATCH if the stars contradict the prior.
+    """Return the identification near a prior attitude, or NO_MATCH if the stars contradict the prior.
 
     The prior is the quaternion `attitude` (4,) from ICRS to camera axes, with the standard deviation `sigma`,
     rad, about each axis. If `sigma` exceeds some degrees, `identify` is faster and more reliable.
@@ -422,7 +422,7 @@ def _same_shift(
 ) -> tuple[IntArray, npt.NDArray[np.intp]]:
     """Return the indices of observed stars (k,) and guide stars (k,) that have a common displacement.
 
-    They are the largest set of pairs for which one displacement explains the errors of the prior.
+    These stars are the largest set of pairs for which one displacement explains the error of the prior.
     """
     reach = PRIOR_SIGMAS * sigma
     across, down = (scale * width for width in field.half_width)

@@ -62,11 +62,11 @@ class Detections:
         flux: counts above the background of each source (n,).
         background: sky background at each source (n,), counts per pixel.
         signal_to_noise: flux of each source divided by its standard deviation (n,).
-        width: standard deviation of the Gaussian that best fits each source (n,), px; NaN if not measured.
+        width: standard deviation of the Gaussian that best fits each source (n,), px, or NaN if not measured.
         quality: `Quality` flags of each source (n,), int64.
         prediction: index of the prediction near which each source was found (n,); -1 in a search of the
             whole frame.
-        psf_sigma: standard deviation of the frame's PSF, px; NaN if it was neither given nor measured.
+        psf_sigma: standard deviation of the frame's PSF, px, or NaN if it was neither given nor measured.
     """
 
     points: FloatArray
@@ -399,9 +399,9 @@ def measure_near(
     Args:
         pixels: counts of the frame (rows, columns).
         predicted: predicted positions (m, 2), px; positions outside the frame are ignored.
-        settings: detection settings; None for the defaults.
-        trail: displacement of each star during the exposure (m, 2), px, of at most a few pixels; None for no
-            displacement.
+        settings: detection settings, or None for the defaults.
+        trail: displacement of each star during the exposure (m, 2), px, of at most a few pixels, or None for
+            no displacement.
 
     Raises:
         ValueError: unless pixels and predictions are finite real numbers and the frame has at least 16 x 16

@@ -2,16 +2,17 @@
 
 `first_look` fits each star alone with a free width, and `frame_spread` derives the PSF and the noise of the
 frame from these fits. `measure` then fits each star with the PSF of the frame, or computes a centroid in a
-window whose border is subtracted (Michalski, eq. (12) to (21)). The window ends at x_start + a - 1.
-Michalski, eq. (14) and (15), end the window one pixel later, which contradicts the divisor 4 (a - 1) of eq.
-(16e), the number of border pixels of a window of a x a pixels. Michalski, eq. (20), is used as y_CM with j
-(errata).
+window whose border is subtracted (Michalski, eq. (12) to (21)). The window of a x a pixels ends at column
+x_start + a - 1. In Michalski, eq. (14) and (15), the window ends one pixel later, which contradicts eq.
+(16e), where the border has 4 (a - 1) pixels. Michalski, eq. (20), repeats x_CM instead of y_CM, and is
+corrected here (errata).
 
 Three other centroid methods start from the centre of mass and weight the pixels. `weighted` weights each
 pixel with its own counts (Michalski, reference [22]; most CubeSat star trackers use this method). `iterative`
-uses a Gaussian weight that follows the centroid (Stone 1989, Astron. J. 97, 1227, and the windowed positions
-of SExtractor). `gaussian` fits a parabola to the logarithm of the counts. Each method also returns the
-derivatives of the centroid with respect to the pixels, from which the variance of the centroid is computed.
+uses a Gaussian weight that follows the centroid (Stone 1989, Astronomical Journal 97, 1227, and the windowed
+positions of SExtractor). `gaussian` fits a parabola to the logarithm of the counts. Each method also returns
+the derivatives of the centroid with respect to the pixels, from which the variance of the centroid is
+computed.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ REACH = 2.7
 """Half-width of a window, in standard deviations of the PSF, within `LEAST_HALF` and `MOST_HALF` px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
 # Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the star's counts.
-# It is smaller than in the first fit, so that not only the wings of bright stars determine the fit.
+# This mismatch is smaller than in the first fit, so that more than the wings of bright stars are used.
 _NEXT_MISMATCH = 0.02
 # Mismatch between PSF and Gaussian that is assumed if no star determines it.
 _UNKNOWN_MISMATCH = 0.02
@@ -109,8 +110,9 @@ def first_look(targets: StarTargets, gain: float | None = None) -> Shapes:
 def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) -> FrameSpread:
     """Return the width of the PSF and the noise model of a frame, from the stars selected by `plain` (n,).
 
-    A gain in the settings is kept. A width in the settings is kept unless at least eight stars determine the
-    width. If no star is usable, the width is 1 px and the photon noise 0, unless the settings state them.
+    A gain in the settings is used unchanged. A width in the settings is kept unless at least eight stars
+    determine the width. If no star is usable, the width is 1 px and the photon noise 0, unless the settings
+    state them.
     """
     fitted = shapes.fitted
     certain = fitted.flux > 8.0 * np.sqrt(fitted.covariance[:, FLUX, FLUX])
@@ -304,9 +306,10 @@ class WindowCentroids:
 def centre_of_mass(
     windows: StarWindows, noise: NoiseModel, psf_sigma: float, method: Method = "window"
 ) -> WindowCentroids:
-    """Return the centroids in windows by the centre of mass (Michalski, eq. (12) to (20)) or by `METHODS`.
+    """Return the centroids in windows from one of `METHODS` or the centre of mass.
 
-    Pixels of a window that are outside the frame count as zero.
+    The centre of mass follows Michalski, eq. (12) to (20). Pixels of a window that are outside the frame
+    count as zero.
     """
     half = windows.half
     offset, flux, sky = _moments(windows.light)

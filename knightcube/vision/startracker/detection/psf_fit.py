@@ -8,9 +8,9 @@ equations of all stars, 4 x 4 or 5 x 5 each, are solved together.
 
 The variance of a pixel is noise^2 + light / gain + (mismatch x light)^2, where light is the star's counts in
 the pixel. The three terms are the sky noise, the photon noise, and the difference between the PSF and a
-Gaussian. If the gain is unknown, gain and mismatch are measured from the residuals of the stars. They can be
-distinguished because the variance of photon noise is proportional to the light, and that of the mismatch to
-the square of the light.
+Gaussian. If the gain is unknown, gain and mismatch are measured from the residuals of the stars. Gain and
+mismatch can be distinguished because the variance of photon noise is proportional to the light, and that of
+the mismatch to the square of the light.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def cut(
         level: sky background in each window (n,), counts.
         noise: standard deviation of a background pixel in each window (n,), counts.
         ceiling: counts from which a pixel is saturated and not used.
-        trail: displacement of each star during the exposure (n, 2), px; None for no displacement.
+        trail: displacement of each star during the exposure (n, 2), px, or None for no displacement.
     """
     rows, columns = pixels.shape
     step = np.arange(-half, half + 1)
@@ -174,7 +174,7 @@ def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | 
         offset: position of each star relative to the centre of the middle pixel (n, 2), px.
         sigma: standard deviation of the PSF of each star (n,), px.
         half: half-width of the windows, px.
-        trail: displacement of each star during the exposure (n, 2), px; None for no displacement.
+        trail: displacement of each star during the exposure (n, 2), px, or None for no displacement.
     """
     out = np.zeros((len(offset), 2 * half + 1, 2 * half + 1))
     for shift, share in path(np.zeros_like(offset) if trail is None else trail):
@@ -219,7 +219,7 @@ def measure_noise(
     """Return the noise model from the residuals of a fit of stars; if the gain is given, it is kept.
 
     A non-negative least-squares fit models residual^2 - noise^2 as a sum of multiples of light and light^2.
-    Its weights are the reciprocal variances of the square of a normal residual.
+    The weights of this fit are the reciprocal variances of the square of a normal residual.
 
     Args:
         residual: residuals of the fit (n, k, k), counts.
@@ -256,10 +256,10 @@ def _shared_mismatch(
     used: BoolArray,
     photon: float,
 ) -> float:
-    """Return the mismatch between PSF and Gaussian as a weighted median over the stars.
+    """Return the mismatch between PSF and Gaussian, for known photon noise, as a weighted median over stars.
 
-    The photon noise is known. The median is used because a wrong PSF affects all stars, but the light of
-    neighbouring stars affects only a few.
+    The median is used because a wrong PSF affects all stars, but the light of neighbouring stars affects only
+    a few.
     """
     m = np.where(used, light, 0.0)
     floor = np.broadcast_to((noise**2)[:, None, None], light.shape)

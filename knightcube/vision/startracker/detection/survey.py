@@ -287,9 +287,9 @@ class DetectionSettings:
         threshold_sigmas: minimum height of a peak in the smoothed frame, in standard deviations of its noise.
         most_stars: maximum number of stars, the brightest first. Each sixteenth of the frame contributes at
             most a quarter of this number.
-        psf_sigma: standard deviation of the PSF, px. None means that it is measured in the frame, which needs
-            several stars. State the value for tracking windows with few stars.
-        gain: electrons per count; None means that it is measured from the residuals of the stars.
+        psf_sigma: standard deviation of the PSF, px. None means that the PSF is measured in the frame, which
+            needs several stars. State the width of the PSF for tracking windows with few stars.
+        gain: electrons per count, or None to measure the gain from the residuals of the stars.
         saturation: counts at which a pixel saturates. None means the highest count of the frame if several
             pixels have it, otherwise the maximum of the integer type.
         window: side length of the centroid window, px, an odd number (a_ROI in Michalski, eq. (12) to (15)).
@@ -496,9 +496,8 @@ def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
     """Return whether lines follow one rotation, from `centre` (n, 2), px, and `direction` (n,), rad.
 
     Near the boresight, a rotation displaces the image at (x, y) by t + w (-y, x), with a vector t and a
-    number w. The flow has no component along the normal of a line that follows it. The best t and w are the
-    right singular vector with the smallest singular value of the matrix that maps t and w to the normal
-    components.
+    number w. The flow has no component along the normal of a line that follows it. The best t and w follow
+    from a singular value decomposition of the normal components.
     """
     middle = centre.mean(axis=0)
     scale = float(np.abs(centre - middle).max()) or 1.0

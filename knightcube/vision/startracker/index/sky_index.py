@@ -2,28 +2,28 @@
 
 The file begins with a header, which contains 8 magic bytes that identify the kind of table, the version
 (uint32), the CRC-32 of everything after the header (uint32), and the length of the table of contents
-(uint32). The table of contents is JSON. The columns follow, little-endian, each at a multiple of 64 bytes. A
-file with the same columns always has the same bytes.
+(uint32). The table of contents is JSON and is followed by the columns, which are little-endian and begin at
+multiples of 64 bytes. A file with the same columns always has the same bytes.
 
 Guide stars are the stars of the catalogue as a given lens images them (Michalski, section 3.3). Proper motion
 is applied up to the epoch of observation. Stars that the image cannot resolve are merged into one star at
 their centroid, with their joint magnitude. Aberration is not included in the index, because it depends on the
 velocity of the camera; it is applied to the matched directions on board.
 
-The index contains only triangles whose stars are bright relative to the size of the triangle. The reach r of
-a star is its distance from the `rank`-th nearest of the stars that are brighter than the star itself. The
-star is then among the `rank` brightest stars of every circle around it that is smaller than r. The index
+The index contains only triangles whose stars are bright relative to the size of the triangle. The reach of a
+star is its distance from the `rank`-th nearest of the stars that are brighter than the star itself. A star is
+among the `rank` brightest stars of every circle around the star whose radius is below its reach. The index
 contains a triangle if its longest side is at most the reach of each of its stars. The index does not depend
 on the field of view: frames of any field of view find about the same number of triangles of their brightest
-stars. Every part of the sky has about the same number of such stars, so dense regions do not add triangles.
-Near a cluster of bright stars, no star has a long reach. Therefore the triangles of the `few` brightest stars
-of circles that cover the sky are added, for circles of several radii.
+stars. Every part of the sky has about the same number of stars with a given reach, so dense regions do not
+add triangles. Near a cluster of bright stars, no star has a long reach. To cover such regions, the index also
+contains the triangles of the `few` brightest stars of circles of several radii that cover the sky.
 
 The sides of a triangle are chords of the unit sphere. The key of a triangle consists of three parts. The
-first part is whether the corners opposite the shortest, the middle and the longest side run left or right.
-The second part is the ratios of the shortest and of the middle side to the longest side, in cells of `CELL`.
-The third part is the longest side. In the sorted keys, the triangles of one cell within limits of size are
-contiguous.
+first part of a key is whether the corners opposite the shortest, the middle and the longest side run left or
+right. The second part of a key is the ratios of the shortest and of the middle side to the longest side, in
+cells of `CELL`. The third part of a key is the longest side. In the sorted keys, the triangles of one cell
+within limits of size are contiguous.
 
 `python -m knightcube.vision.startracker.index.build` builds the index. The same stars and settings give a
 file with the same bytes.
