@@ -49,7 +49,7 @@ def test_streaks_hardly_move_level_and_noise() -> None:
     assert np.median(background.noise) == pytest.approx(np.sqrt(150.0), rel=0.05)
 
 
-def test_noise_below_the_rounding_is_not_called_zero() -> None:
+def test_noise_below_the_rounding_is_not_zero() -> None:
     background = estimate_background(np.full((128, 128), 7, dtype=np.uint8))
     np.testing.assert_allclose(background.noise, np.sqrt(1.0 / 12.0))
 
@@ -61,7 +61,7 @@ def test_a_frame_that_blocks_do_not_divide_is_covered() -> None:
     np.testing.assert_allclose(level, 9.0, rtol=1e-6)
 
 
-def test_dead_overexposed_and_living_frames_are_distinguished() -> None:
+def test_dead_overexposed_and_usable_frames_are_distinguished() -> None:
     rng = np.random.default_rng(3)
     dead = np.zeros((256, 256), dtype=np.uint16)
     dead[10, 20] = 4000
@@ -111,7 +111,7 @@ _EIGHT_BITS = np.random.default_rng(1).normal(20.0, 2.0, (64, 96)).astype(np.uin
 
 
 @pytest.mark.parametrize(("step", "offset"), [(257, 0), (16, 5), (4, 3)])
-def test_counts_that_share_a_step_come_back_in_steps(step: int, offset: int) -> None:
+def test_counts_with_a_common_step_are_returned_in_steps(step: int, offset: int) -> None:
     pixels = _EIGHT_BITS.astype(np.uint16) * np.uint16(step) + np.uint16(offset)
     found, *lattice = in_steps(pixels)
     assert np.array_equal(found, _EIGHT_BITS)
@@ -119,7 +119,7 @@ def test_counts_that_share_a_step_come_back_in_steps(step: int, offset: int) -> 
     assert found.dtype == pixels.dtype
 
 
-def test_a_few_repaired_pixels_between_the_steps_go_to_the_nearest() -> None:
+def test_repaired_pixels_between_steps_are_rounded_to_the_nearest_step() -> None:
     pixels = _EIGHT_BITS.astype(np.uint16) * np.uint16(257)
     pixels[3, 5] = 20 * 257 + 200
     found, step, _ = in_steps(pixels)
@@ -211,7 +211,7 @@ def test_the_limit_of_a_faint_hot_pixel_is_a_fraction_of_its_light() -> None:
         assert are_hot(np.array([10.0, second, *[0.0] * 7])[:, None], np.ones(1)).tolist() == [hot]
 
 
-def test_hot_pixels_are_found_where_they_stand_and_nowhere_on_the_border() -> None:
+def test_hot_pixels_are_found_except_on_the_border() -> None:
     signal = np.zeros((12, 15), dtype=np.float32)
     signal[4, 6] = signal[0, 3] = signal[11, 14] = 100.0
     signal[8:10, 9:11] = 100.0  # four bright pixels in a square are not hot

@@ -63,7 +63,7 @@ def _assert_right(solution: FrameSolution | None, truth: FloatArray) -> None:
 @pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
 @pytest.mark.parametrize("streak_px", [0.0, 40.0], ids=["at rest", "streaks"])
 @pytest.mark.parametrize("known", [False, True], ids=["lost", "prior"])
-def test_every_way_through_gives_the_right_attitude_and_says_whether_it_was_lost(
+def test_every_branch_gives_the_right_attitude_and_its_method(
     estimator: LikelihoodSettings | StreakEstimator, streak_px: float, known: bool
 ) -> None:
     frame = _frame(streak_px)
@@ -80,7 +80,7 @@ def test_every_way_through_gives_the_right_attitude_and_says_whether_it_was_lost
 
 
 @pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
-def test_a_streaked_frame_without_a_known_rate_is_solved_all_the_same(
+def test_a_streaked_frame_without_a_known_rate_is_solved(
     estimator: LikelihoodSettings | StreakEstimator,
 ) -> None:
     """Without a rate prior, the sign of the rotation is unknown.
@@ -93,7 +93,7 @@ def test_a_streaked_frame_without_a_known_rate_is_solved_all_the_same(
     _assert_right(found.solution, frame.attitude)
 
 
-def test_a_wrong_prior_is_not_believed() -> None:
+def test_a_wrong_prior_does_not_change_the_attitude() -> None:
     frame = _frame(0.0)
     elsewhere = AttitudePrior(multiply(from_rotation_vector(np.array([0.3, 0.0, 0.0])), frame.attitude), 1e-3)
     found = run(replace(_job(frame, LikelihoodSettings()), attitude_prior=elsewhere))
@@ -106,7 +106,7 @@ def test_a_wrong_prior_is_not_believed() -> None:
 @pytest.mark.parametrize(
     ("level", "status"), [(0, StreakStatus.BLACK), (65_535, StreakStatus.SATURATED)], ids=["black", "white"]
 )
-def test_a_frame_that_shows_nothing_gives_neither(
+def test_an_empty_frame_gives_neither_attitude_nor_rate(
     estimator: LikelihoodSettings | StreakEstimator, level: int, status: StreakStatus
 ) -> None:
     job = _job(_frame(0.0), estimator)
@@ -116,7 +116,7 @@ def test_a_frame_that_shows_nothing_gives_neither(
 
 
 @pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
-def test_the_same_pixels_again_are_a_frozen_camera_and_no_second_attitude(
+def test_repeated_pixels_are_reported_as_a_frozen_camera(
     estimator: LikelihoodSettings | StreakEstimator,
 ) -> None:
     job = _job(_frame(0.0), estimator)
@@ -126,7 +126,7 @@ def test_the_same_pixels_again_are_a_frozen_camera_and_no_second_attitude(
 
 
 @pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
-def test_without_a_tracker_there_is_the_same_motion_and_no_attitude(
+def test_without_a_tracker_the_result_is_the_motion_only(
     estimator: LikelihoodSettings | StreakEstimator,
 ) -> None:
     frame = _frame(40.0)
@@ -158,7 +158,7 @@ def test_the_stars_of_a_solved_frame_of_streaks_serve_a_second_fit() -> None:
     assert np.array_equal(found.solution.fix.quaternion, better.fix.quaternion)
 
 
-def test_a_job_and_what_it_found_pass_between_processes() -> None:
+def test_a_job_and_its_result_can_be_sent_between_processes() -> None:
     job = pickle.loads(pickle.dumps(_job(_frame(0.0), LikelihoodSettings())))
     found = passed(run(job))
     _assert_right(found.solution, _frame(0.0).attitude)

@@ -39,6 +39,6 @@ def off_deg(sigma: float) -> float:
     return float(np.degrees(np.arccos(found.direction @ SUN / np.linalg.norm(SUN))))
 
 
-def test_a_rough_attitude_says_which_strings_the_earth_lights() -> None:
+def test_a_rough_attitude_predicts_which_strings_the_earth_illuminates() -> None:
     assert off_deg(0.5 * EARTHLIGHT_SIGMA) < 3.0
     assert off_deg(2.0 * EARTHLIGHT_SIGMA) > 8.0

@@ -70,7 +70,7 @@ def _squared_error(found: Calibration, truth: Lens) -> float:
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.1, 0.3])
-def test_the_lens_is_found_as_well_as_the_covariance_says_wrong_matches_or_not(wrong: float) -> None:
+def test_the_lens_agrees_with_its_covariance_with_and_without_wrong_matches(wrong: float) -> None:
     rng = np.random.default_rng(81)
     runs, errors, misfit, degrees = 12, 0.0, 0.0, 0
     for _ in range(runs):
@@ -122,7 +122,7 @@ def test_the_wrong_matches_are_reported() -> None:
     assert np.flatnonzero(~found.used[2]).tolist() == [3, 17]
 
 
-def test_a_lens_begun_with_far_off_is_found_too() -> None:
+def test_a_lens_far_from_the_initial_lens_is_found() -> None:
     """The initial focal length is wrong by 8 %, and the distortion is 40 px at the corners."""
     rng = np.random.default_rng(85)
     begun = _begun()
@@ -131,7 +131,7 @@ def test_a_lens_begun_with_far_off_is_found_too() -> None:
     assert _squared_error(calibrate(frames, begun), truth) < chi2.ppf(0.9999, 5)
 
 
-def test_one_narrow_frame_leaves_the_centre_and_the_distortion_to_the_prior_and_says_so() -> None:
+def test_one_narrow_frame_does_not_determine_centre_and_distortion() -> None:
     rng = np.random.default_rng(86)
     begun = _begun(3.0)
     frames, _ = _frames(rng, Lens.of(begun), 1, 15, noise=0.3)
@@ -143,7 +143,7 @@ def test_one_narrow_frame_leaves_the_centre_and_the_distortion_to_the_prior_and_
         calibrate(frames, begun, _OPEN)
 
 
-def test_what_the_prior_leaves_is_as_uncertain_as_it_says() -> None:
+def test_the_covariance_with_a_prior_agrees_with_the_errors() -> None:
     """For lenses drawn from the prior and two narrow frames each, the error agrees with the covariance."""
     rng = np.random.default_rng(87)
     prior = LensPrior(0.01, 8.0, 0.1, 0.2)
@@ -163,7 +163,7 @@ def test_what_the_prior_leaves_is_as_uncertain_as_it_says() -> None:
     assert low < errors < high
 
 
-def test_sigmas_that_are_too_small_are_made_up_for_in_the_covariance() -> None:
+def test_standard_deviations_that_are_too_small_increase_the_covariance() -> None:
     rng = np.random.default_rng(88)
     runs, errors = 20, 0.0
     for _ in range(runs):
@@ -193,7 +193,7 @@ def test_the_derivatives_are_those_of_the_projection() -> None:
         assert np.max(np.abs(residuals(frames[0], LensFit(exact, attitudes), 0))) < 6.0
 
 
-def test_frames_that_are_none_are_refused() -> None:
+def test_malformed_frames_are_refused() -> None:
     rng = np.random.default_rng(90)
     (good,), _ = _frames(rng, Lens.of(_begun()), 1, 20)
     points, sigma, directions = good.points, good.sigma, good.directions
@@ -214,7 +214,7 @@ def test_frames_that_are_none_are_refused() -> None:
         calibrate([few], _begun(), _OPEN)
 
 
-def test_matches_that_are_mostly_wrong_are_refused_or_fit_badly_on_record() -> None:
+def test_mostly_wrong_matches_are_refused_or_have_a_large_chi_square() -> None:
     rng = np.random.default_rng(91)
     truth = _lens(rng, _begun())
     frames, _ = _frames(rng, truth, 4, 20, wrong=1.0)
@@ -226,7 +226,7 @@ def test_matches_that_are_mostly_wrong_are_refused_or_fit_badly_on_record() -> N
     assert found.sigma["focal_length"] > 1.0
 
 
-def test_each_sigma_has_its_parameters_name() -> None:
+def test_each_standard_deviation_has_the_name_of_its_parameter() -> None:
     rng = np.random.default_rng(92)
     found = calibrate(_frames(rng, _lens(rng, _begun()), 4, 20)[0], _begun())
     assert tuple(found.sigma) == PARAMETERS
@@ -265,7 +265,7 @@ def test_the_accuracy_of_a_lens_is_that_of_its_errors(field_deg: float, count: i
         assert 0.3 < np.sqrt(np.mean(np.square(values))) < 1.9, name
 
 
-def test_a_term_that_the_stars_do_not_fix_is_none_of_the_lens_whatever_the_fit_makes_of_it() -> None:
+def test_an_undetermined_term_is_omitted_whatever_its_fitted_value() -> None:
     """In a narrow image, the fitted k2 has half its prior standard deviation and is meaningless."""
     rng, begun = np.random.default_rng(62), _begun(6.0)
     for _ in range(5):
@@ -279,7 +279,7 @@ def test_a_term_that_the_stars_do_not_fix_is_none_of_the_lens_whatever_the_fit_m
         assert "centre" not in found.accuracy or "centre" not in found.omitted
 
 
-def test_terms_that_the_stars_fix_all_stay() -> None:
+def test_determined_terms_are_all_kept() -> None:
     rng, begun = np.random.default_rng(63), _begun(40.0)
     truth = Lens(1024, 1024, 1.01 * begun.focal_length, (520.0, 505.0), -0.2, 0.08)
     found = calibrate_determined(_frames(rng, truth, 6, 40)[0], begun)
@@ -288,7 +288,7 @@ def test_terms_that_the_stars_fix_all_stay() -> None:
     assert set(found.accuracy) == {"focal_length", "centre", "distortion"}
 
 
-def test_a_lens_without_distortion_is_given_none_and_the_axis_of_one_narrow_frame_is_the_middle() -> None:
+def test_missing_distortion_and_an_undetermined_centre_are_omitted() -> None:
     rng, begun = np.random.default_rng(64), _begun(3.0)
     found = calibrate_determined(_frames(rng, Lens.of(begun), 1, 15, noise=0.3)[0], begun)
     assert set(found.omitted) == {"k1", "k2", "centre"}
@@ -298,9 +298,7 @@ def test_a_lens_without_distortion_is_given_none_and_the_axis_of_one_narrow_fram
 
 
 @pytest.mark.parametrize(("share", "known"), [(0.45, True), (0.55, False)])
-def test_the_distortion_is_stated_if_the_stars_halve_what_the_prior_leaves_open(
-    share: float, known: bool
-) -> None:
+def test_the_distortion_is_stated_if_it_is_below_half_of_the_prior(share: float, known: bool) -> None:
     """The expected displacement of a corner is that by k1 = 1 and k2 = 3 at a squared tangent of 0.25."""
     lens = Lens(1024, 1024, 2.0 * math.hypot(511.5, 511.5), (511.5, 511.5), 0.0, 0.0)
     corner = math.hypot(1.0 * 0.25, 3.0 * 0.25**2)

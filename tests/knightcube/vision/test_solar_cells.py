@@ -46,7 +46,9 @@ def _reading(seed: int, nadir_known: bool, count: int = 400) -> tuple[FloatArray
 
 
 @pytest.mark.parametrize(("nadir_known", "limit"), [(True, 2.0), (False, 3.5)])
-def test_the_coarse_sun_is_good_to_a_few_degrees_and_knows_how_good(nadir_known: bool, limit: float) -> None:
+def test_the_coarse_sun_is_accurate_to_a_few_degrees_with_its_covariance(
+    nadir_known: bool, limit: float
+) -> None:
     """The readings are from 400 random positions and attitudes.
 
     Each string has a gain error of 2 %, and the albedo is 0.3.
@@ -60,7 +62,7 @@ def test_the_coarse_sun_is_good_to_a_few_degrees_and_knows_how_good(nadir_known:
     assert false_light == 0
 
 
-def test_ideal_strings_have_the_cosine_law_and_give_the_direction_back() -> None:
+def test_ideal_strings_obey_the_cosine_law_and_give_the_exact_direction() -> None:
     generator = np.random.default_rng(6)
     position = np.array([0.0, 0.0, 7e6])
     for _ in range(20):
@@ -106,7 +108,7 @@ def test_an_unknown_nadir_gives_the_mean_and_the_covariance_of_all_directions_an
     assert np.diag(covariance) == pytest.approx(readings.var(axis=0), rel=0.02)
 
 
-def test_in_eclipse_the_strings_say_dark() -> None:
+def test_in_eclipse_the_solar_strings_report_darkness() -> None:
     model = SolarCellsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6))
     position = np.array([-7e6, 0.0, 0.0])
     sun = np.array([ASTRONOMICAL_UNIT, 0.0, 0.0])
@@ -115,7 +117,7 @@ def test_in_eclipse_the_strings_say_dark() -> None:
     assert reading.sigma == np.inf
 
 
-def test_currents_that_no_sun_makes_are_uncertain() -> None:
+def test_currents_that_no_sun_direction_explains_are_uncertain() -> None:
     """One string has 1.5 times the largest possible current, or opposite faces have full currents."""
     towards = np.array([1.0, 1.0, 1.0]) / np.sqrt(3.0)
     good = np.maximum(STRINGS.normals @ towards, 0.0)
@@ -158,7 +160,7 @@ def test_the_camera_that_has_the_sun_is_read_first() -> None:
         assert sorted(choice.index for choice in order) == [0, 1, 2, 3]
 
 
-def test_a_sun_between_the_fields_is_likely_in_none_and_possible_in_the_nearest() -> None:
+def test_a_sun_between_two_fields_is_possible_in_the_nearest_only() -> None:
     """The Sun is 2 deg beyond the edge of a field of view, and the coarse Sun has an error of 3 deg."""
     towards = np.array([np.cos(np.radians(35.5)), np.sin(np.radians(35.5)), 0.0])
     basis = np.array([[-towards[1], towards[0], 0.0], [0.0, 0.0, 1.0]])
@@ -168,7 +170,7 @@ def test_a_sun_between_the_fields_is_likely_in_none_and_possible_in_the_nearest(
     assert [choice.index for choice in order if choice.possible] == [0]
 
 
-def test_in_the_dark_no_camera_is_read_and_in_doubt_all_are() -> None:
+def test_no_camera_is_read_in_the_dark_and_all_without_a_coarse_sun() -> None:
     dark = cameras_by_sun(CoarseSun(CoarseSunStatus.DARK), _cameras())
     assert dark == []
     doubt = cameras_by_sun(CoarseSun(CoarseSunStatus.UNCERTAIN), _cameras())

@@ -54,7 +54,7 @@ def test_the_covariance_is_honest(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(CAMERAS))
-def test_no_frame_without_the_sun_shows_one(name: str) -> None:
+def test_no_sun_is_found_in_frames_without_the_sun(name: str) -> None:
     """The frames show limb, clouds and hot pixels, in the overexposed camera large saturated ones.
 
     Three frames, seed 12.
@@ -95,7 +95,7 @@ def test_a_sun_cut_by_the_edge_is_found_with_a_covariance_that_grows_across_the_
         assert np.degrees(np.hypot(*off)) < 0.06
 
 
-def test_the_corners_of_a_field_of_92_deg_show_it_too() -> None:
+def test_the_sun_is_found_in_the_corners_of_a_field_of_92_deg() -> None:
     """In the corners, a pinhole stretches the disc to 1.7 times its width, but not the blur around it."""
     model = wide_model(WideCamera(columns=512, rows=512, field_of_view_deg=92.0))
     for number, (x, y) in enumerate(
@@ -117,7 +117,7 @@ def test_the_same_sun_is_found_in_twelve_bits() -> None:
     assert np.degrees(np.linalg.norm(solution.sun.basis @ truth)) < 0.01
 
 
-def test_a_sun_that_blooms_over_whole_columns_is_refused_not_guessed() -> None:
+def test_a_sun_that_blooms_over_whole_columns_is_refused() -> None:
     """The charge of the Sun spreads over a whole column, so that the patch has no round rim.
 
     Expose for less.
@@ -149,7 +149,7 @@ def test_few_pixels_are_read() -> None:
     assert len(range(1, 512, 3)) < rows < 0.45 * 512
 
 
-def test_dead_pixels_in_the_disc_and_hot_ones_beside_it_move_it_little() -> None:
+def test_dead_and_hot_pixels_hardly_change_the_sun_direction() -> None:
     frame, truth = _frame_at(250.2, 250.6, MODEL)
     frame = frame.copy()
     frame[251, 251] = 0
@@ -165,7 +165,7 @@ def _disc_frame(radius: float, x: float = 256.0, y: float = 200.0) -> Image:
     return np.asarray((20 + 235 * inside).astype(np.uint8))
 
 
-def test_what_is_too_small_too_large_or_not_round_is_not_the_sun_and_says_why() -> None:
+def test_patches_that_are_too_small_too_large_or_not_round_are_refused_with_a_reason() -> None:
     for radius in (1.0, 9.0, 60.0):
         solution = find_sun(_disc_frame(radius), CAMERA, SunSettings())
         assert solution.status in (SunStatus.NOT_THE_SUN, SunStatus.NO_SUN)
@@ -233,7 +233,9 @@ def test_only_the_camera_that_the_strings_choose_is_read(seen: tuple[EarthScene,
     assert np.degrees(np.sqrt(0.5 * np.trace(found.covariance))) < 0.02
 
 
-def test_the_strings_stand_in_where_the_cameras_algorithm_fails(seen: tuple[EarthScene, Image]) -> None:
+def test_the_solar_strings_give_the_direction_if_no_camera_finds_the_sun(
+    seen: tuple[EarthScene, Image],
+) -> None:
     sun = _in_body(seen[0])
     found = sun_of_cameras({0: DARK, 1: DARK, 2: DARK}, MOUNTED, _strings(sun), JOINT_SETTINGS)
     assert found.camera is None
@@ -258,7 +260,7 @@ def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(seen: tuple[EarthS
     assert float(found.direction @ true) > np.cos(0.1)
 
 
-def test_a_sun_cut_by_the_frames_edge_claims_less(seen: tuple[EarthScene, Image]) -> None:
+def test_a_sun_cut_by_the_frames_edge_has_a_larger_covariance(seen: tuple[EarthScene, Image]) -> None:
     """The error of a truncated disc is equal in every frame, up to 0.03 deg for a sigma of 0.007 deg."""
     scene, _ = seen
     turn = shortest_turn(sun_direction(scene), WIDE_MODEL.lens.unit_vectors(np.array([[510.7, 300.0]]))[0])
@@ -274,7 +276,7 @@ def test_a_sun_cut_by_the_frames_edge_claims_less(seen: tuple[EarthScene, Image]
     assert float(np.linalg.norm(np.cross(found.direction, sun))) < 2.0 * sigma
 
 
-def test_doubtful_strings_leave_all_cameras_to_be_read_and_eclipse_none(
+def test_all_cameras_are_read_with_uncertain_strings_and_none_in_eclipse(
     seen: tuple[EarthScene, Image],
 ) -> None:
     _, frame = seen

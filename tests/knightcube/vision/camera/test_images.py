@@ -125,7 +125,7 @@ def test_colour_becomes_luminance(tmp_path: Path, mode: str, name: str) -> None:
     assert image[0] == pytest.approx(expected, abs=0.6)
 
 
-def test_what_is_transparent_keeps_its_brightness(tmp_path: Path) -> None:
+def test_transparent_pixels_keep_their_brightness(tmp_path: Path) -> None:
     picture = np.dstack([EIGHT, EIGHT, EIGHT, np.zeros_like(EIGHT)])
     pillow.fromarray(picture).save(tmp_path / "a.png")
     assert np.array_equal(read_image(tmp_path / "a.png"), EIGHT)
@@ -211,7 +211,7 @@ def test_a_damaged_file_gives_an_image_or_one_clear_line(tmp_path: Path, kind: s
     assert refused > 60
 
 
-def test_without_pillow_a_picture_asks_for_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pillow_an_image_asks_for_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pillow.fromarray(EIGHT).save(tmp_path / "a.png")
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(UsageError, match=r"knightcube-flight\[images\]"):
@@ -239,7 +239,7 @@ def test_a_frame_of_one_brightness_is_black() -> None:
         grey_stretch(np.zeros((4, 5)), 99.0, 1.0)
 
 
-def test_a_picture_that_was_written_is_read_again(tmp_path: Path) -> None:
+def test_a_written_image_can_be_read_again(tmp_path: Path) -> None:
     picture = grey_stretch(SIXTEEN)
     picture[3, 4] = (255, 0, 0)
     write_picture(tmp_path / "found.png", picture)
@@ -291,7 +291,7 @@ def test_every_kind_of_pixel_keeps_its_type_and_value(bits: int, kind: str, expe
     assert image.tolist() == PIXELS.tolist()
 
 
-def test_unsigned_numbers_are_what_they_are() -> None:
+def test_unsigned_integers_keep_their_values() -> None:
     """FITS 4.4.2.5 stores value - BZERO, so that 0, 32768 and 65535 are stored as -32768, 0 and 32767."""
     stored = np.array([[-32768, 0, 32767]])
     image = primary_image(fits_file(stored.astype(">i2"), 16, BZERO=32768, BSCALE=1), "x.fits")
@@ -310,7 +310,7 @@ def test_a_scale_gives_physical_values() -> None:
     assert image.tolist() == (-1.5 + 0.25 * PIXELS).tolist()
 
 
-def test_the_array_is_the_machines_own_and_row_0_the_files_first() -> None:
+def test_the_array_has_native_byte_order_and_starts_with_the_first_row() -> None:
     image = primary_image(fits_file(PIXELS.astype(">i2"), 16), "x.fits")
     assert image.dtype.isnative
     assert image[0].tolist() == [0, 1, 2]
@@ -336,7 +336,7 @@ def test_a_third_axis_of_one_plane_is_accepted() -> None:
         ({"BLANK": 128}, "blank pixels"),
     ],
 )
-def test_what_is_not_read_is_said_in_one_line(cards: dict[str, object], says: str) -> None:
+def test_an_unsupported_file_is_reported_in_one_line(cards: dict[str, object], says: str) -> None:
     with pytest.raises(UsageError, match=says) as caught:
         primary_image(fits_file(PIXELS.astype(">i2"), 16, **cards), "night.fits")
     assert str(caught.value).startswith("night.fits: ")
@@ -376,7 +376,7 @@ def test_a_fits_file_is_known_by_its_content(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_another_reader_opens_the_newest_frames(tmp_path: Path, kind: type[np.unsignedinteger]) -> None:
+def test_stored_frames_can_be_read_by_another_library(tmp_path: Path, kind: type[np.unsignedinteger]) -> None:
     pixels = (np.arange(60).reshape(6, 10) * (1000 if kind is np.uint16 else 4)).astype(kind)
     folder = tmp_path / "frames"
     for number in range(5):
@@ -388,7 +388,7 @@ def test_another_reader_opens_the_newest_frames(tmp_path: Path, kind: type[np.un
     assert facts_of((folder / names[0]).read_bytes()) == {"stars": "solved"}
 
 
-def test_a_disk_that_takes_nothing_costs_the_frame_alone(tmp_path: Path) -> None:
+def test_a_full_disk_loses_only_the_stored_frame(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     keep_frame(KeptFrames(tmp_path / "file" / "frames", 3, "a"), np.zeros((2, 2), np.uint8), {})
     with pytest.raises(ValueError, match="no kept frame"):

@@ -79,7 +79,7 @@ def test_a_lens_is_refused_exactly_when_its_image_folds_within_the_detector(k1: 
             Lens(1024, 1024, 512.0, (511.5, 511.5), k1, k2)
 
 
-def test_a_direction_beyond_the_fold_is_not_seen_again_within() -> None:
+def test_a_direction_beyond_the_fold_is_not_imaged() -> None:
     lens = Lens(200, 200, 1000.0, (99.5, 99.5), -0.5)
     tangents = np.array([0.1, 0.8, 1.0, 1.4])
     points = lens.project(np.stack([tangents, 0.0 * tangents, np.ones(4)], axis=-1))
@@ -89,7 +89,7 @@ def test_a_direction_beyond_the_fold_is_not_seen_again_within() -> None:
     assert np.isnan(lens.unit_vectors(np.array([[99.5 + 545.0, 99.5]]))).all()
 
 
-def test_a_pixel_that_is_none_leaves_the_others_alone() -> None:
+def test_an_invalid_pixel_does_not_affect_the_others() -> None:
     lens = Lens(1024, 768, 1000.0, (511.5, 383.5), 0.2, 0.1)
     vectors = lens.unit_vectors(np.array([[np.nan, 5.0], [1000.0, 700.0]]))
     assert np.isnan(vectors[0]).all()
@@ -146,14 +146,14 @@ def test_projection_does_not_depend_on_distance(x: float, y: float, distance: fl
 
 
 @given(COLUMN, ROW)
-def test_what_is_behind_the_camera_has_no_pixel(x: float, y: float) -> None:
+def test_a_direction_behind_the_camera_has_no_pixel(x: float, y: float) -> None:
     """Errata to section 2.1 of the thesis: a direction and its opposite would project to the same pixel."""
     behind = CAMERA.project(-CAMERA.unit_vectors(np.array([[x, y]])))
     assert np.all(np.isnan(behind))
     assert not CAMERA.contains(behind, margin=1e9)[0]
 
 
-def test_what_is_beside_the_camera_has_no_pixel() -> None:
+def test_a_direction_beside_the_camera_has_no_pixel() -> None:
     assert np.all(np.isnan(CAMERA.project(np.array([[1.0, 0.0, 0.0]]))))
 
 

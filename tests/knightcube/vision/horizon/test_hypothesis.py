@@ -31,7 +31,7 @@ def test_scan_lines_cross_a_circle_as_often_as_its_extent_in_x_and_y_says() -> N
     assert view.length == pytest.approx(100.0 * np.pi, rel=1e-3)
 
 
-def test_edges_all_along_a_limb_are_not_due_to_chance_and_a_tenth_of_them_may_be() -> None:
+def test_edges_along_a_whole_limb_are_significant_and_a_tenth_of_them_are_not() -> None:
     limb, generator = LimbInView(500.0, 40.0, 40.0), np.random.default_rng(1)
     others = generator.uniform(-200.0, 200.0, 100)
     assert log10_chance(limb, generator.normal(0.0, 0.1, 40), others, CAMERA, 2) < -50.0
@@ -51,7 +51,7 @@ def test_points_that_the_lens_does_not_image_are_not_part_of_a_limb() -> None:
     assert log10_chance(view, np.zeros(0), np.zeros(0), CAMERA, 2) > 0.0
 
 
-def test_a_small_disc_is_the_limb_of_no_low_orbit() -> None:
+def test_a_small_disc_is_not_a_limb_from_low_orbit() -> None:
     """A lens ghost with a radius of 10.6 deg looks like the Earth from an altitude of 28,000 km."""
     y, x = np.mgrid[0:512, 0:512]
     disc = np.clip(74.0 - np.hypot(x - 200.0, y - 230.0), 0.0, 1.0)

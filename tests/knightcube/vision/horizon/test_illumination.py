@@ -50,21 +50,21 @@ def judged(picture: Image, nadir: FloatArray, altitude: float, sun: FloatArray) 
     return why_false(image_brightness(picture, CAMERA, SUNLIT_COUNTS), nadir, altitude, sun)
 
 
-def test_no_sound_picture_is_false() -> None:
+def test_no_sound_image_is_judged_false() -> None:
     assert [seed for seed in range(60) if judged(*view(seed))] == []
 
 
 @pytest.mark.parametrize(
     ("fault", "least"), [("black", 6), ("saturated", 30), ("blinded", 30), ("garbage", 30)]
 )
-def test_pictures_of_a_broken_camera_are_false(fault: str, least: int) -> None:
+def test_images_of_a_broken_camera_are_judged_false(fault: str, least: int) -> None:
     """Many of the 60 views show the night side or space beside the Sun."""
     views = [view(seed) for seed in range(60)]
     false = [bool(judged(np.asarray(SPOILT[fault](one[0], 1)), *one[1:])) for one in views]
     assert sum(false) >= least
 
 
-def test_what_is_under_the_camera_decides() -> None:
+def test_the_ground_under_the_camera_decides() -> None:
     """A nadir camera shows bright ground at noon, and dark ground on the night side."""
     down, overhead, beside = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0])
     dark, lit = np.zeros((128, 128), np.uint8), np.full((128, 128), 200, np.uint8)

@@ -77,7 +77,7 @@ def test_the_cone_of_the_most_edges_is_found_and_then_the_other(known: bool) -> 
 
 
 @pytest.mark.parametrize(("off", "members", "left"), [(1.9, 12, 0), (2.1, 0, 0), (3.9, 0, 0), (4.1, 0, 12)])
-def test_edges_within_the_tolerance_are_members_and_within_twice_of_it_are_spent(
+def test_edges_within_the_tolerance_are_members_and_within_twice_the_tolerance_used_up(
     off: float, members: int, left: int
 ) -> None:
     angle = math.acos(COSINE)
@@ -88,7 +88,7 @@ def test_edges_within_the_tolerance_are_members_and_within_twice_of_it_are_spent
     assert np.count_nonzero(left_free(edges, free(edges), cone, 2.0)) == left
 
 
-def test_an_edge_that_is_bright_outside_is_on_no_cone() -> None:
+def test_an_edge_with_a_bright_outer_side_is_not_on_a_cone() -> None:
     edges = ring(NADIR, math.acos(COSINE), 24)
     inverse = EdgeRays(edges.rays, -edges.brighter, edges.pixel)
     elsewhere = best_cone(inverse, free(inverse), (COSINE, COSINE), 2.0, 400)
@@ -108,7 +108,7 @@ def test_only_cones_within_the_range_of_altitudes_are_candidates(half_angle: flo
     assert (best_cone(edges, free(edges), limits, 0.5, 400) is not None) is found
 
 
-def test_two_edges_leave_a_known_cone_three_an_unknown_one_and_one_none() -> None:
+def test_two_edges_determine_a_known_cone_and_three_an_unknown_one() -> None:
     edges = ring(NADIR, math.acos(COSINE), 3)
     assert best_cone(edges, np.arange(3) < 2, (COSINE, COSINE), 0.5, 400) is not None
     assert best_cone(edges, np.arange(3) < 1, (COSINE, COSINE), 0.5, 400) is None
@@ -118,7 +118,7 @@ def test_two_edges_leave_a_known_cone_three_an_unknown_one_and_one_none() -> Non
     assert cone.members.all()
 
 
-def test_few_tries_are_spread_over_all_pairs() -> None:
+def test_few_trials_are_spread_over_all_pairs() -> None:
     """The first third of the edges is on no common cone with the others, and its pairs are tried first."""
     draw = np.random.default_rng(1)
     good = ring(NADIR, math.acos(COSINE), 30)
@@ -200,7 +200,7 @@ def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
         assert coarse.mismatch == pytest.approx(off_deg / math.hypot(1.0, 0.2), rel=1e-6)
 
 
-def test_the_share_of_nadirs_that_a_direction_allows_is_that_of_a_belt_of_the_sphere() -> None:
+def test_the_fraction_of_nadirs_allowed_by_a_direction_is_that_of_a_belt() -> None:
     """The fraction of the sphere within four sigma of a great circle is sin(4 sigma).
 
     Two such belts intersect.

@@ -46,7 +46,7 @@ def test_rays_along_the_limb_touch_the_ellipsoid_at_its_height() -> None:
     assert limb_residuals(view, rays @ view.rotation.T) == pytest.approx(np.zeros(90), abs=1e-12)
 
 
-def test_the_limb_is_the_simulators_and_so_is_the_suns_elevation() -> None:
+def test_limb_and_sun_elevation_agree_with_the_simulator() -> None:
     """The simulator computes the limb with independent code."""
     generator = np.random.default_rng(2)
     attitude = normalise(generator.standard_normal(4))
@@ -98,7 +98,7 @@ def test_the_height_above_ellipsoid_and_sphere() -> None:
     assert mean_sphere().height_of(np.array([0.0, 7e6, 0.0])) == pytest.approx(7e6 - 6_371_008.8, abs=0.1)
 
 
-def test_pairs_and_triples_of_rays_leave_the_cone_they_lie_on() -> None:
+def test_pairs_and_triples_of_rays_determine_their_cone() -> None:
     generator = np.random.default_rng(6)
     nadir = normalise(generator.standard_normal(3))
     view = LimbView(np.eye(3), -7e6 * nadir, mean_sphere(), 0.0)
@@ -167,7 +167,7 @@ def test_edges_all_in_one_place_give_no_limb() -> None:
     assert fitted is None or np.sqrt(np.max(np.linalg.eigvalsh(fitted.covariance[:3, :3]))) > 0.1
 
 
-def test_points_that_are_drawn_the_same_way_as_their_neighbours_count_for_fewer() -> None:
+def test_points_with_correlated_errors_get_a_smaller_weight() -> None:
     """If points have equal errors in pairs, the duplicates must reduce neither covariance nor error."""
     generator = np.random.default_rng(8)
     view = _view(generator)

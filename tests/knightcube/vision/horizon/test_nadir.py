@@ -66,7 +66,7 @@ def _gps(scene: EarthScene) -> HorizonKnowledge:
     return HorizonKnowledge(position=scene.position, sun=scene.sun, pole=scene.pole)
 
 
-def test_the_airs_profile_is_the_simulators() -> None:
+def test_the_profile_of_the_air_agrees_with_the_simulator() -> None:
     """The simulator's optical depth is Chapman's function, and the estimator's is a sum along the ray."""
     air, _, _, _ = limb_light(np.array([[0.0, 10e3, UNIT_DEPTH_HEIGHT, 18.4e3, 40e3]]), np.array([500.0]))[
         :, 0
@@ -135,7 +135,7 @@ def test_an_unknown_altitude_is_fitted_with_its_spread(day: tuple[EarthScene, Im
     assert _error_deg(found, scene) < 4.0 * np.degrees(found.nadir.sigma)
 
 
-def test_a_coarse_sun_that_contradicts_the_horizon_makes_it_refused(day: tuple[EarthScene, Image]) -> None:
+def test_a_horizon_that_contradicts_the_coarse_sun_is_refused(day: tuple[EarthScene, Image]) -> None:
     scene, frame = day
     # The opposite of the true Sun direction is inconsistent with the horizon.
     wrong = SensedDirection(-(scene.camera_matrix @ scene.sun), scene.sun, np.radians(5.0))
@@ -146,7 +146,7 @@ def test_a_coarse_sun_that_contradicts_the_horizon_makes_it_refused(day: tuple[E
     assert len(found.candidates) >= 1
 
 
-def test_light_where_a_view_has_sky_makes_it_refused(day: tuple[EarthScene, Image]) -> None:
+def test_a_horizon_with_bright_sky_is_refused(day: tuple[EarthScene, Image]) -> None:
     """The image is rotated by 180 deg, but the attitude is that of the original image."""
     scene, frame = day
     found = find_nadir(
@@ -249,14 +249,14 @@ def test_a_photograph_from_orbit_is_fitted_to_less_than_half_a_pixel() -> None:
     assert abs(found.nadir.altitude - 515e3) < 4.0 * found.nadir.altitude_sigma
 
 
-def test_a_frame_that_is_not_the_cameras_is_refused(day: tuple[EarthScene, Image]) -> None:
+def test_a_frame_of_another_size_than_the_camera_is_refused(day: tuple[EarthScene, Image]) -> None:
     with pytest.raises(ValueError, match="256 x 512 pixels, but the camera has 512 x 512"):
         find_nadir(day[1][:, :256], MODEL.lens)
     with pytest.raises(ValueError, match="not finite"):
         find_nadir(np.full((512, 512), np.nan), MODEL.lens)
 
 
-def test_settings_that_cannot_be_are_refused() -> None:
+def test_invalid_settings_are_refused() -> None:
     for wrong in ({"lines": 1}, {"run": 4}, {"threshold": 1.5}, {"contrast": 0.0}):
         with pytest.raises(Exception, match=next(iter(wrong))):
             EdgeSettings(**wrong)
@@ -324,7 +324,7 @@ def level() -> Instant:
     return instant(UW, np.array([0.02, -0.03, 1.0]), np.array([0.8, 0.5, 0.3]), 11)
 
 
-def test_the_cameras_together_know_nadir_better_than_any_one(level: Instant) -> None:
+def test_all_cameras_together_are_more_accurate_than_each_camera(level: Instant) -> None:
     found = nadir_of_cameras(level.frames, UW, level.knowledge(), JOINT_SETTINGS)
     assert found.status is HorizonStatus.FOUND
     assert sorted(found.cameras) == [0, 1, 2]
@@ -336,7 +336,7 @@ def test_the_cameras_together_know_nadir_better_than_any_one(level: Instant) -> 
     assert float(np.linalg.norm(off)) < 4.0 * found.nadir.sigma
 
 
-def test_a_sun_that_is_known_exactly_refuses_no_true_limb(level: Instant) -> None:
+def test_an_exactly_known_sun_does_not_reject_a_true_limb(level: Instant) -> None:
     """A cone through the edges is 0.1 to 0.3 deg off nadir before the limb fit, and the Sun is exact."""
     rough = level.knowledge()
     for sigma in (np.radians(0.005), np.radians(1.0)):
@@ -363,7 +363,7 @@ def test_air_higher_than_believed_shifts_one_cameras_nadir_but_not_that_of_three
     assert error_deg(single, level.nadir) > 3.0 * error_deg(shifted, level.nadir)
 
 
-def test_a_camera_that_says_otherwise_leaves_the_nadir_ambiguous(level: Instant) -> None:
+def test_two_cameras_that_disagree_leave_the_nadir_ambiguous(level: Instant) -> None:
     """The images of two cameras are exchanged, and neither a third camera nor an attitude decides."""
     frames = {0: level.frames[0], 1: np.ascontiguousarray(level.frames[1][::-1])}
     found = nadir_of_cameras(frames, UW, HorizonKnowledge(position=level.position), JOINT_SETTINGS)
@@ -414,7 +414,7 @@ def test_one_camera_filled_and_the_others_dark_give_a_coarse_nadir() -> None:
         assert error < 3.0 * coarse.sigma
 
 
-def test_dark_pictures_give_no_coarse_nadir() -> None:
+def test_dark_images_give_no_coarse_nadir() -> None:
     dark = np.full((512, 512), 8, dtype=np.uint8)
     looks = [image_brightness(dark, camera, EARTHLIGHT) for camera in VT]
     assert coarse_nadir(looks, ALTITUDE, np.array([0.0, 0.0, 1.0])) is None

@@ -51,7 +51,7 @@ def test_lines_and_windows_have_their_limits(sound: dict[str, int], wrong: dict[
 
 
 @pytest.mark.parametrize("name", ["threshold", "contrast"])
-def test_fractions_lie_between_nothing_and_all(name: str) -> None:
+def test_fractions_lie_between_zero_and_one(name: str) -> None:
     for sound in (0.001, 0.999):
         EdgeSettings(**{name: sound})  # type: ignore[arg-type]  # fractions only
     for wrong in (0.0, 1.0, -0.1, np.nan):

@@ -89,14 +89,14 @@ def test_the_residual_is_that_of_olae() -> None:
 
 
 @pytest.mark.parametrize("theta_deg", _THETAS)
-def test_a_star_in_the_same_place_is_the_star_itself(theta_deg: float) -> None:
+def test_a_star_at_the_same_position_is_the_same_star(theta_deg: float) -> None:
     ends, turn = _stars(theta_deg)
     vectors = _PINHOLE.unit_vectors(ends)
     np.testing.assert_allclose(_PINHOLE.project(star_ends(vectors, turn)), ends, atol=1e-8)
 
 
 @pytest.mark.parametrize("theta_deg", _THETAS)
-def test_exact_stars_deviate_nowhere_whatever_the_axis(theta_deg: float) -> None:
+def test_exact_stars_have_no_deviations_for_any_axis(theta_deg: float) -> None:
     """The projection changes slopes by 1.8 deg and lengths by 6 % over the field without a deviation."""
     ends, turn = _stars(theta_deg)
     found = evaluate(ends[:, ::-1], np.full(len(ends), 0.1), turn, _PINHOLE, _BOUNDS)
@@ -146,7 +146,7 @@ def test_each_indicator_sees_its_own_part_of_a_motion(
     assert not np.delete(found.fired, one, axis=0).any()
 
 
-def test_a_point_has_no_direction_but_the_wrong_displacement() -> None:
+def test_a_point_has_a_wrong_displacement_and_no_direction() -> None:
     ends, turn = _stars(60.0)
     ends[3] = ends[3].mean(axis=0)
     found = evaluate(ends, np.full(len(ends), 0.1), turn, _PINHOLE, _BOUNDS)
@@ -248,7 +248,7 @@ def test_a_saturated_tracked_object_is_found() -> None:
     np.testing.assert_allclose(found.endpoints.mean(axis=0), [270.0, 230.0], atol=0.5)
 
 
-def test_with_time_reversed_everything_moves_the_other_way() -> None:
+def test_time_reversal_reverses_all_motions() -> None:
     motion = motion_across(_PLACE, 60.0 / _FOCAL, 2.4)
     path = object_path(_FRAME_CAMERA, _PLACE, motion, _ROTATION)
     pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 5, [(path, 4.0)], _FAINTEST)
@@ -377,7 +377,7 @@ def test_the_public_search_gives_the_direction_of_each_object_with_its_covarianc
         detect_objects(pixels[1:], pinhole, _ROTATION, exposure)
 
 
-def test_an_object_weaker_than_asked_is_not_called_one() -> None:
+def test_an_object_below_the_required_significance_is_not_reported() -> None:
     path = object_path(_FRAME_CAMERA, _PLACE, motion_across(_PLACE, 60.0 / _FOCAL, 2.4), _ROTATION)
     pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 5, [(path, 4.0)], _FAINTEST)
     deaf = dataclasses.replace(ObjectSettings(), improvement=1e9, crossing_improvement=1e9)
@@ -387,7 +387,7 @@ def test_an_object_weaker_than_asked_is_not_called_one() -> None:
     assert Verdict.UNCLEAR in report.verdicts + report.crowded
 
 
-def test_the_report_travels_between_processes() -> None:
+def test_the_report_can_be_sent_between_processes() -> None:
     report, _ = _see(motion_across(_PLACE, 60.0 / _FOCAL, 2.4), 4.0)
     copy = passed(report)
     np.testing.assert_array_equal(copy.objects[0].endpoints, report.objects[0].endpoints)
@@ -424,7 +424,7 @@ def _places(since: FloatArray) -> FloatArray:
     return np.asarray(MEETING + since[:, None, None] * MOTIONS)
 
 
-def test_two_objects_as_bright_as_each_other_cross_in_the_frame_and_keep_their_tracks() -> None:
+def test_two_equally_bright_objects_that_cross_keep_their_tracks() -> None:
     tracker, own = ObjectTracker(TrackSettings()), {}
     focal = CAMERA.pinhole.focal_length
     for second in range(15):

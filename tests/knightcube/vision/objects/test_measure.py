@@ -56,7 +56,7 @@ def _star(brightest: float, faintest: float) -> FloatArray:
 
 
 @pytest.mark.parametrize(("apart", "magnitude", "star"), [(2.0, 4.0, 5.0), (3.0, 5.5, 5.0), (1.5, 3.0, 4.5)])
-def test_an_object_beside_a_catalogue_star_is_sighted_where_it_is(
+def test_an_object_beside_a_catalogue_star_is_measured_correctly(
     apart: float, magnitude: float, star: float
 ) -> None:
     place = _star(star - 0.5, star + 0.5) + apart * np.array([0.6, 0.8])
@@ -83,7 +83,7 @@ def test_stars_alone_are_not_reported_as_objects() -> None:
 
 @pytest.mark.parametrize("knows", [True, False])
 @pytest.mark.parametrize(("turn", "magnitude"), [(0.0, -1.0), (0.02, 2.0)])
-def test_a_bright_satellite_is_not_named_as_a_star(turn: float, magnitude: float, knows: bool) -> None:
+def test_a_bright_satellite_is_not_identified_as_a_star(turn: float, magnitude: float, knows: bool) -> None:
     """Neither the identification nor the catalogue refit identifies the satellite as a star."""
     place, motion = np.array([203.3, 301.8]), np.array([2.5, 1.0])
     shot = Shot(place, motion, magnitude, np.array([0.0, turn, 0.0]), knows)

@@ -38,7 +38,7 @@ def _patch(middles: list[tuple[float, float]], flux: float, extra: FloatArray | 
     return Patch(signal, weight, _NOISE, _CORNER, mask, ((0.0, 0.0), (0.0, 0.0)), 1.0)
 
 
-def test_overlapping_stars_leave_nothing() -> None:
+def test_overlapping_stars_leave_an_empty_residual() -> None:
     middles = [(240.3, 238.7), (252.0, 241.2)]
     patch = _patch(middles, 60_000.0, None, 1)
     paths, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
@@ -49,7 +49,7 @@ def test_overlapping_stars_leave_nothing() -> None:
     assert brightest_left(patch, left) is None
 
 
-def test_a_point_on_a_star_is_left_and_placed() -> None:
+def test_a_point_on_a_star_remains_and_is_measured() -> None:
     place = np.array([[245.4, 240.1]])
     patch = _patch([(240.3, 238.7)], 60_000.0, place, 2)
     _, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
@@ -58,7 +58,7 @@ def test_a_point_on_a_star_is_left_and_placed() -> None:
     np.testing.assert_allclose(found, np.tile(place, (2, 1)), atol=0.1)
 
 
-def test_a_line_across_a_star_is_left_with_its_ends() -> None:
+def test_a_line_across_a_star_remains_with_its_ends() -> None:
     ends = np.array([[230.2, 226.4], [255.7, 253.1]])
     patch = _patch(
         [(240.3, 238.7)], 60_000.0, ends[0] + np.linspace(0, 1, 801)[:, None] * np.diff(ends, axis=0), 3
@@ -70,7 +70,7 @@ def test_a_line_across_a_star_is_left_with_its_ends() -> None:
     assert error < 0.5
 
 
-def test_nothing_but_noise_holds_neither_star_nor_object() -> None:
+def test_pure_noise_contains_neither_star_nor_object() -> None:
     patch = _patch([], 0.0, None, 4)
     paths, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
     assert paths == []

@@ -85,7 +85,7 @@ def test_hot_pixels_are_repaired_and_stars_are_left() -> None:
     assert signal[places[:, 0], places[:, 1]].max() < 300.0
 
 
-def test_light_taken_from_some_pixels_leaves_the_sums_of_what_is_left() -> None:
+def test_sums_after_subtraction_are_those_of_the_remaining_light() -> None:
     """The test includes pixels at the corners and edges of the frame."""
     generator = np.random.default_rng(9)
     image = generator.integers(0, 1000, (40, 50)).astype(np.float32)
@@ -155,7 +155,7 @@ def test_the_harris_response_is_that_of_the_eigenvalues() -> None:
     np.testing.assert_allclose(harris_response(tensor, 0.15), expected, rtol=1e-9, atol=1e-12)
 
 
-def test_an_edge_answers_negative_and_a_corner_positive() -> None:
+def test_the_response_is_negative_on_an_edge_and_positive_on_a_corner() -> None:
     image = np.zeros((40, 40))
     image[20:, 20:] = 1.0
     response = harris_response(structure_tensor(image, 1.0, 1.5))

@@ -64,7 +64,7 @@ def test_the_attitude_and_scale_of_exact_directions_are_found() -> None:
 
 
 @pytest.mark.parametrize("free_scale", [False, True])
-def test_the_covariance_is_that_of_many_fits_and_the_squares_have_their_freedom(free_scale: bool) -> None:
+def test_the_covariance_and_the_residuals_agree_with_many_fits(free_scale: bool) -> None:
     """In 400 fits of 12 stars, attitude and residuals have the chi-squares 3 or 4 and 24 minus 3 or 4."""
     draw = np.random.default_rng(2)
     seen, parameters = directions(12), 4 if free_scale else 3
@@ -129,7 +129,7 @@ def test_stretching_multiplies_the_tangents_and_its_slope_is_that_of_differences
     assert scale_slope(seen) == pytest.approx(difference, abs=1e-9)
 
 
-def test_a_turn_of_the_attitude_is_the_quaternions() -> None:
+def test_a_rotation_of_the_attitude_equals_that_of_the_quaternion() -> None:
     quaternion, turn = normalise(np.array([0.3, -0.2, 0.5, 0.7])), np.array([0.4, -1.1, 0.7])
     expected = attitude_matrix(multiply(from_rotation_vector(turn), quaternion))
     assert turned(attitude_matrix(quaternion), turn) == pytest.approx(expected, abs=1e-12)
@@ -217,7 +217,7 @@ def test_a_star_beyond_four_sigma_is_left_out(sigmas: float, kept: bool) -> None
     assert len(found.star) == (40 if kept else 39)
 
 
-def test_a_lens_that_bends_by_more_than_a_quarter_is_refused() -> None:
+def test_a_lens_distortion_above_a_quarter_is_refused() -> None:
     true = directions(40)
     assert distorted_fit(barrel(true, 0.22), true, 1e-4, 40) is not None
     assert distorted_fit(barrel(true, 0.3), true, 1e-4, 40) is None

@@ -57,7 +57,7 @@ def _rate_error(solution: FrameSolution, frame: SkyFrame) -> float:
     return float(np.linalg.norm(solution.motion.rate - frame.rate) / np.linalg.norm(frame.rate))
 
 
-def test_attitude_and_rate_come_nearer_to_the_truth() -> None:
+def test_the_second_fit_improves_attitude_and_rate() -> None:
     """The rms errors are those of three frames in which undetected stars bias the first fit."""
     errors = []
     for seed in _SEEDS:
@@ -73,7 +73,7 @@ def test_attitude_and_rate_come_nearer_to_the_truth() -> None:
     assert rate_after < 0.65 * rate_before
 
 
-def test_stars_that_hidden_light_had_silenced_have_a_say_again() -> None:
+def test_stars_rejected_because_of_hidden_stars_are_accepted_again() -> None:
     for seed in _SEEDS:
         first, second = _first(seed)[1].motion, _second(seed).motion
         assert first is not None
@@ -81,7 +81,7 @@ def test_stars_that_hidden_light_had_silenced_have_a_say_again() -> None:
         assert second.used_count > first.used_count
 
 
-def test_the_error_is_what_the_covariance_says() -> None:
+def test_the_errors_agree_with_the_covariance() -> None:
     """The limit is the quantile 1 - 1e-3 of a chi-square with 9 degrees of freedom."""
     squares = 0.0
     for seed in _SEEDS:
@@ -91,7 +91,7 @@ def test_the_error_is_what_the_covariance_says() -> None:
     assert squares < 27.9
 
 
-def test_it_needs_little_memory_in_the_milky_way() -> None:
+def test_the_second_fit_needs_little_memory_in_the_milky_way() -> None:
     """The worker's memory is limited, so that only close pairs of the 1200 stars are examined."""
     frame, first = _first(_MILKY_WAY, 120.0)
     tracemalloc.start()
@@ -103,7 +103,7 @@ def test_it_needs_little_memory_in_the_milky_way() -> None:
     assert peak < 45 * 2**20
 
 
-def test_what_is_in_no_catalogue_stays_among_the_stars_without_a_say() -> None:
+def test_a_star_missing_in_the_catalogue_stays_untrusted() -> None:
     """The second brightest identified star is removed from the catalogue."""
     frame, first = _first(_SEEDS[0])
     struck = int(np.sort(first.star[first.matched])[1])
@@ -127,7 +127,7 @@ def test_what_is_in_no_catalogue_stays_among_the_stars_without_a_say() -> None:
     assert not motion.used[apart.argmin()]
 
 
-def test_another_rate_than_before_is_not_believed() -> None:
+def test_a_contradicting_second_rate_is_rejected() -> None:
     """The first rate is wrong by 1 % with a small covariance, so that the correct second rate is rejected."""
     frame, first = _first(_SEEDS[0])
     motion = first.motion
@@ -138,7 +138,7 @@ def test_another_rate_than_before_is_not_believed() -> None:
     assert refit_with_catalogue(frame.pixels, off, sky(), _SETTINGS, _LIKELIHOOD) is off
 
 
-def test_what_is_not_solved_not_calibrated_or_no_streaks_is_left_alone() -> None:
+def test_unsolved_uncalibrated_and_unstreaked_frames_are_not_fitted_again() -> None:
     frame, first = _first(_SEEDS[0])
     for other in (
         replace(first, status=SolveStatus.NO_MATCH),

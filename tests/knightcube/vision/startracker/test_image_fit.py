@@ -51,7 +51,7 @@ def _error(found: ImageFit) -> FloatArray:
 
 
 @pytest.mark.parametrize("free_scale", [False, True])
-def test_places_without_error_give_attitude_and_scale_back(free_scale: bool) -> None:
+def test_exact_positions_give_the_exact_attitude_and_scale(free_scale: bool) -> None:
     """If the scale is fitted, the assumed focal length is wrong by 1 %."""
     points, covariance = _streaks(np.random.default_rng(1), 10)
     reference = _reference(points)
@@ -64,7 +64,7 @@ def test_places_without_error_give_attitude_and_scale_back(free_scale: bool) -> 
 
 
 @pytest.mark.parametrize("free_scale", [False, True])
-def test_the_errors_scatter_as_the_covariance_says_and_less_than_with_round_ones(free_scale: bool) -> None:
+def test_elongated_errors_agree_with_the_covariance_and_beat_round_ones(free_scale: bool) -> None:
     """The 200 fields of 12 stars are compared with fields of isotropic errors with the same mean variance."""
     rng = np.random.default_rng(2)
     mismatch, mine, rounds, scales = 0.0, 0.0, 0.0, 0.0
@@ -87,7 +87,7 @@ def test_the_errors_scatter_as_the_covariance_says_and_less_than_with_round_ones
         assert 0.6 < scales / _TRIALS < 1.55
 
 
-def test_stars_that_scatter_beyond_their_errors_widen_the_covariance() -> None:
+def test_excess_scatter_of_the_stars_increases_the_covariance() -> None:
     rng = np.random.default_rng(3)
     points, covariance = _streaks(rng, 12)
     reference = _reference(points)
@@ -99,7 +99,7 @@ def test_stars_that_scatter_beyond_their_errors_widen_the_covariance() -> None:
     assert ratio > 0.3
 
 
-def test_stars_that_disagree_have_no_say_and_leave_the_errors_as_the_covariance_says() -> None:
+def test_stars_that_disagree_are_rejected_and_the_covariance_stays_correct() -> None:
     """Two of 14 stars are displaced by 6 px, which is sixty standard deviations across their streaks."""
     rng = np.random.default_rng(4)
     mismatch = 0.0
@@ -116,7 +116,7 @@ def test_stars_that_disagree_have_no_say_and_leave_the_errors_as_the_covariance_
     assert _LOW < mismatch / (3.0 * _TRIALS) < _HIGH
 
 
-def test_where_too_few_would_be_left_all_keep_their_say_and_the_covariance_tells() -> None:
+def test_all_stars_are_kept_if_too_few_would_remain() -> None:
     """One of four stars is wrong, but the data do not show which one."""
     rng = np.random.default_rng(5)
     points, covariance = rng.uniform(50.0, 970.0, (4, 2)), np.tile(0.01 * np.eye(2), (4, 1, 1))
@@ -130,13 +130,13 @@ def test_where_too_few_would_be_left_all_keep_their_say_and_the_covariance_tells
     assert float(error @ np.linalg.solve(found.fix.covariance, error)) < 3.0 * 3.0
 
 
-def test_stars_in_one_direction_fix_no_attitude() -> None:
+def test_stars_in_one_direction_do_not_determine_an_attitude() -> None:
     points = np.full((3, 2), 400.0)
     with pytest.raises(AttitudeError):
         _fit(points, np.tile(np.eye(2), (3, 1, 1)), _reference(points))
 
 
-def test_stars_that_belong_elsewhere_do_not_give_an_attitude() -> None:
+def test_stars_from_different_parts_of_the_sky_do_not_give_an_attitude() -> None:
     """Two stars at a right angle are imaged side by side, which no attitude explains."""
     points = np.array([[500.0, 500.0], [520.0, 500.0]])
     reference = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -144,7 +144,7 @@ def test_stars_that_belong_elsewhere_do_not_give_an_attitude() -> None:
         _fit(points, np.tile(1e-4 * np.eye(2), (2, 1, 1)), reference)
 
 
-def test_a_lens_that_nobody_gave_is_fitted_and_its_doubt_is_in_the_covariance() -> None:
+def test_an_unknown_lens_is_fitted_and_included_in_the_covariance() -> None:
     """The optical axis is 25 px off the image centre, and the distortion is 2 % at the corner."""
     squares, off = [], []
     for number in range(12):
@@ -158,7 +158,7 @@ def test_a_lens_that_nobody_gave_is_fitted_and_its_doubt_is_in_the_covariance() 
     assert np.sqrt(np.mean(np.square(off))) < 0.2
 
 
-def test_a_shutter_that_nobody_described_is_fitted_and_its_doubt_is_in_the_covariance() -> None:
+def test_an_unspecified_shutter_is_fitted_and_included_in_the_covariance() -> None:
     """In 200 fields, 12 stars move by one standard deviation of the delay, which is 1 px per frame height."""
     rng = np.random.default_rng(6)
     known, unknown, delays = 0.0, 0.0, 0.0
@@ -179,7 +179,7 @@ def test_a_shutter_that_nobody_described_is_fitted_and_its_doubt_is_in_the_covar
     assert delays / _TRIALS < 0.02**2
 
 
-def test_bright_streaks_that_err_by_as_much_as_faint_ones_claim_no_more_than_they_know() -> None:
+def test_equal_errors_of_bright_and_faint_streaks_are_in_the_covariance() -> None:
     """In 200 fields, all positions err by 0.05 px, which is ten times the noise of the brightest stars."""
     rng = np.random.default_rng(7)
     known, unknown, off, without = 0.0, 0.0, 0.0, 0.0
@@ -200,7 +200,7 @@ def test_bright_streaks_that_err_by_as_much_as_faint_ones_claim_no_more_than_the
     assert off < 0.7 * without
 
 
-def test_streaks_that_err_as_their_noise_says_lose_little_by_the_question() -> None:
+def test_fitting_the_scatter_costs_little_accuracy_with_correct_noise() -> None:
     rng = np.random.default_rng(8)
     known, ratio = 0.0, []
     for _ in range(_TRIALS):

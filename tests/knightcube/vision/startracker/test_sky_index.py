@@ -81,7 +81,7 @@ def test_any_circle_has_triangles_of_its_brightest_stars_beside_a_cluster_too() 
     assert triangles(5) >= 10
 
 
-def test_a_sky_turned_has_the_same_triangles() -> None:
+def test_a_rotated_sky_has_the_same_triangles() -> None:
     """The range of a star is the distance of a neighbour.
 
     Rounding must not affect the choice of triangles.
@@ -95,7 +95,7 @@ def test_a_sky_turned_has_the_same_triangles() -> None:
         np.testing.assert_array_equal(found, first)
 
 
-def test_a_key_tells_the_shape_and_the_size_of_its_triangle() -> None:
+def test_a_key_depends_on_shape_and_size_of_its_triangle() -> None:
     sky = default_index()
     some = np.random.default_rng(3).integers(0, len(sky.triangles), 500)
     corners = sky.stars.direction[sky.triangles.corners[some].astype(int)]
@@ -119,9 +119,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_file_gives_back_what_was_saved_and_the_same_stars_make_the_same_bytes(
-    stored: Path, tmp_path: Path
-) -> None:
+def test_an_index_file_round_trips_and_is_deterministic(stored: Path, tmp_path: Path) -> None:
     again = tmp_path / "again.index"
     sky = index_build.build(SMALL)
     save(sky, again)
@@ -152,7 +150,7 @@ def test_a_flipped_bit_is_reported_with_its_cure(stored: Path, tmp_path: Path, p
     ],
     ids=["empty", "another-file", "another-version"],
 )
-def test_another_file_is_refused_with_advice(tmp_path: Path, content: bytes, problem: str) -> None:
+def test_a_file_of_another_kind_is_refused_with_advice(tmp_path: Path, content: bytes, problem: str) -> None:
     path = tmp_path / "other.index"
     path.write_bytes(content)
     with pytest.raises(InputError, match=problem):
@@ -187,7 +185,7 @@ def test_the_stars_move_to_another_epoch_by_their_proper_motion() -> None:
         sky.at(float("nan"))
 
 
-def test_the_command_writes_an_index_and_says_what_it_holds(
+def test_the_command_writes_an_index_and_describes_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "folder" / "small.index"

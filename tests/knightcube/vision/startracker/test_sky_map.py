@@ -27,13 +27,13 @@ def test_north_is_up_at_no_roll_and_east_is_then_on_the_left() -> None:
     np.testing.assert_allclose(east, [-1.0, 0.0, 0.0], atol=1e-15)
 
 
-def test_a_quarter_of_roll_turns_the_image_until_up_is_east() -> None:
+def test_at_a_roll_of_90_deg_east_is_up() -> None:
     matrix = attitude_matrix(Pointing(0.0, 0.0, 0.5 * np.pi).quaternion())
     np.testing.assert_allclose(matrix @ [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], atol=1e-15)
 
 
 @given(st.floats(0.0, 6.28), st.floats(-1.57, 1.57), st.floats(0.0, 6.28))
-def test_there_and_back_is_the_same_attitude(ra: float, dec: float, roll: float) -> None:
+def test_angles_to_attitude_and_back_is_the_identity(ra: float, dec: float, roll: float) -> None:
     q = Pointing(ra, dec, roll).quaternion()
     assert angle_between(Pointing.of(q).quaternion(), q) < 1e-9
 
@@ -48,7 +48,7 @@ def test_a_star_across_the_motion_is_displaced_by_the_constant_of_aberration() -
     assert np.arctan2(seen[0], seen[2]) == pytest.approx(20.49552 * _ARCSECOND, abs=1e-3 * _ARCSECOND)
 
 
-def test_stars_ahead_and_behind_stay_and_lengths_stay_one() -> None:
+def test_aberration_keeps_stars_ahead_and_behind_and_unit_lengths() -> None:
     velocity = np.array([0.0, 2.0e5, 0.0])
     seen = apparent(np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]]), velocity)
     np.testing.assert_allclose(seen[:2], [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]], atol=1e-15)

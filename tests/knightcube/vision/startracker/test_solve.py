@@ -84,7 +84,7 @@ def test_a_calibrated_lens_is_kept_lost_in_space() -> None:
         assert found.camera.focal_length == NARROW.pinhole.focal_length
 
 
-def test_a_streaked_frame_tells_the_rate_and_a_frame_at_rest_does_not() -> None:
+def test_a_streaked_frame_gives_the_rate_and_a_frame_at_rest_does_not() -> None:
     streaked = sky_frame(np.random.default_rng(12), 40.0, 0.1)
     motion = _solve(streaked).motion
     assert motion is not None
@@ -109,7 +109,7 @@ def test_a_right_prior_is_tracked_to_the_same_attitude(streak_px: float) -> None
     assert _mismatch(found, frame.attitude) < _CHI_SQUARE_3_DOF_1E_5
 
 
-def test_a_wrong_prior_costs_time_but_no_truth() -> None:
+def test_a_wrong_prior_does_not_change_the_solution() -> None:
     frame = sky_frame(np.random.default_rng(15), 0.0, 0.1)
     elsewhere = multiply(from_rotation_vector(np.array([0.5, 0.0, 0.0])), frame.attitude)
     found = _solve(frame, AttitudePrior(elsewhere, 3e-4))
@@ -178,7 +178,7 @@ def test_a_photograph_is_solved_to_a_minute_of_arc(name: str) -> None:
 
 
 @pytest.mark.skipif(not _PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are not here")
-def test_a_mirrored_photograph_is_solved_and_said_to_be_mirrored() -> None:
+def test_a_mirrored_photograph_is_solved_and_reported_as_mirrored() -> None:
     """The attitude is that of the unmirrored image, and the positions are those of the given image."""
     upright = read_image(_PHOTOGRAPHS / "esa_alt40_azi45.tiff")
     camera = type(NARROW.pinhole)(upright.shape[1], upright.shape[0], 5110.0)
@@ -216,7 +216,7 @@ def _turns(*powers: float) -> FloatArray:
 
 
 @pytest.mark.parametrize(("weighting", "part"), [(MEAN, 24.0), (ENDS, 8.0), (MIDDLE, np.inf)])
-def test_a_steady_acceleration_draws_the_attitude_off_as_the_integral_says(
+def test_the_attitude_error_by_a_steady_acceleration_is_its_integral(
     weighting: Weighting, part: float
 ) -> None:
     """For a rotation a t^2 / 2, the mean over T is a T^2 / 24.
@@ -230,12 +230,12 @@ def test_a_steady_acceleration_draws_the_attitude_off_as_the_integral_says(
 
 
 @pytest.mark.parametrize("weighting", [MEAN, ENDS, MIDDLE])
-def test_a_steady_rate_leaves_no_doubt_nor_does_what_is_odd_in_time(weighting: Weighting) -> None:
+def test_steady_and_odd_motions_do_not_change_the_attitude_at_mid_exposure(weighting: Weighting) -> None:
     assert middle_covariance(weighting, _turns(0.7, 0.0, 0.4), np.zeros((3, 3)), _EXPOSURE).max() < 1e-30
 
 
 @pytest.mark.parametrize("name", list(_WEIGHTS))
-def test_the_nodes_stand_for_the_whole_exposure(name: str) -> None:
+def test_the_nodes_represent_the_whole_exposure(name: str) -> None:
     """Up to the fourth power of time, the nodes agree with the fine weights."""
     weighting, fine = _WEIGHTS[name]
     time = 0.5 * _EXPOSURE * _EVEN
@@ -244,7 +244,7 @@ def test_the_nodes_stand_for_the_whole_exposure(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(_WEIGHTS))
-def test_white_acceleration_scatters_the_attitude_as_much_as_is_said(name: str) -> None:
+def test_the_scatter_by_white_acceleration_agrees_with_the_covariance(name: str) -> None:
     """In 4,000 random exposures, the acceleration is integrated twice. The variance is accurate to 10 %."""
     weighting, fine = _WEIGHTS[name]
     density, steps, trials = 0.03, 200, 4000
@@ -259,7 +259,7 @@ def test_white_acceleration_scatters_the_attitude_as_much_as_is_said(name: str) 
     np.testing.assert_array_equal(said, said[0, 0] * np.eye(3))
 
 
-def test_the_kind_of_motion_tells_how_the_attitude_comes_about() -> None:
+def test_the_kind_of_motion_determines_the_time_weighting() -> None:
     rest, moved = StreakStatus.TOO_SHORT, StreakStatus.RATE
     assert weighting_of(FrameMotion(rest, 0, 1.0)) is MEAN
     assert weighting_of(MotionResult(rest, 0, 1.0)) is MEAN

@@ -93,14 +93,14 @@ def test_a_prior_within_its_uncertainty_is_followed(sigma_deg: float) -> None:
         assert np.mean(found.star[matched] == drawn.star[matched]) > 0.8
 
 
-def test_a_prior_that_looks_elsewhere_is_refused() -> None:
+def test_a_prior_of_another_direction_is_refused() -> None:
     for seed in range(60):
         drawn = _drawn(ListKind(noise_px=0.5, false_stars=5), seed)
         elsewhere = normalise(np.random.default_rng(seed).standard_normal(4))
         assert track(drawn.field(), SKY, elsewhere, np.deg2rad(0.3)).status is MatchStatus.NO_MATCH
 
 
-def test_a_prior_of_no_use_is_refused_and_not_searched_forever() -> None:
+def test_a_useless_prior_is_refused_in_limited_time() -> None:
     drawn = _drawn(ListKind(faintest=7.0), 1)
     assert track(drawn.field(), SKY, np.array([0.0, 0.0, 0.0, 1.0]), 0.2).status is MatchStatus.NO_MATCH
 

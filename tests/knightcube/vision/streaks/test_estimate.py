@@ -263,7 +263,7 @@ def test_frames_of_noise_dead_frames_and_frozen_frames_have_their_status() -> No
     assert dead.status is not StreakStatus.RATE
 
 
-def test_the_result_is_deterministic_and_travels_between_processes() -> None:
+def test_the_result_is_deterministic_and_can_be_pickled() -> None:
     scene = real_sky(20, np.radians(45.0), 40.0, 0.2)
     first, second = _estimated(scene), _estimated(scene)
     assert pickle.dumps(first) == pickle.dumps(second)

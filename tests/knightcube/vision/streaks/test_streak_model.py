@@ -69,7 +69,7 @@ def test_the_light_is_that_of_brute_force(
 
 @pytest.mark.parametrize("growth", [0.3, 1.0, 2.0, -2.0])
 @pytest.mark.parametrize("length", [16.0, 30.0, 90.0])
-def test_the_light_of_a_rate_that_changes_is_that_of_brute_force(growth: float, length: float) -> None:
+def test_the_light_of_a_changing_rate_is_that_of_brute_force(growth: float, length: float) -> None:
     """For a motion from rest, a patch models the bright slow end, and strips model the remaining streak."""
     turn = np.array([0.4, 0.9, 0.1]) * length / _PINHOLE.focal_length
     motion, star = CameraMotion(turn, growth * turn), np.array([160.3, 155.2])

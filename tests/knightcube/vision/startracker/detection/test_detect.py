@@ -242,7 +242,7 @@ def test_wrong_settings_are_refused() -> None:
             DetectionSettings(**wrong)
 
 
-def test_odd_sizes_and_cameras_do() -> None:
+def test_odd_sizes_and_unusual_cameras_are_accepted() -> None:
     for rows, columns in ((17, 16), (100, 37), (65, 1000)):
         camera = StarCameraModel(columns=columns, rows=rows, field_of_view=np.radians(columns / 51.2))
         place = np.array([[columns / 2.0, rows / 2.0]])
@@ -290,7 +290,7 @@ def test_two_predictions_of_one_star_give_it_once_to_the_nearer() -> None:
     assert found.prediction.tolist() == [1]
 
 
-def test_a_whole_frame_and_windows_say_the_same() -> None:
+def test_a_whole_frame_and_windows_give_the_same_result() -> None:
     pixels = frame_of(CAMERA, PLACES, np.linspace(3.0, 6.5, 30), [4, 41])
     whole, near = detect(pixels).stars(), measure_near(pixels, PLACES, DetectionSettings(saturation=4095.0))
     apart = np.linalg.norm(near.points[:, None] - whole.points, axis=-1)
@@ -305,7 +305,7 @@ def test_wrong_predictions_are_refused() -> None:
         measure_near(np.zeros((50, 50)), np.array([[np.nan, 1.0]]))
 
 
-def test_stars_that_move_by_a_few_pixels_are_measured_where_they_are_in_the_middle() -> None:
+def test_trailed_stars_are_measured_at_mid_exposure() -> None:
     """For trails of 3 px on a sloping background, the errors agree with the covariance."""
     rng = np.random.default_rng(12)
     trail, squares, claims = np.array([2.5, 1.5]), [], []

@@ -66,7 +66,7 @@ def test_photon_noise_and_mismatch_are_distinguished_by_their_growth_with_light(
         assert known.mismatch == pytest.approx(mismatch, rel=0.1, abs=0.006)
 
 
-def test_few_bright_pixels_give_no_measure_noise() -> None:
+def test_few_bright_pixels_do_not_determine_the_noise() -> None:
     light, leverage = np.full((1, 2, 2), 100.0), np.full((1, 2, 2), 0.2)
     found = measure_noise(light, light, leverage, light, np.ones(1), None)
     assert (found.photon, found.mismatch) == (0.0, 0.0)
