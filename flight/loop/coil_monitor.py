@@ -1,36 +1,38 @@
 """The coil monitor: detects broken coils from commands, supply current and motion, and identifies the fault.
 
-Each cycle the loop passes the commands (`commanded`, `interrupted`), the samples of the inertial unit
-(`observe_motion`) and the newest reading of the current monitor (`measured`) to `CoilMonitor`, and then reads
-`verdicts`, `available`, `resting`, `braked`, `at_rest`, `probe`, `suspicion` and `monitor_doubted`. No call
-waits. `CoilKnowledge` states whether the coil currents are known: they are unknown while the PWM driver
-fails, after the loop has stalled, and while the supply current contradicts the commands.
+In each cycle, the loop passes the commands (`commanded`, `interrupted`), the samples of the inertial unit
+(`observe_motion`) and the newest reading of the current monitor (`measured`) to `CoilMonitor`. It then reads
+the results: `verdicts`, `available`, `resting`, `braked`, `at_rest`, `probe`, `suspicion` and
+`monitor_doubted`. No call waits. The class `CoilKnowledge` determines whether the coil currents are known:
+they are unknown while the PWM driver fails, after the loop has stalled, and while the supply current
+contradicts the commands.
 
-The current monitor measures the sum of |I| of three bridges, so it cannot detect a reversed coil, and detects
-an open coil only while that axis is commanded: axes that are not driven are not judged. Every reading is
-compared with the prediction of each hypothesis (healthy; each axis open, shorted, either leg of either input
-stuck; see `flight.loop.coil_response`). There is a verdict when `healthy` is rejected and the hypotheses that
-explain the readings since then all name one axis; between axes that are not driven, a small probe current on
-each axis in turn decides. A reversed coil is found from the angular acceleration, which also distinguishes a
-wrong monitor from a broken coil; over longer bins the acceleration also shows missing torque at currents that
-are too small for the monitor.
+The current monitor measures the sum of |I| over the three H-bridges. It cannot detect a reversed coil, and it
+detects an open coil only while that coil is driven. Every reading is compared with the prediction of each
+hypothesis: all coils healthy, or one axis open, shorted, or with one leg of an input stuck
+(`flight.loop.coil_response`). A verdict is given when the hypothesis `healthy` is rejected and all hypotheses
+that explain the later readings name the same axis. If the axes are not driven, a small probe current on one
+axis after another decides between them. A reversed coil is detected from the angular acceleration, which also
+distinguishes a wrong current monitor from a broken coil. Averaged over longer bins, the acceleration reveals
+missing torque at currents that are too small for the current monitor.
 
-A leg stuck high is found by setting the coils to zero and braking bridges. Braking (both inputs high) removes
-the voltage from any coil, whether its bridge is healthy or not. When the supply current is far too large or
-too small, all coils are commanded to zero. A current that remains is caused by a fault. All bridges are then
-braked at once. If the current stops, the bridges are released one by one, and the bridge with which the
-current returns is broken. During this search no healthy coil carries current, and no other verdict is given.
-If neither zero commands nor braking change the current, as with a shorted coil or a wrong monitor, the search
-ends. When commands change continuously, as in the windows of B-dot detumbling, the command during an ADC
-sample is ambiguous. The coils are then commanded to zero every few seconds as a check, without a suspicion.
+An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
+inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
+far too large or too small, all coils are commanded to zero. If current still flows at zero commands, there is
+a fault. All bridges are then braked at once. If braking stops the current, the bridges are released one by
+one, and the bridge at whose release the current returns is broken. During this search no healthy coil carries
+current, and no other verdict is given. The search ends if neither zero commands nor braking change the
+current, as with a shorted coil or a wrong current monitor. If the commands change continuously, as in the
+windows of B-dot detumbling, the command that was in force during an ADC sample is ambiguous. In this case,
+all coils are commanded to zero every few seconds as a check, even without a suspicion.
 
-A reversed coil draws the same supply current as a healthy coil, so that the monitor cannot confirm the
-verdict. In a tumble the motion depends more on the inertia than on the coils. A coil that looks reversed in a
-tumble is therefore not isolated. It is kept at zero current, and used and judged again when the body is
-slower than `tumble_rate`, or after ten minutes.
+A reversed coil draws the same supply current as a healthy coil, so the current monitor cannot confirm a
+verdict of reversal. In a tumble, the angular acceleration depends more on the inertia than on the coils. A
+coil that looks reversed in a tumble is therefore not isolated. Such a coil is kept at zero current, and is
+used and judged again when the body is slower than `tumble_rate`, or after ten minutes.
 
-The bounds are the thesis's 3.5 mA on each coil's current (Sease 2013 ch. 5), the resistance's error, and the
-18 % error of a single ADC sample of the chopped current (`hal.drivers.ina219`).
+The error bounds are 3.5 mA for each coil's current (Sease thesis, chapter 5), the error of the resistance,
+and 18 % for a single ADC sample of the chopped current (`hal.drivers.ina219`).
 """
 
 from __future__ import annotations
@@ -63,13 +65,13 @@ from hal.interfaces.devices import NO_AXES, Axes, CoilState, PowerReading
 from knightcube.astro.arrays import BoolArray, FloatArray
 
 _SURE = 2
-"""Number of ADC samples in a row that must agree."""
+"""Number of consecutive ADC samples that must agree."""
 _PATIENCE = 12
-"""Number of ADC samples without agreement after which a step is given up."""
+"""Number of ADC samples without agreement after which a step of the search is abandoned."""
 _PAUSE = 50
-"""Number of ADC samples between a check at zero command that found no fault and the next check."""
+"""Number of ADC samples from a check at zero command that found no fault to the next check."""
 _UNCLEAR = 20
-"""Number of ADC samples in a row with an ambiguous command after which the coils are checked at zero."""
+"""Number of consecutive ADC samples with ambiguous commands after which the coils are checked at zero."""
 
 
 class _Step(Enum):
@@ -81,16 +83,16 @@ class _Step(Enum):
 
 
 class StuckLeg:
-    """Searches for a stuck leg: processes ADC samples, requests rest and brakes, and returns an axis.
+    """Searches for an output leg that is stuck high, by zero commands and braking of the bridges.
 
     Attributes:
-        brake: which bridges must be braked now.
-        rest: whether all commands must be zero now.
-        suspicion: reason for the search; empty without a search.
+        brake: flags of the bridges that must be braked now.
+        rest: whether all currents must be commanded to zero now.
+        suspicion: reason for the search; empty if there is no search.
     """
 
     def __init__(self, excess: float) -> None:
-        """`excess` is the smallest excess current (A) that indicates a fault."""
+        """`excess` is the smallest excess of the supply current (A) that indicates a fault."""
         self._excess = excess
         self._pause = self._unclear = 0
         self._high = self._short = self._normal = self._looks = 0
@@ -108,23 +110,23 @@ class StuckLeg:
 
     @property
     def is_searching(self) -> bool:
-        """Whether a search is running, during which the coils are at zero command and may be braked."""
+        """Whether a search is running, in which the coils are commanded to zero and may be braked."""
         return self.rest
 
     def exceeds(self, supplied: Supplied) -> bool:
-        """Return whether an ADC sample exceeds the current of healthy coils."""
+        """Return whether an ADC sample exceeds the current that healthy coils would draw."""
         return supplied.current > supplied.most + self._excess
 
     def ask_for_rest(self, why: str) -> None:
-        """Request zero commands, unless a search is running or the last request was too recent."""
+        """Request zero commands, unless a search is running or the last request is too recent."""
         if self._step is _Step.WATCHING and not self._pause:
             self._rest(why)
 
     def look(self, supplied: Supplied) -> int | None:
-        """Process an ADC sample; return the axis of a stuck leg once it is found."""
+        """Process an ADC sample, and return the axis with a stuck leg once it is identified."""
         self._pause = max(self._pause - 1, 0)
         if self.rest and supplied.driven:
-            return None  # the coils are not yet at rest
+            return None  # zero commands are not yet in force
         high = self.exceeds(supplied)
         short = supplied.current < supplied.least - self._excess
         self._high = self._high + 1 if high else 0
@@ -132,7 +134,7 @@ class StuckLeg:
         self._normal = 0 if high or short else self._normal + 1
         self._looks += 1
         if self.is_searching and self._looks > _PATIENCE:
-            self._give_up()  # an intermittent current is not a stuck leg
+            self._give_up()  # a stuck leg would not draw an intermittent current
             return None
         self._unclear = self._unclear + 1 if supplied.spread > self._excess else 0
         if self._unclear >= _UNCLEAR and self._step is _Step.WATCHING:
@@ -200,7 +202,7 @@ class StuckLeg:
         self._await()
 
     def _release_next(self) -> None:
-        """Release the next bridge; end the search after the last bridge."""
+        """Release the next bridge; end the search after the last one."""
         if not self._left:
             self.reset()
             return
@@ -209,7 +211,7 @@ class StuckLeg:
         self._await()
 
     def _give_up(self) -> None:
-        """End the search until the current is normal again."""
+        """End the search until the supply current is normal again."""
         self.reset()
         self._step = _Step.NO_CURE
 
@@ -219,7 +221,7 @@ class StuckLeg:
 
 def _reason(supplied: Supplied) -> str:
     due = f"{1e3 * max(supplied.least, 0.0):.0f} to {1e3 * supplied.most:.0f} mA"
-    return f"supply current {1e3 * supplied.current:.0f} mA where {due} are due"
+    return f"supply current {1e3 * supplied.current:.0f} mA, expected {due}"
 
 
 def _only(axes: Sequence[int]) -> Axes:
@@ -227,22 +229,22 @@ def _only(axes: Sequence[int]) -> Axes:
 
 
 _PROOFS = 2
-"""Number of ADC samples in a row that must agree."""
+"""Number of consecutive ADC samples that must agree."""
 
 
 class BrakeProof:
-    """Collects ADC samples to confirm that the braked bridges have a leg stuck high."""
+    """Confirms from ADC samples that the braked bridges have a leg stuck high."""
 
     def __init__(self) -> None:
         self._axes: set[int] = set()
         self._exceeds: deque[bool] = deque(maxlen=_PROOFS)
 
     def __bool__(self) -> bool:
-        """Return whether any brake is unconfirmed."""
+        """Return whether any braked bridge is unconfirmed."""
         return bool(self._axes)
 
     def add(self, axis: int) -> None:
-        """Add an axis that is braked because of a verdict, without confirmation."""
+        """Add an axis that is braked because of a verdict and not yet confirmed."""
         self._axes.add(axis)
 
     def discard(self, axis: int) -> None:
@@ -250,9 +252,9 @@ class BrakeProof:
         self._axes.discard(axis)
 
     def ingest(self, exceeds: bool) -> frozenset[int]:
-        """Accept whether an ADC sample shows current despite braking.
+        """Accept whether an ADC sample shows a current in spite of braking.
 
-        Return the axes that were braked wrongly.
+        Return the axes that are braked wrongly.
         """
         self._exceeds.append(exceeds)
         if len(self._exceeds) < _PROOFS:
@@ -266,7 +268,7 @@ class BrakeProof:
 
 @dataclass(frozen=True, slots=True)
 class CoilVerdict:
-    """The fault of one axis, numbered 0, 1, 2 for x, y, z."""
+    """The fault of one axis, where the axes 0, 1 and 2 are x, y and z."""
 
     axis: int
     fault: CoilFault
@@ -276,23 +278,27 @@ class CoilVerdict:
 
 @dataclass(frozen=True, slots=True)
 class CoilMonitorSettings:
-    """Properties of the coils' circuit and of the monitor.
+    """Properties of the coil circuit and of the current monitor.
 
     Attributes:
-        full_current: current of a coil that is fully on, A: supply voltage divided by resistance.
-        current_uncertainty: bound (A) on the deviation of each driven coil's current from its command.
-        gain_error: relative error bound due to resistance, supply voltage, and sampling of the chopped
+        full_current: current (A) of each coil when fully on, which is the supply voltage divided by its
+            resistance.
+        current_uncertainty: bound (A) on the deviation of a driven coil's current from its command.
+        gain_error: relative error bound due to resistance, supply voltage and sampling of the chopped
             current.
-        monitor_noise: error bound of the monitor at any current, A.
-        window_ns: averaging time of a reading's mean. A longer gap between readings resets the monitor.
-        persistence: number of readings in a row inconsistent with a healthy circuit that raise a suspicion.
-        settle: number of further readings until the averaging window lies entirely after the fault.
-        evidence: number of readings that a verdict needs.
-        probe_current: amplitude (A) of the square wave that distinguishes faults of axes that are not driven.
-        probe_half_ns: half the period of this square wave, ns.
-        response: the body's response to the coils; None if the motion is not used.
-        slow: as `response`, with longer bins, which show the torque of currents below the monitor's noise.
-        tumble_rate: body rate (rad/s) above which a coil that looks reversed is kept at zero current.
+        monitor_noise: error bound (A) of the current monitor at any current.
+        window_ns: time (ns) over which the current monitor averages. A longer gap between readings discards
+            the evidence.
+        persistence: number of consecutive readings that raise a suspicion if they contradict a healthy
+            circuit.
+        settle: number of further readings until the averaging window begins after the fault.
+        evidence: number of readings that are needed for a verdict.
+        probe_current: amplitude (A) of the square wave that reveals which of the undriven axes is faulty.
+        probe_half_ns: half the period (ns) of the probe's square wave.
+        response: settings for judging coils by the body's motion; None if the motion is not used.
+        slow: settings as `response` with longer bins, for torques of currents below the monitor's noise.
+        tumble_rate: body rate (rad/s) above which a coil that looks reversed is not isolated but kept at zero
+            current.
     """
 
     full_current: tuple[float, float, float]
@@ -311,23 +317,22 @@ class CoilMonitorSettings:
 
 
 _UNSEEN_NS = 600_000_000
-"""Largest age (ns) of an error when it is detected; the driver reads its outputs back twice a second."""
+"""Largest age (ns) of a PWM error at its detection; the driver reads its outputs back twice a second."""
 _UNSUSPECTED_NS = 800_000_000
-"""Longest time (ns) between a fault and its suspicion, which is four readings of the monitor."""
+"""Longest time (ns) from a fault to its suspicion, which takes four readings of the current monitor."""
 STOOD_NS = 200_000_000
-"""Stall of the loop (ns) after which the guardian may have zeroed the coils."""
+"""Stall of the control loop (ns) after which the guardian may have set the coils to zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class CurrentValidity:
-    """Whether the coil currents are known.
+    """Validity of the recorded coil currents.
 
     Attributes:
         now: whether the currents in force are known.
-        since_last_look: whether the chip kept all commands since the previous look.
-        since_ns: time (ns) since which the currents are known.
-        uncertain_since_ns: time (ns) from which currents that were recorded as known are uncertain; else
-            None.
+        since_last_look: whether the PWM chip kept all commands since the previous call.
+        since_ns: time (ns) since which the currents have been known.
+        uncertain_since_ns: time (ns) since which currents recorded as known are uncertain, or None.
     """
 
     now: bool
@@ -346,10 +351,10 @@ class CoilKnowledge:
         self._looked_ns: int | None = None
 
     def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
-        """Return which currents are known, from the driver's state and the time since the last look.
+        """Return which currents are known, from the driver's state and the time since the last call.
 
-        `suspected` is whether the supply current contradicts a healthy circuit, so that a coil current may be
-        arbitrary.
+        `suspected` states whether the supply current contradicts a healthy circuit, so that a coil may carry
+        any current.
         """
         obeyed, self._obeys = self._obeys, not in_force.error
         was_suspected, self._suspected = self._suspected, suspected
@@ -368,10 +373,9 @@ class CoilKnowledge:
 
 
 class Probe:
-    """Applies a square wave with zero mean to one axis after the other.
+    """Applies a probe current to one axis after another: a square wave with zero mean.
 
-    The two halves last `half_ns` each and carry +`current` and -`current` (A), so that the mean torque is
-    zero.
+    The two halves of the wave last `half_ns` each, with the currents +`current` and -`current` (A).
     """
 
     def __init__(self, current: float, half_ns: int) -> None:
@@ -381,7 +385,7 @@ class Probe:
         self._tried: set[int] = set()
 
     def begin(self, axes: set[int], now_ns: int) -> int | None:
-        """Begin a wave on the next untried axis of `axes`; return its end (ns), None if all were tried."""
+        """Begin a wave on the next untried axis of `axes`; return its end (ns), or None after all axes."""
         candidates = sorted(axes - self._tried)
         if not candidates:
             self._tried.clear()
@@ -391,12 +395,12 @@ class Probe:
         return now_ns + 2 * self._half_ns
 
     def stop(self) -> None:
-        """End the wave; count all axes as untried."""
+        """End the square wave and consider all axes untried."""
         self._running = None
         self._tried.clear()
 
     def wave(self, now_ns: int) -> FloatArray:
-        """Return the currents (3,) A to add to the commands at `now_ns`."""
+        """Return the probe's currents (3,), A, which are added to the commands at `now_ns`."""
         wave = np.zeros(3)
         if self._running is not None:
             axis, since_ns = self._running
@@ -412,24 +416,25 @@ AXES = "xyz"
 
 _BRAKED = {CoilFault.A_HIGH, CoilFault.B_HIGH, CoilFault.HIGH}
 _STUCK_EXCESS = 0.3
-"""Minimum excess current of a leg stuck high, as a fraction of the current of a coil that is fully on."""
+"""Smallest excess current of a leg stuck high, as a fraction of the current of a coil that is fully on."""
 _LEAST_SHORT = 0.02
-"""Minimum excess current (A) of a shorted coil that the motion of the body can confirm."""
+"""Smallest excess current (A) of a shorted coil that the motion of the body can confirm."""
 _READING_NS = 200_000_000
 _MOST_EVIDENCE = 40
 _IN_DOUBT = 5
-"""Number of readings after which a verdict may name an axis without a kind of fault."""
+"""Number of readings after which a verdict may name an axis with an uncertain kind of fault."""
 _LONGEST_REST_NS = 600_000_000_000
-"""Longest time (ns) at zero current for a coil that looks reversed in a tumble."""
+"""Longest time (ns) for which a coil that looks reversed in a tumble is kept at zero current."""
 
 
 class CoilMonitor:
     """Detects broken coils from the commands and readings of the last seconds.
 
-    Longer than 200 lines because all methods share the state of one suspicion, from detection to verdict.
+    The class is longer than 200 lines, because its methods share the state of one suspicion from detection to
+    verdict.
 
     Attributes:
-        tumble_rate: rate (rad/s) above which no coil is isolated by the motion alone.
+        tumble_rate: body rate (rad/s) above which no coil is isolated because of the motion alone.
     """
 
     def __init__(self, settings: CoilMonitorSettings) -> None:
@@ -446,16 +451,16 @@ class CoilMonitor:
         self._fresh = 0
         self._strange = 0
         self._suspected_ns: int | None = None
-        self._judge_ns = 0  # time (ns) after which a verdict needs no kind of fault
-        self._sound_ns = 0  # time at which a driven coil last drew the expected current
-        self._unmixed_ns = 0  # time after which a reading's mean covers one state of the circuit
+        self._judge_ns = 0  # time (ns) after which a verdict may leave the kind of fault open
+        self._sound_ns = 0  # time (ns) at which a driven coil last drew the expected current
+        self._unmixed_ns = 0  # time (ns) since which the circuit, as averaged in a reading, has not changed
         self._evidence: deque[Predicted] = deque(maxlen=_MOST_EVIDENCE)
         self._probe = Probe(settings.probe_current, settings.probe_half_ns)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
-        self._weak = ""  # the coil whose torque is missing in the motion, as text
+        self._weak = ""  # text about the coil whose torque is missing in the motion
         self._verdicts: dict[int, CoilVerdict] = {}
-        # By resting axis: time at which its rest began, and the reason.
+        # Axes kept at zero current, each with the start time (ns) and the reason.
         self._rests: dict[int, tuple[int, str]] = {}
         self._looked_ns = 0
         self._leg = StuckLeg(_STUCK_EXCESS * min(settings.full_current))
@@ -465,12 +470,12 @@ class CoilMonitor:
 
     @property
     def verdicts(self) -> tuple[CoilVerdict, ...]:
-        """The broken axes, at most one verdict each, in the order found; kept until `forget`."""
+        """The verdicts on broken axes, at most one per axis, in order of time; they last until `forget`."""
         return tuple(self._verdicts.values())
 
     @property
     def available(self) -> BoolArray:
-        """Flags (3,) of the axes that may be used, for `knightcube.gnc.control.allocation`."""
+        """Flags (3,) of the axes that are not broken, for `knightcube.gnc.control.allocation`."""
         return np.array([axis not in self._verdicts for axis in range(3)])
 
     @property
@@ -480,7 +485,7 @@ class CoilMonitor:
 
     @property
     def suspicion(self) -> str:
-        """Why a coil is suspected; empty while the readings are consistent with a healthy circuit."""
+        """The reason why a coil is suspected; empty while all readings are consistent with healthy coils."""
         rests = "; ".join(why for _, why in self._rests.values())
         return self._unknown or rests
 
@@ -491,12 +496,12 @@ class CoilMonitor:
 
     @property
     def _unknown(self) -> str:
-        """Why a coil's current may differ from its command; empty if it does not."""
+        """The reason why a coil's current may differ from its command; empty if there is none."""
         return self._leg.suspicion or self._strangeness or self._weak
 
     @property
     def braked(self) -> Axes:
-        """The bridges to brake: bridges with a leg stuck high, and bridges under test in the search."""
+        """Flags of the bridges to brake: those with a leg stuck high, and those under test in the search."""
         if not self._verdicts:
             return self._leg.brake
         x, y, z = (
@@ -507,11 +512,14 @@ class CoilMonitor:
 
     @property
     def at_rest(self) -> bool:
-        """Whether all commands must be zero now, to reveal a leg stuck high."""
+        """Whether all currents must be commanded to zero now, to reveal a leg stuck high."""
         return self._leg.rest
 
     def forget(self, axis: int) -> None:
-        """Discard the verdict on an axis, on command. A lasting fault is detected again."""
+        """Discard the verdict on an axis, as commanded by the ground.
+
+        If the fault persists, it is detected again.
+        """
         self._verdicts.pop(axis, None)
         self._rests.pop(axis, None)
         self._proof.discard(axis)
@@ -520,17 +528,17 @@ class CoilMonitor:
     def commanded(
         self, time_ns: int, currents: FloatArray, braked: Axes = NO_AXES, written_ns: int | None = None
     ) -> None:
-        """Record the currents (3,) A and brakes on the wire at `time_ns`, written at `written_ns` or then."""
+        """Record the currents (3,), A, and brakes in force at `time_ns`, written at `written_ns` if given."""
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
-        # Without readings of the monitor, the search would never end.
+        # If the monitor gives no readings, the search is ended, because it could not finish.
         if self._leg.is_searching and time_ns - self._looked_ns > self._settings.window_ns:
             self._leg.reset()
         for response in self._responses:
             response.commanded(time_ns if written_ns is None else written_ns, values)
 
     def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> None:
-        """Add a sample of the body rate (3,) rad/s and the magnetic field (3,) T, body axes."""
+        """Add a sample of body rate (3,), rad/s, and magnetic field (3,), T, in body axes."""
         if self._rests:
             self._end_rests(time_ns, float(np.sqrt(rate @ rate)))
         for response in self._responses:
@@ -538,27 +546,27 @@ class CoilMonitor:
                 self._judge_motion(response, time_ns)
 
     def _judge_motion(self, response: CoilResponse, now_ns: int) -> None:
-        """Give a verdict on a reversed axis, and suspect an axis without torque.
+        """Give a verdict on a reversed axis, and raise a suspicion about an axis without torque.
 
-        In a tumble an axis that looks reversed rests without a verdict.
+        In a tumble, an axis that looks reversed is kept at zero current without a verdict.
         """
         for axis in response.reversed_axes():
-            # An uncommanded current makes a torque too, so that the motion gives no evidence.
+            # An uncommanded current also makes a torque, which could be mistaken for a reversed coil.
             if axis in self._verdicts or axis in self._rests or self._leg.suspicion or self._strangeness:
                 continue
             if response.fastest <= self.tumble_rate:
                 self._give(axis, CoilFault.REVERSED, now_ns, response.text(axis))
             else:
-                why = f"coil {AXES[axis]}: {response.text(axis)}; it rests while the body tumbles"
+                why = f"coil {AXES[axis]}: {response.text(axis)}; kept at zero current in the tumble"
                 self._rests[axis] = now_ns, why
         if response is self._slow:
             known = self._verdicts.keys() | self._rests.keys()
             axes = [axis for axis in response.feeble_axes() if axis not in known]
-            # If several coils look weak at once, the gyro or the field is more likely wrong.
+            # If several coils look weak at once, the gyro or the field is wrong rather than the coils.
             self._weak = f"coil {AXES[axes[0]]}: {response.text(axes[0])}" if len(axes) == 1 else ""
 
     def _end_rests(self, now_ns: int, speed: float) -> None:
-        """Try the resting axes again, on new evidence, once the body is slow or the rest has lasted long."""
+        """Use the axes at zero current again, if the body is slow or after a long time."""
         oldest_ns = min(since_ns for since_ns, _ in self._rests.values())
         if speed <= self.tumble_rate or now_ns - oldest_ns > _LONGEST_REST_NS:
             self._rests.clear()
@@ -566,7 +574,7 @@ class CoilMonitor:
                 response.reset()
 
     def interrupted(self, now_ns: int) -> None:
-        """Discard all evidence until now, because the coil currents of that time are unknown."""
+        """Discard all evidence until now, because the coil currents up to this time are unknown."""
         self._fresh = 0
         self._leg.reset()
         self._reset()
@@ -575,7 +583,7 @@ class CoilMonitor:
             response.interrupted(now_ns)
 
     def measured(self, reading: PowerReading) -> None:
-        """Add a reading of the monitor; a repeated reading is ignored."""
+        """Process a reading of the current monitor, unless it was processed before."""
         gap_ns = reading.time_ns - self._reading_ns
         if gap_ns <= 0 or not self._commands:
             return
@@ -600,12 +608,12 @@ class CoilMonitor:
 
     @property
     def probe(self) -> FloatArray:
-        """Currents (3,) A to add to the commands now: zero, or the probe's square wave."""
+        """Currents (3,), A, to add to the commands now: the probe's square wave, or zero."""
         return self._probe.wave(self._commands.newest_ns) if self._commands else np.zeros(3)
 
     @property
     def monitor_doubted(self) -> str:
-        """Why the current monitor is assumed to be wrong; empty while the monitor is trusted."""
+        """The reason why the current monitor is considered wrong; empty while it is trusted."""
         return self._witness.doubt
 
     @property
@@ -618,14 +626,14 @@ class CoilMonitor:
 
     @property
     def _known(self) -> dict[int, CoilFault]:
-        """The known fault of each broken axis, for the supply current; a braked axis draws no current."""
+        """The fault of each broken axis, as it affects the supply current; a braked axis draws no current."""
         return {
             axis: CoilFault.OPEN if verdict.fault in _BRAKED else verdict.fault
             for axis, verdict in self._verdicts.items()
         }
 
     def _look_at_legs(self, reading: PowerReading) -> None:
-        """Search for a leg stuck high, if this ADC sample was made under the present brakes."""
+        """Search for a leg stuck high if the ADC sample was made under the present braking."""
         commands = self._commands
         if commands.braked != self.braked or not commands.is_known_since(reading.newest_since_ns):
             return
@@ -642,7 +650,7 @@ class CoilMonitor:
             self.interrupted(reading.time_ns)
 
     def _predictions(self, reading: PowerReading) -> list[Predicted]:
-        """Return predictions of a reading's newest ADC sample, and of its mean if it has one state."""
+        """Predict the newest ADC sample and, if the circuit did not change in its window, the mean."""
         windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
         begin_ns = reading.time_ns - self._settings.window_ns
         if begin_ns >= self._unmixed_ns:
@@ -668,7 +676,7 @@ class CoilMonitor:
             return
         self._strange += 1
         if self._strange >= self._settings.persistence:
-            why = f"supply current {1e3 * reading.newest:.0f} mA where {1e3 * asked:.0f} are due"
+            why = f"supply current {1e3 * reading.newest:.0f} mA, expected {1e3 * asked:.0f} mA"
             self._suspect(why)
             if reading.newest > asked > 0.0:
                 self._leg.ask_for_rest(why)
@@ -680,7 +688,7 @@ class CoilMonitor:
         self._strangeness = why
 
     def _judge(self, now_ns: int) -> None:
-        """Give a verdict if the evidence leaves one axis; discard the suspicion of healthy readings."""
+        """Give a verdict if all evidence names one axis; drop the suspicion if readings are normal again."""
         evidence = tuple(self._evidence)
         if len(evidence) < self._settings.evidence:
             return
@@ -705,7 +713,7 @@ class CoilMonitor:
     def _conclude(self, axis: int, fault: CoilFault, now_ns: int) -> None:
         excess = max(one.current - float(one.mean[:, 0].sum()) for one in self._evidence)
         if fault is CoilFault.SHORTED and excess < _LEAST_SHORT:
-            self._reset()  # the motion cannot confirm so small an excess; the monitor may be wrong
+            self._reset()  # such a small excess may be an error of the current monitor
             return
         if self._is_contradicted(axis, fault):
             why = f"{self._strangeness}; yet the motion shows no change of coil {AXES[axis]}"
@@ -724,9 +732,10 @@ class CoilMonitor:
         return self._witness.contradicts(axis, fault, begun_ns, self._suspected_ns, self._reading_ns)
 
     def _look_further(self, axes: set[int], now_ns: int) -> None:
-        """Probe the next suspected axis; after the last one, collect new evidence.
+        """Apply the probe to the next suspected axis; after the last axis, collect new evidence.
 
-        An intermittent fault, or a fault of the monitor, is not explained by any hypothesis.
+        New evidence is needed, because no hypothesis explains an intermittent fault or a wrong current
+        monitor.
         """
         ends_ns = self._probe.begin(axes, now_ns)
         if ends_ns is None:

@@ -1,27 +1,29 @@
 """Responses of the coils to commands: supply current and angular acceleration, with and without faults.
 
-The supply current of each hypothesis (healthy, or one fault on one axis) is predicted from the commands. An
-H-bridge has the inputs A and B. Input A is pulsed for a positive current, and input B for a negative current.
-An output leg that is stuck high drives its coil continuously, except during a pulse on the other input.
+For each hypothesis (all healthy, or one fault on one axis), the supply current is predicted from the
+commands. Each H-bridge has two inputs, A and B. The input A is pulsed for positive currents, the input B for
+negative currents. If an output leg is stuck high, it drives its coil continuously, except while the other
+input is pulsed.
 
-`CoilResponse` estimates the torque gain of each coil from the body's angular acceleration over some seconds.
-Rate and commanded rate change (the integral of J^-1 (m x B)) are averaged over short bins; differences of
-neighbouring bins are accelerations. Least squares over the last bins estimates each coil's gain, with a
-constant disturbance, a torsion and a damping of each free axis. A gain of 1 indicates a healthy coil, 0 a
-coil without torque, and -1 a reversed coil. When the commands vary too little, the gain's standard deviation
-is large and no axis is judged. A gain beyond `LARGEST_GAIN` is physically impossible. It shows that the model
-is wrong, and no axis is judged.
+The class `CoilResponse` estimates the torque gain of each coil from the body's angular acceleration over some
+seconds. The measured rate and the commanded rate change, which is the integral of J^-1 (m x B), are averaged
+over short bins. Differences of neighbouring bins are accelerations. A least squares fit over the last bins
+estimates the gain of each coil, together with a constant disturbance, a torsion and a damping about each free
+axis. The gain is 1 for a healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the
+commands vary too little, the standard deviation of the gain is large, and the axis is not judged. A gain
+larger than `LARGEST_GAIN` is physically impossible. Such a gain shows that the model is wrong, and no axis is
+judged.
 
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
-that an inertia error of 2 % makes healthy coils look reversed. The fit therefore subtracts the gyroscopic
+that an inertia error of 2 % can make healthy coils look reversed. The fit therefore subtracts the gyroscopic
 acceleration for the assumed inertia, and estimates the remaining error by nuisance parameters
-(`knightcube.gnc.estimation.rigid_body`). If the field of the coils at the magnetometer is as large as the
-Earth's field, the fit uses the Earth's field that was measured in the last pause of the coils, rotated with
-the body.
+(`knightcube.gnc.estimation.rigid_body`). If the coils' own field at the magnetometer is comparable with the
+Earth's field, the fit uses the field measured in the last pause of the coils, rotated with the body.
 
-The residual accelerations for healthy coils are stored for a longer time. If they change at the same time as
-the supply current, a coil is broken; otherwise the current monitor is wrong (`observed_share`).
-`MotionWitness` checks verdicts that are based on the supply current in this way.
+The residual accelerations, computed for healthy coils, are stored for a longer time. If these residuals
+change together with the supply current, a coil is broken; otherwise the current monitor is wrong
+(`observed_share`). The class `MotionWitness` uses this to check verdicts that are based on the supply
+current.
 """
 
 from __future__ import annotations
@@ -47,14 +49,14 @@ from knightcube.gnc.estimation.rigid_body import (
 
 @dataclass(frozen=True, slots=True)
 class Supplied:
-    """An ADC sample made entirely with the present braking, and the current expected of healthy coils.
+    """An ADC sample, during which the braking did not change, and the current expected of healthy coils.
 
     Attributes:
         current: measured supply current, A.
-        least, most: bounds of the total current of healthy coils, A.
-        spread: range of the total commanded current within the time window of the sample, A.
-        at_rest: the axes that were not driven and have no known fault.
-        driven: whether any axis was driven.
+        least, most: bounds (A) of the total current that healthy coils would draw.
+        spread: range (A) of the total commanded current within the time window of the sample.
+        at_rest: indices of the axes that were not driven and have no known fault.
+        driven: whether any axis was driven during the sample.
     """
 
     current: float
@@ -66,7 +68,7 @@ class Supplied:
 
 
 class CoilFault(Enum):
-    """A fault of a coil axis; the values are the texts in the log."""
+    """A fault of a coil axis; the values are the texts in the flight log."""
 
     OPEN = "open: no current when driven"
     SHORTED = "shorted: too much current when driven"
@@ -89,22 +91,22 @@ ELECTRICAL = (
 )
 _VARIANTS: tuple[CoilFault | None, ...] = (None, *ELECTRICAL)
 PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
-"""The variants of a prediction, in order; None is a healthy bridge."""
+"""Index of each variant in a prediction; the variant None is a healthy bridge."""
 _SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)[:, None]
 _SHORTED_SLACK = 0.04
 _OUTLIERS = 0.15
-"""Fraction of the readings that a hypothesis need not explain, because the fault began in their window."""
+"""Fraction of the readings that a hypothesis may leave unexplained, because the fault began within them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Bounds of the error of a predicted reading.
+    """Error bounds of a predicted supply current.
 
     Attributes:
-        full_current: current of a coil that is fully on, A.
-        uncertainty: error bound of the current of each driven coil, A.
+        full_current: current (A) of each coil when it is fully on.
+        uncertainty: error bound (A) of the current of each driven coil.
         gain: relative error bound that is common to all readings.
-        noise: error bound of the current monitor, A.
+        noise: error bound (A) of the current monitor.
     """
 
     full_current: tuple[float, float, float]
@@ -115,12 +117,12 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """Error bounds of a reading of a chopped current that changes within the reading's window.
+    """Error bounds of a reading of a chopped current that changes within the reading's time window.
 
     Attributes:
-        scatter: error caused by chopping, as a fraction of the bridge's current or of its difference from the
-            full current, whichever is smaller. A bridge that is fully on is not chopped.
-        range_share: error of the mean, as a fraction of the range of the current within the window.
+        scatter: error due to chopping, as a fraction of the bridge's current or, if smaller, of the
+            difference from the full current. A current that is fully on is not chopped.
+        range_share: error of the mean, as a fraction of the current's range within the time window.
     """
 
     scatter: float
@@ -128,20 +130,22 @@ class Sampling:
 
 
 NEWEST = Sampling(0.2, 1.0)
-"""Error bounds of a single ADC sample at an unknown time in its window: 18 % (`hal.drivers.ina219`)."""
+"""Error bounds of one ADC sample at an unknown time in its window: 18 % by chopping (`hal.drivers.ina219`).
+"""
 MEAN = Sampling(0.02, 0.25)
 """Error bounds of the mean of five ADC samples.
 
-A further 7 %, common to all readings, are part of the gain error.
+An error of 7 % that is common to all readings is included in the gain error.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """A reading (A), and the predicted current (3, v) A of each axis for each of v variants.
+    """A reading (A) of the supply current, and the current (3, v), A, predicted for each axis and variant.
 
-    `mean` is the mean over the window, `slack` its error bound without chopping, and `chopped` the error
-    bound due to chopping. The current may exceed a `clipped` reading.
+    The prediction consists of the mean over the time window (`mean`), its error bound without chopping
+    (`slack`) and the error bound due to chopping (`chopped`). A reading that is `clipped` is a lower bound of
+    the current.
     """
 
     current: float
@@ -154,7 +158,7 @@ class Predicted:
 def predict(
     current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling, clipped: bool = False
 ) -> Predicted:
-    """Predict the current of each variant for the commands (k, 3) A within a reading's time window."""
+    """Predict the current of each variant for the commands (k, 3), A, in the time window of a reading."""
     full = np.array(bounds.full_current)[:, None]
     drawn = supply_currents(commands.T, full)
     count = len(commands)
@@ -165,10 +169,10 @@ def predict(
 
 
 def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
-    """Return the supply currents (n, v, k) A of n bridges for each of v variants and commands (n, k) A.
+    """Return the supply currents (n, v, k), A, of n bridges in v variants for the commands (n, k), A.
 
-    `full` (n, 1) is the current of a coil that is fully on, A. The result for a shorted coil is that for a
-    healthy coil.
+    `full` is the current (n, 1), A, of each coil when it is fully on. For a shorted coil, the result is the
+    current of a healthy coil.
     """
     forward, backward = np.maximum(commands, 0.0), np.maximum(-commands, 0.0)
     drawn = np.empty((len(commands), len(_VARIANTS), commands.shape[1]))
@@ -197,7 +201,7 @@ def fits(
     chops = np.array([one.chopped for one in evidence])
     mean, own, chopped, own_chopped = np.zeros((4, len(evidence)))
     slack: FloatArray = np.full(len(evidence), bounds.noise)
-    free = 0.0  # largest additional current (A) of axes in an unknown state
+    free = 0.0  # largest current (A) that axes in an unknown state may add
     for number, variant in enumerate(variants):
         if variant is CoilFault.UNCERTAIN or (variant is CoilFault.SHORTED and number != axis):
             free += bounds.full_current[number]
@@ -222,20 +226,23 @@ def fits(
 
 @cache
 def _scales(gain: float) -> FloatArray:
-    """Return nine gain factors (9, 1, 1) that cover the range of the gain error."""
+    """Return nine factors (9, 1, 1) that cover the range of the gain error."""
     return np.linspace(1.0 - gain, 1.0 + gain, 9)[:, None, None]
 
 
 _SAMPLES_NS = 25_000_000
 _NOTED_LATE_NS = 25_000_000
-"""A command is noted one cycle after it was written."""
+"""Delay (ns) from the writing of a command to its record, which is one cycle."""
 
 
 class CoilCommands:
-    """Commanded currents and braking, with their times; `braked` is which bridges are braked now."""
+    """A record of the commanded currents and the braking.
+
+    The attribute `braked` holds flags of the bridges that are braked now.
+    """
 
     def __init__(self, reach_ns: int) -> None:
-        """Store the commands of the last `reach_ns` (ns)."""
+        """Store commands for `reach_ns` ns."""
         self._reach_ns = reach_ns
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque()
         self._braked_ns = 0
@@ -247,11 +254,11 @@ class CoilCommands:
 
     @property
     def newest_ns(self) -> int:
-        """Time of the newest command."""
+        """The time (ns) of the newest command."""
         return self._commands[-1][0]
 
     def note(self, time_ns: int, currents: tuple[float, ...], braked: Axes) -> None:
-        """Record the currents (3,) A and the braking that are in force from `time_ns` on."""
+        """Record the currents (3,), A, and the braking in force from `time_ns` on."""
         if braked != self.braked:
             self._braked_ns, self.braked = time_ns, braked
         self._commands.append((time_ns, currents))
@@ -260,11 +267,11 @@ class CoilCommands:
             self._commands.popleft()
 
     def is_known_since(self, time_ns: int) -> bool:
-        """Return whether all commands since `time_ns` are known and had the present braking."""
+        """Return whether all commands since `time_ns` are recorded and the braking has not changed since."""
         return time_ns >= max(self._braked_ns, self._commands[0][0])
 
     def window(self, begin_ns: int, end_ns: int) -> FloatArray:
-        """Return the commands (k, 3) A that may have been in force between two times, evenly sampled."""
+        """Return the commands (k, 3), A, possibly in force between two times, in equal time steps."""
         later = iter(self._commands)
         _, currents = next(later)
         following = next(later, None)
@@ -276,9 +283,9 @@ class CoilCommands:
         return np.array(sampled)
 
     def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
-        """Return the newest ADC sample with the bounds of the current of healthy coils.
+        """Return the newest ADC sample, with the bounds of the current that healthy coils would draw.
 
-        `known` holds the known faults by axis.
+        `known` maps axes to their known faults.
         """
         sizes = np.abs(self.window(reading.newest_since_ns, reading.time_ns))
         free = [axis for axis, fault in known.items() if fault in {CoilFault.SHORTED, CoilFault.UNCERTAIN}]
@@ -301,26 +308,25 @@ class CoilCommands:
 
 @dataclass(frozen=True, slots=True)
 class ResponseSettings:
-    """The body's response to the coils, and the settings of the fit.
+    """Settings of the fit of the coil gains to the motion of the body.
 
     Attributes:
-        inertia: inertia (3, 3), kg m^2.
-        dipole_per_ampere: turns times area of each coil, m^2.
-        rate_noise: standard deviation of a sample of the rate about each axis, rad/s.
-        free: (3,) whether the body can rotate about each axis; on a thread only about y.
-        bin_samples: number of rate samples in a bin.
-        bins: number of bin differences in the fit.
-        model_error: acceleration error of a bin, rad/s^2, caused by the uncertain delay between command and
-            current.
+        inertia: inertia matrix (3, 3), kg m^2.
+        dipole_per_ampere: number of turns times the area of each coil, m^2.
+        rate_noise: standard deviation (rad/s) of a gyro sample about each axis.
+        free: flags (3,) of the axes about which the body can rotate; on a thread only y.
+        bin_samples: number of gyro samples in a bin.
+        bins: number of differences of neighbouring bins in the fit.
+        model_error: acceleration error (rad/s^2) of a bin due to the uncertain delay from command to current.
         torsion, damping: prior standard deviations of torsion (1/s^2) and damping (1/s) about each free axis.
-        errors: largest errors of inertia and gyro for a body that is free about three axes.
-        sure: standard deviation of a gain below which the gain is used.
-        persistence: number of fits in a row that must agree.
-        lowest_sound, highest_feeble, highest_reversed: bounds of the gain of a healthy coil, of a coil
-            without torque, and of a reversed coil.
-        memory_ns: time (ns) for which the residual accelerations are stored.
-        settle_ns: time (ns) after the coils are switched off until the magnetometer measures the Earth's
-            field alone; None if the field of the coils is small compared with the Earth's field.
+        errors: largest errors of inertia and gyro of a body that is free about three axes.
+        sure: standard deviation of a gain below which the gain is used for judgements.
+        persistence: number of consecutive fits that must agree.
+        lowest_sound, highest_feeble, highest_reversed: gain limits for a healthy coil (minimum), a coil
+            without torque (maximum) and a reversed coil (maximum).
+        memory_ns: time (ns) for which residual accelerations are stored.
+        settle_ns: time (ns) from switching the coils off until their field at the magnetometer has decayed,
+            or None if their field is small compared with the Earth's.
     """
 
     inertia: FloatArray
@@ -344,23 +350,26 @@ class ResponseSettings:
 
 _STALE_NS = 200_000_000
 _REACH_NS = 3_000_000_000
-"""Time (ns) for which commands are stored. After a stall of the loop, samples arrive late and in a burst."""
+"""Time (ns) for which commands are stored.
+
+The time is long, because samples arrive late and in a burst after a stall of the loop.
+"""
 _LEAST_CHANGE = 4.0e-3
-"""Smallest change of the angular acceleration that can be detected, rad/s^2."""
+"""Smallest detectable change of the angular acceleration, rad/s^2."""
 LARGEST_GAIN = 1.5
-"""Largest absolute gain that is physically possible for the configured body."""
+"""Largest absolute gain of a coil that is physically possible."""
 _GAIN_PRIOR = 10.0
 _WEAK_GAIN, _SIGMAS = 0.7, 2.5
-"""Upper bound of a weak coil's gain, and number of standard deviations by which the gain must be lower."""
+"""Upper limit of a weak coil's gain, and number of standard deviations that must lie below the limit."""
 
 
 class CoilResponse:
-    """Fit of the three coil gains over a sliding window.
+    """Estimates the torque gains of the three coils over a sliding window.
 
     Attributes:
-        gain, sigma: gains (3,) of the newest fit and their standard deviations (3,), infinite before the
+        gain, sigma: gains (3,) of the newest fit, and their standard deviations (3,), infinite before the
             first fit.
-        fastest: largest body rate within the window of the newest fit, rad/s.
+        fastest: largest body rate (rad/s) within the window of the newest fit.
     """
 
     def __init__(self, settings: ResponseSettings) -> None:
@@ -369,13 +378,13 @@ class CoilResponse:
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)[:, None]
         count = len(self._free)
-        # Gyroscopic acceleration (3, 6) per product of rates, and its changes (k, 3, 6) by the k error modes.
+        # Gyroscopic acceleration (3, 6) per product of rates, and its changes (k, 3, 6) by k error modes.
         self._gyroscopic: FloatArray = np.zeros((3, 6))
         self._modes: FloatArray = np.zeros((0, 3, 6))
         if count == 3:
             self._gyroscopic = gyroscopic_coefficients(settings.inertia)
             self._modes = coefficient_modes(settings.inertia, settings.errors)
-        # Parameters: three gains, a torsion and a damping of each free axis, and a weight of each mode.
+        # Fit parameters: three gains, torsion and damping of each free axis, and a weight of each error mode.
         spreads = [_GAIN_PRIOR] * 3 + [settings.torsion] * count + [settings.damping] * count
         spreads += [1.0] * len(self._modes)
         self._prior: FloatArray = np.diag(1.0 / np.array(spreads) ** 2)
@@ -390,20 +399,21 @@ class CoilResponse:
     def reset(self) -> None:
         """Discard all samples."""
         self._asked: FloatArray = np.zeros((3, 3))
-        # Time and time since the sample before, s; rate and field (3,); currents (3,).
+        # Samples: time (ns), time since the previous sample (s), rate (3,), field (3,) and currents (3,).
         self._samples: list[tuple[int, float, FloatArray, FloatArray, tuple[float, ...]]] = []
         self._previous: tuple[float, FloatArray, FloatArray, FloatArray] | None = None
         self._turned: FloatArray = np.zeros(3)
-        self._spun: FloatArray = np.zeros(6)  # rad^2/s, the integrals of the rate products
+        self._spun: FloatArray = np.zeros(6)  # integrals of the rate products, rad^2/s
         self._quiet_field: FloatArray | None = None
-        # One row (f, 6 + k) for each bin and its f free axes: three accelerations by the coils, the observed
-        # acceleration, mean rate, angle, and accelerations by the k modes.
+        # Each bin has a row (f, 6 + k) for its f free axes.
+        # The first columns are three coil accelerations and the observed acceleration.
+        # The other columns are mean rate, angle, and the accelerations by the k error modes.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
         self.fastest = 0.0
-        self._weights: FloatArray = np.zeros(len(self._modes))  # of the modes, in the newest fit
-        # Time; commanded accelerations of each coil and those per ampere (3, 3); residual (3,); the modes'
-        # accelerations (3, k).
+        self._weights: FloatArray = np.zeros(len(self._modes))  # weights of the error modes, newest fit
+        # Each bin has a residual, with its time (ns) and the commanded acceleration of each coil (3, 3).
+        # The acceleration per ampere (3, 3), the residual (3,) and the error modes' (3, k) follow.
         self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]] = deque()
         self._wrong_for = [0, 0, 0]
         self._sound_for = [0, 0, 0]
@@ -411,7 +421,7 @@ class CoilResponse:
         self.sigma = np.full(3, np.inf)
 
     def commanded(self, time_ns: int, currents: tuple[float, ...]) -> None:
-        """Record the currents (3,) A in force from `time_ns` on."""
+        """Record the currents (3,), A, in force from `time_ns` on."""
         if currents == self._commands[-1][1]:
             return
         self._commands.append((time_ns, currents))
@@ -419,12 +429,12 @@ class CoilResponse:
             self._commands.popleft()
 
     def interrupted(self, until_ns: int) -> None:
-        """Ignore samples up to `until_ns`: the coil currents of that time are unknown."""
+        """Ignore samples up to `until_ns`, because the coil currents of that time are unknown."""
         self._known_ns = until_ns
         self.reset()
 
     def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> bool:
-        """Add a sample of rate (3,) rad/s and magnetic field (3,) T; return whether a new fit was made."""
+        """Add a sample of rate (3,), rad/s, and field (3,), T, and return whether a new fit was made."""
         if time_ns < self._known_ns:
             return False
         since_ns = time_ns - self._last_ns
@@ -443,7 +453,7 @@ class CoilResponse:
     def _field_without_coils(
         self, time_ns: int, span: float, rate: FloatArray, field: FloatArray
     ) -> FloatArray | None:
-        """Return the Earth's field of the present or last pause, rotated with the body.
+        """Return the field measured in the present or last pause, rotated with the body.
 
         None before a pause.
         """
@@ -464,7 +474,7 @@ class CoilResponse:
         return self._commands[0][1]
 
     def reversed_axes(self) -> list[int]:
-        """Return the axes whose gain was reversed in the last `persistence` fits."""
+        """Return the axes whose gain was that of a reversed coil in the last `persistence` fits."""
         return [axis for axis in range(3) if self._wrong_for[axis] >= self._settings.persistence]
 
     def feeble_axes(self) -> list[int]:
@@ -472,15 +482,15 @@ class CoilResponse:
         return [axis for axis in range(3) if self._feeble_for[axis] >= self._settings.persistence]
 
     def is_healthy(self, axis: int) -> bool:
-        """Return whether the gain of an axis was healthy in the last `persistence` fits."""
+        """Return whether an axis had the gain of a healthy coil in the last `persistence` fits."""
         return self._sound_for[axis] >= self._settings.persistence
 
     def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
-        """Return the observed fraction of a change of torque.
+        """Return the observed fraction of a hypothetical change of torque.
 
-        The assumed change is that the coil carries `constant` A instead of its command. The residuals before
-        `since_ns` are compared with the residuals after `settled_ns`. The result is None if the change is too
-        small to be observed, and NaN if there are too few residuals.
+        The hypothesis is that the coil carries `constant` A instead of its command. The residuals before
+        `since_ns` are compared with those after `settled_ns`. The result is None if the change is too small
+        to be observed, and NaN if there are too few residuals.
         """
         before = [row[3] - row[4] @ self._weights for row in self._remainders if row[0] < since_ns]
         after = [row for row in self._remainders if row[0] >= settled_ns]
@@ -502,7 +512,7 @@ class CoilResponse:
         times, spans, rates, fields, currents = zip(*self._samples, strict=True)
         self._samples.clear()
         count = len(times)
-        # Row a: acceleration per ampere in coil a alone, J^-1 (n e_a x B).
+        # Row a holds the acceleration per ampere of coil a: J^-1 (n e_a x B).
         per_ampere = cross_matrices(np.array(fields)) @ self._per_field
         steps = np.array(currents)[:, :, None] * per_ampere * np.array(spans)[:, None, None]
         steps[0] += self._asked
@@ -541,7 +551,7 @@ class CoilResponse:
 
     def _fit(self, span: float) -> None:
         rows = np.array(self._rows)
-        # Subtracting the means removes a constant disturbance about each free axis.
+        # Subtracting the mean removes a constant disturbance about each free axis.
         rows -= rows.sum(axis=0) / len(rows)
         count = len(self._free)
         inputs = np.zeros((len(rows), count, len(self._prior)))
@@ -562,7 +572,7 @@ class CoilResponse:
         self.sigma = np.sqrt(spread * covariance.diagonal()[:3])
         self.fastest = max(self._speeds)
         self._weights = found[3 + 2 * count :]
-        # The model is wrong if a gain is impossible by more than its uncertainty.
+        # If a gain is impossible even within its uncertainty, the model is wrong.
         possible = bool((np.abs(self.gain) - 3.0 * self.sigma < LARGEST_GAIN).all())
         pairs = zip(self.gain.tolist(), self.sigma.tolist(), strict=True)
         for number, (gain, sigma) in enumerate(pairs):
@@ -577,39 +587,39 @@ class CoilResponse:
 
 
 _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
-"""Direction in which a leg stuck high drives its coil continuously."""
+"""Sign of the continuous current through a coil whose leg is stuck high."""
 _LITTLE_RESPONSE = 0.4
 _DOUBTED_FOR_NS = 60_000_000_000
-"""Time (ns) after a false verdict during which the monitor is ignored if the motion is inconclusive."""
+"""Time (ns) after a refuted verdict for which further verdicts are rejected if the motion is inconclusive."""
 
 
 class MotionWitness:
-    """Compares verdicts with the torque observed in the body's motion.
+    """Checks verdicts from the supply current against the torque observed in the body's motion.
 
     Attributes:
-        doubt: why the current monitor is assumed to be wrong; empty while the monitor is trusted.
+        doubt: the reason why the current monitor is considered wrong; empty while it is trusted.
     """
 
     def __init__(self, response: CoilResponse | None, full_current: tuple[float, float, float]) -> None:
-        """`full_current` is the current (3,) A of each coil when it is fully on."""
+        """`full_current` is the current (3,), A, of each coil when it is fully on."""
         self._response = response
         self._full_current = full_current
         self._doubted_ns = -_DOUBTED_FOR_NS
         self.doubt = ""
 
     def trust_monitor(self) -> None:
-        """Trust the current monitor again, because its readings are consistent with a healthy circuit."""
+        """Trust the current monitor again, because its readings are consistent with healthy coils."""
         self.doubt = ""
 
     def doubt_monitor(self, why: str, now_ns: int) -> None:
-        """Assume from now on that the current monitor is wrong."""
+        """Consider the current monitor wrong from now on."""
         self.doubt, self._doubted_ns = why, now_ns
 
     def contradicts(self, axis: int, fault: CoilFault, begun_ns: int, suspected_ns: int, now_ns: int) -> bool:
-        """Return whether the coil's torque is unchanged, so that the monitor is wrong.
+        """Return whether the coil's torque has not changed, so that the current monitor must be wrong.
 
         The coil last drew the expected current at `begun_ns`, so that the fault began later. The fault was
-        suspected at `suspected_ns`; the newest reading was made at `now_ns`.
+        suspected at `suspected_ns`, and the newest reading was made at `now_ns`.
         """
         if self._response is None:
             return False
@@ -620,6 +630,6 @@ class MotionWitness:
         if observed is None:
             return fault not in _DRIVEN and self._response.is_healthy(axis)
         if math.isnan(observed):
-            # No data from before the fault; a coil driven at zero command would show its torque by now.
+            # Without data from before the fault, judge by the present torque of the coil.
             return fault in _DRIVEN or self._response.is_healthy(axis)
         return observed < _LITTLE_RESPONSE

@@ -1,10 +1,10 @@
-"""Commanding: executes and answers commands that arrive on channels or are due on the time line.
+"""Commanding: executes and answers the commands that arrive on channels or are due on the time line.
 
-The dispatcher is one of the named containment boundaries: no command can end the loop.
+The dispatcher is one of the named containment boundaries: no command can end the control loop.
 
-A command replaces the table of parameters as a whole; the new table is stored for the next boots. Before a
-table takes effect, its values are checked against their ranges and against the bounds of the schema. If a
-flight ends uncleanly within `PROVEN_NS` after a load, the next boot uses the previous table
+A command replaces the whole table of onboard parameters, and the new table is stored for later boots. Before
+a table takes effect, its values are checked against their ranges and against the bounds of the configuration.
+If a flight ends uncleanly within `PROVEN_NS` after a table was loaded, the next boot uses the previous table
 (`flight.loop.state`).
 """
 
@@ -53,11 +53,11 @@ from flight.schema.sections import CommandStep, Config, Health, Modes
 S = TypeVar("S", Modes, Health)
 
 PROVEN_NS = 60_000_000_000
-"""Flight time (ns) after which a loaded table is kept even if the flight ends uncleanly."""
+"""Flight time (ns) after which a loaded table is considered proven, and survives an unclean end."""
 
 
 class OnboardParameters:
-    """The table of parameters in force."""
+    """The table of onboard parameters in force."""
 
     def __init__(
         self,
@@ -67,9 +67,9 @@ class OnboardParameters:
         keeper: StateKeeper | None,
         services: Services,
     ) -> None:
-        """Start with the values of the configuration, or with the table that the `keeper` has stored.
+        """Start with the configured values, or with the table that the `keeper` has stored.
 
-        `adopt_modes` and `adopt_health` replace the limits of the tasks that use them.
+        The functions `adopt_modes` and `adopt_health` give new limits to the tasks that use them.
         """
         self._config = config
         self._adopt_modes, self._adopt_health = adopt_modes, adopt_health
@@ -82,14 +82,13 @@ class OnboardParameters:
         self._loaded_ns = 0
 
     def begin(self, now_ns: int) -> None:
-        """Apply the stored table if this software version and configuration accept it.
+        """Apply the stored table if it is valid for this software version and configuration.
 
         Record the active table.
         """
         self._loaded_ns = now_ns
         if kept := self._table.values:
-            # Another version of the software may have added or removed keys: missing keys take the value of
-            # the configuration.
+            # Keys that the stored table lacks, because another version wrote it, get their configured values.
             table = {key: kept.get(key, value) for key, value in self._configured.items()}
             if problem := problem_of(table) or self._adopt(table):
                 self._table = msgspec.structs.replace(self._table, values={}, proven=True)
@@ -97,17 +96,17 @@ class OnboardParameters:
         self.dump(now_ns)
 
     def run(self, now_ns: int) -> None:
-        """Mark a table that has been in use for `PROVEN_NS` as proven."""
+        """Mark a table as proven when it has been in use for `PROVEN_NS`."""
         if not self._table.proven and now_ns - self._loaded_ns >= PROVEN_NS:
             self._keep(msgspec.structs.replace(self._table, proven=True))
 
     def load(self, values: Mapping[str, float], replaced: int, now_ns: int) -> str:
-        """Replace the table whose CRC is `replaced`.
+        """Load a new table instead of the table whose CRC is `replaced`.
 
-        Return why the new table is refused, or an empty text.
+        Return why the new table is rejected, or an empty text.
         """
         if replaced != self._crc:
-            return f"the table that flies is {self._crc:08x}, not {replaced:08x}: dump it and look again"
+            return f"the table in force is {self._crc:08x}, not {replaced:08x}: dump it and check again"
         before = self._table.values if self._table.proven else self._table.before
         if problem := problem_of(values) or self._adopt(values):
             return problem
@@ -119,7 +118,7 @@ class OnboardParameters:
         return ""
 
     def dump(self, now_ns: int) -> None:
-        """Record the active table as a packet."""
+        """Record the table in force as a packet."""
         named = {
             field.name: self._values[key] for field, key in zip(PARAMETER_FIELDS, PARAMETER_KEYS, strict=True)
         }
@@ -141,7 +140,7 @@ class OnboardParameters:
             self._keeper.note_table(table)
 
     def _adopt(self, values: Mapping[str, float]) -> str:
-        """Pass a table to all tasks that use it; return why the schema refuses it, or an empty text."""
+        """Pass a table to all tasks that use it; return why the schema rejects it, or an empty text."""
         try:
             modes = _section(self._config.modes, "modes", values)
             health = _section(self._config.health, "health", values)
@@ -160,7 +159,7 @@ def _value(config: Config, key: str) -> Any:
 
 
 def _section(section: S, name: str, values: Mapping[str, float]) -> S:
-    """Return a section of the configuration with the values of a table.
+    """Return a configuration section in which the values of a table replace those of the configuration.
 
     Raises ValidationError for invalid values.
     """
@@ -172,7 +171,7 @@ _REMEMBERED = 64
 
 
 class CommandTask:
-    """The task of the commands' rate group."""
+    """Task of the command rate group: executes commands and sends the answers."""
 
     def __init__(
         self,
@@ -200,7 +199,7 @@ class CommandTask:
         self._parameters.begin(now_ns)
 
     def run(self, cycle: Cycle) -> None:
-        """Execute the commands that are due or have arrived."""
+        """Execute the commands that have arrived or are due on the time line."""
         now_ns = cycle.start_ns
         self._parameters.run(now_ns)
         while self._timeline and self._timeline[0].at <= (now_ns - self._recorder.epoch_ns) * 1e-9:
@@ -223,13 +222,13 @@ class CommandTask:
     def _execute(self, source: str, data: bytes, now_ns: int) -> tuple[dict[str, Any], bool]:
         """Execute a datagram.
 
-        Return the fields of the answer, and whether the datagram is a command packet.
+        Return the fields of the answer, and whether the datagram is a well-formed command packet.
         """
         command: Command | None = None
         problem = ""
         well_formed = True
         if data in self._received:
-            problem = "the very same packet has come before"
+            problem = "an identical packet was received before"
         else:
             try:
                 command = unpack(data)
@@ -240,7 +239,7 @@ class CommandTask:
         return self._conclude(source, command, problem, now_ns), well_formed
 
     def _conclude(self, source: str, command: Command | None, problem: str, now_ns: int) -> dict[str, Any]:
-        """Execute a command unless a `problem` was found; report and record the result."""
+        """Execute a command if no `problem` was found before, then report and record the result."""
         self._count += 1
         if command is not None and not problem:
             try:
@@ -264,7 +263,7 @@ class CommandTask:
         return fields
 
     def _obey(self, command: Command, now_ns: int) -> str:
-        """Execute a command; return why it is refused, or an empty text."""
+        """Execute a command, and return why it is rejected, or an empty text."""
         problem = ""
         match command:
             case Ping():
@@ -293,7 +292,10 @@ class CommandTask:
 
 
 def command_of(step: CommandStep) -> Command:
-    """Return the command of a time line step. Raises CommandError unless the step has exactly one command."""
+    """Return the command of a step of the time line.
+
+    Raises CommandError unless the step contains exactly one command.
+    """
     found: list[Command] = []
     if step.mode is not None:
         found.append(ChangeMode(Mode.named(step.mode)))

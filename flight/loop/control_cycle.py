@@ -28,14 +28,14 @@ from knightcube.gnc.estimation.estimate import ATTITUDE as ATTITUDE_ERROR
 from knightcube.gnc.estimation.estimate import RATE, Estimate
 
 ATTITUDE_EVERY = 4
-"""Number of control cycles between attitude packets."""
+"""Number of control cycles from one attitude packet to the next."""
 _NAN3 = np.full(3, np.nan)
 _NAN4 = np.full(4, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
 class LoopTasks:
-    """The tasks of the loop, in the order of the data flow.
+    """The tasks of the loop, in the order in which data flow through them.
 
     A task is None if the configuration has no device or command channel for it.
     """
@@ -56,14 +56,15 @@ class LoopTasks:
 
 @dataclass(slots=True, eq=False)
 class _CycleRecord:
-    """The inputs and results of one cycle, filled in step by step.
+    """Inputs and results of a control cycle, filled in step by step.
 
     Attributes:
-        coils: the coil command that the PWM chip holds at the start of the cycle.
+        coils: coil command that the PWM chip holds at the start of the cycle.
         validity: whether the coil currents are known.
         readings: readings of the inertial unit since the last cycle, oldest first.
-        estimate: present estimate, from measurements or propagated by the model; None without an estimate.
-        measured: the estimate, if it may be used for steering.
+        estimate: present state estimate, measured or propagated by the model, or None before the filter
+            starts.
+        measured: the state estimate if it is recent enough for steering, otherwise None.
     """
 
     cycle: Cycle
@@ -76,7 +77,7 @@ class _CycleRecord:
 
     @property
     def now_ns(self) -> int:
-        """Time (ns) at which the cycle started."""
+        """Start time (ns) of the cycle."""
         return self.cycle.start_ns
 
 
@@ -106,9 +107,9 @@ class ControlCycle:
         return self._publish(record, steered)
 
     def _sample(self, cycle: Cycle) -> _CycleRecord:
-        """Read the coil command in force and the inertial unit, and pass both to navigation."""
+        """Read the inertial unit and the coil command in force, and pass both to navigation."""
         tasks, now_ns = self._tasks, cycle.start_ns
-        # The last command may have reached the PWM chip late, because the thread of the coil driver sends it.
+        # The coil driver's thread may have sent the last command late.
         coils = tasks.drive.state()
         validity = self._knowledge.look(coils, now_ns, suspected=tasks.drive.is_suspect)
         tasks.navigation.commanded(coils, validity)
@@ -118,18 +119,18 @@ class ControlCycle:
         return _CycleRecord(cycle, coils, validity, readings)
 
     def _estimate(self, record: _CycleRecord) -> None:
-        """Propagate the estimate to now."""
+        """Propagate the state estimate to the present."""
         record.estimate = self._tasks.navigation.estimate(record.now_ns)
 
     def _check(self, record: _CycleRecord) -> None:
-        """Compare the coils with supply current and motion, and check the star camera."""
+        """Check the coils by supply current and motion, and check the star camera."""
         known = record.validity.since_last_look
         self._tasks.drive.look(record.coils, record.readings, record.now_ns, known=known)
         if self._tasks.imaging is not None:
             self._tasks.imaging.serve(record.now_ns)
 
     def _decide(self, record: _CycleRecord) -> None:
-        """Set mode and target; request a path for a new target, or when the estimate is available again."""
+        """Determine mode and target, and request a path for a new target or a new estimate."""
         tasks, control, now_ns, estimate = self._tasks, self._body.control, record.now_ns, record.estimate
         overdue = None
         if estimate is not None and self._target is not None:
@@ -152,7 +153,7 @@ class ControlCycle:
         self._was_measured = measured
 
     def _accept_results(self, record: _CycleRecord) -> None:
-        """Pass the workers' results to their tasks; results from camera frames change the estimate."""
+        """Pass the workers' results to their tasks, and update the estimate if cameras changed it."""
         tasks, now_ns = self._tasks, record.now_ns
         for result in self._jobs.collect():
             tasks.observer.job(result, now_ns)
@@ -167,7 +168,7 @@ class ControlCycle:
         record.measured = record.estimate if self._was_measured else None
 
     def _steer(self, record: _CycleRecord) -> Steered:
-        """Use the coils as the mode requires."""
+        """Use the coils as the mode requires, and return the result."""
         steering, modes, now_ns = self._tasks.steering, self._tasks.modes, record.now_ns
         if record.mode in STEERING:
             return steering.run(record.measured, now_ns, self._ever_started)
@@ -179,7 +180,7 @@ class ControlCycle:
         return steering.rest(now_ns)
 
     def _publish(self, record: _CycleRecord, steered: Steered) -> ControlOutput:
-        """Submit the requested plan, and record the cycle."""
+        """Submit a requested plan to the planner worker, and record the cycle."""
         mode, estimate, target, now_ns = record.mode, record.estimate, self._target, record.now_ns
         output = ControlOutput(record.cycle, mode, estimate, target, steered, self._tasks.drive.state())
         if mode in STEERING and target is not None:

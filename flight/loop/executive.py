@@ -1,18 +1,19 @@
-"""The executive runs rate groups on an injected clock; job runners run jobs outside its thread.
+"""The executive, which runs rate groups on a given clock, and job runners, which run jobs outside its thread.
 
-Each rate group has a fixed grid of time slots. Rate groups run in order of their due times, one at a time. A
-slot that is less than half a period late is run; a later slot is skipped and counted. Two cycles of a group
-are therefore never closer than half a period, and there is no burst of catch-up cycles. The number of slots
-run and skipped always equals the number of slots elapsed.
+Each rate group has a fixed grid of time slots. The executive runs the groups one at a time, in the order in
+which they are due. A slot is run if it starts less than half a period late; otherwise it is skipped and
+counted. Two cycles of a group are therefore never closer than half a period, and missed cycles are not made
+up in a burst. The number of slots that were run or skipped always equals the number of slots elapsed.
 
-Groups are given in order of importance. Of several groups that are due at the same time, the first one runs
-first. The executive's task runner is one of the named containment boundaries: an exception of a task is
-reported, and the loop continues.
+Rate groups are listed in order of importance. If several groups are due at the same time, the most important
+one runs first. The executive's task runner is one of the named containment boundaries: an exception in a task
+is reported, and the loop continues.
 
-The control thread submits a job and later collects the finished result; it never waits. In lock-step
-simulation `LockStepRunner` runs the job at once, in `submit`, and delivers the result after the worker's
-modelled latency of simulated time, so that the result of a flight does not depend on the speed of the
-machine. In real time `flight.loop.worker_processes.ProcessRunner` runs jobs in processes.
+The control thread submits a job and later collects its result; it never waits for a job. In a lock-step
+simulation, `LockStepRunner` runs a job at once when it is submitted, and delivers its result after the
+modelled latency in simulated time, so that the result of a flight does not depend on the speed of the
+machine. In a real-time flight, `flight.loop.worker_processes.ProcessRunner` runs jobs in processes of their
+own.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ Outcome = Literal["done", "failed", "timed-out", "died"]
 
 @dataclass(frozen=True, slots=True)
 class Worker:
-    """One kind of job: a function of one argument at the top level of a module.
+    """A worker, which runs one kind of job: a function of one argument at the top level of a module.
 
     Attributes:
-        name: short name for telemetry.
-        function: function that runs in a process of its own in real time. Its argument must be picklable. Its
-            result must consist of plain values, arrays of numbers, and dataclasses and enumerations of
-            modules that the control process has imported.
-        latency_ns: delay (ns) of a result in lock-step simulation.
-        timeout_ns: longest execution time (ns) of a job in real time; a job that runs longer is killed.
+        name: short name of the worker for telemetry.
+        function: the function, which in real time runs in a process of its own. The argument of this function
+            must be picklable. The result must consist of plain values, arrays of numbers, and dataclasses and
+            enumerations from modules that the control process has imported.
+        latency_ns: time (ns) from a job's submission to its result in a lock-step simulation.
+        timeout_ns: longest execution time (ns) of a job in real time, after which the job is killed.
     """
 
     name: str
@@ -50,7 +51,7 @@ class Worker:
 
 @dataclass(frozen=True, slots=True)
 class JobResult:
-    """The outcome of a job. `value` is the function's result when the outcome is "done"."""
+    """The outcome of a job. The attribute `value` is the function's result if the outcome is "done"."""
 
     worker: str
     outcome: Outcome
@@ -71,7 +72,7 @@ class WorkerChange(Enum):
 
 @dataclass(frozen=True, slots=True)
 class WorkerNews:
-    """A change of a worker, and its circumstances."""
+    """A change of a worker, with a text about its circumstances."""
 
     worker: str
     change: WorkerChange
@@ -79,30 +80,30 @@ class WorkerNews:
 
 
 class JobRunner(Protocol):
-    """Runs the jobs of several workers, at most one at a time for each."""
+    """Runs the jobs of several workers, at most one job at a time for each worker."""
 
     def submit(self, worker: str, argument: Any) -> bool:
-        """Submit a job; return False when that worker is busy or not running. Never waits."""
+        """Submit a job, and return False if the worker is busy or not running. Never waits."""
 
     def collect(self) -> list[JobResult]:
-        """Return the results that have arrived. Never waits."""
+        """Return the results that have arrived since the last call. Never waits."""
 
     def news(self) -> list[WorkerNews]:
-        """Return the changes of the workers since the last call. Never waits."""
+        """Return the changes of workers since the last call. Never waits."""
 
     @property
     def borrowed_ns(self) -> int:
-        """Time spent on jobs in the calling thread; zero for jobs in processes of their own."""
+        """Time (ns) spent on jobs in the calling thread; zero if jobs run in processes of their own."""
 
     def close(self) -> None:
         """Stop the workers. Safe to call twice."""
 
 
 class LockStepRunner:
-    """A JobRunner on simulated time.
+    """Runs jobs in simulated time; implements JobRunner.
 
     Attributes:
-        borrowed_ns: time spent on jobs in the calling thread.
+        borrowed_ns: time (ns) spent on jobs in the calling thread.
     """
 
     def __init__(self, clock: Clock, workers: Sequence[Worker]) -> None:
@@ -112,7 +113,7 @@ class LockStepRunner:
         self.borrowed_ns = 0
 
     def submit(self, worker: str, argument: Any) -> bool:
-        """Run the job and keep its result until its latency has passed."""
+        """Run a job at once, and keep its result until the modelled latency has passed."""
         if worker in self._pending:
             return False
         spec = self._workers[worker]
@@ -150,7 +151,7 @@ class LockStepRunner:
 
 @dataclass(frozen=True, slots=True)
 class Cycle:
-    """One cycle of a rate group: number of its slot, time at which it was due, and time of its start (ns)."""
+    """A cycle of a rate group: slot number, time (ns) at which it was due, and start time (ns)."""
 
     slot: int
     due_ns: int
@@ -179,7 +180,7 @@ class RateGroup:
         self._epoch_ns = 0
 
     def begin(self, epoch_ns: int) -> None:
-        """Start the grid, whose slot 0 is due at the epoch."""
+        """Start the grid of slots, of which slot 0 is due at `epoch_ns`."""
         self._epoch_ns = epoch_ns
         self._slot = 0
 
@@ -194,7 +195,7 @@ class RateGroup:
         return self.total_execution_ns / self.cycles if self.cycles else 0.0
 
     def claim(self, now_ns: int) -> tuple[Cycle | None, int]:
-        """Return the cycle to run now, None if no slot is due, and the number of newly skipped slots."""
+        """Return the cycle to run now, or None if no slot is due, and the number of newly skipped slots."""
         late_ns = now_ns - self.due_ns
         if late_ns < 0:
             return None, 0
@@ -210,7 +211,7 @@ class RateGroup:
         return cycle, skipped
 
     def account(self, execution_ns: int, completed: bool = True) -> bool:
-        """Count a cycle, its execution time and whether its task completed; return whether it overran."""
+        """Record the execution time of a cycle and whether its task completed; return whether it overran."""
         self.cycles += 1
         self.completed += completed
         self.total_execution_ns += execution_ns
@@ -221,20 +222,20 @@ class RateGroup:
 
 
 class Observer(Protocol):
-    """Receives the executive's reports; its methods must be quick and must not raise."""
+    """Receives the executive's reports; its methods must be quick and must not raise exceptions."""
 
     def ran(self, group: RateGroup, cycle: Cycle, execution_ns: int) -> None:
-        """Report a cycle that ended."""
+        """Accept the report of a cycle that has ended."""
 
     def slipped(self, group: RateGroup, slots: int) -> None:
-        """Report slots that were skipped."""
+        """Accept the report of skipped slots."""
 
     def failed(self, group: RateGroup, error: Exception) -> None:
-        """Report that a task raised an exception, and bring the devices to a safe state."""
+        """Accept the report of a task that raised an exception, and bring the devices into a safe state."""
 
 
 class CyclicExecutive:
-    """Runs rate groups; `stopwatch` measures their execution times, for telemetry only."""
+    """Runs rate groups; `stopwatch` is a clock (ns) for their execution times, used in telemetry only."""
 
     def __init__(
         self,
@@ -250,11 +251,11 @@ class CyclicExecutive:
         self._stop = False
 
     def stop(self) -> None:
-        """Let the running cycle end, then return from `run`. A signal handler may call this method."""
+        """Let the running cycle end, and then return from `run`. A signal handler may call this method."""
         self._stop = True
 
     def run(self, epoch_ns: int, until_ns: int) -> None:
-        """Run every group on the grid that starts at `epoch_ns`, up to but excluding `until_ns`."""
+        """Run all rate groups on the grid that starts at `epoch_ns`, until `until_ns`."""
         for group in self._groups:
             group.begin(epoch_ns)
         while not self._stop:

@@ -1,15 +1,15 @@
-"""Events, facts and streams, by which the loop detects and reports faults; and the shared services.
+"""Events, facts and streams, by which the loop detects and reports faults, and its shared services.
 
-Events are written to the flight log, throttled by kind, and trigger their reactions. The first event of a
-kind is written at once, and then at most one every `THROTTLE_NS`, together with the number of events held
-back. A fault at 40 Hz therefore writes one event every few seconds.
+Events are written to the flight log and trigger their reactions. The first event of a kind is written at
+once. After that, at most one event of this kind is written in each `THROTTLE_NS`, together with the number of
+events held back. A fault in every 40 Hz cycle therefore writes only one event every few seconds.
 
-A fact is a condition that monitors update. As in NASA's Limit Checker, a fact counts after N violations in a
-row; an unknown state (None) does not change the count. A latching fact stays active until it is cleared by
-command. The count is reset in a mode in which the fact is not watched.
+A fact is a condition whose state is updated by monitors. As in NASA's Limit Checker, a fact becomes active
+after N violations in a row; an unknown state (None) leaves the count unchanged. A latching fact stays active
+until a command clears it. The count of a fact is reset in modes in which the fact is not watched.
 
-A stream is one kind of reading, with its nominal rate, age limit and valid range. As in openpilot's
-SubMaster, liveness, rate and validity are checked separately, so that a stale value is not used even if it is
+A stream is a series of readings of one kind, with nominal rate, age limit and valid range. As in openpilot's
+SubMaster, age, rate and range are checked separately, so that a stale value is not used even if it is
 plausible.
 """
 
@@ -32,14 +32,17 @@ from knightcube.errors import FlightError
 THROTTLE_NS = 5_000_000_000
 
 Sink = Callable[[EventKind, int, int, str], None]
-"""Writes an event; arguments: kind, time in ns, number of events of the kind held back before, text."""
+"""Function that writes an event; its arguments are kind, time (ns), number of events held back, and text."""
 
 Reactor = Callable[[EventKind, int, str], None]
-"""Carries out the reaction of an event: kind, time in ns, text."""
+"""Function that carries out the reaction of an event, given its kind, time (ns) and text."""
 
 
 class EventLog:
-    """Passes events to a sink, throttled by kind; `count` and `counts`, by kind, include those held back."""
+    """Passes events to a sink, and limits the number of written events of each kind.
+
+    The attributes `count` and `counts` include the events that were held back.
+    """
 
     def __init__(self, sink: Sink, throttle_ns: int = THROTTLE_NS) -> None:
         self._sink = sink
@@ -51,11 +54,11 @@ class EventLog:
         self.counts: Counter[EventKind] = Counter()
 
     def react_by(self, react: Reactor) -> None:
-        """Call `react` for every event whose reaction is more than a record, even if it is held back."""
+        """Call `react` for every event with a reaction other than a record, even if it is held back."""
         self._react = react
 
     def report(self, kind: EventKind, time_ns: int, text: str) -> None:
-        """Write an event, or only count it if the throttle holds it back; then carry out its reaction."""
+        """Write an event or, if it is held back, only count it; then carry out its reaction."""
         self.count += 1
         self.counts[kind] += 1
         last_ns = self._last_written.get(kind.code)
@@ -68,7 +71,7 @@ class EventLog:
             self._react(kind, time_ns, text)
 
     def flush(self, time_ns: int) -> None:
-        """Write the events that are still held back, at the end."""
+        """Write the events that are still held back at the end of the flight."""
         by_code = {kind.code: kind for kind in EVENTS}
         for code, held_back in list(self._held_back.items()):
             self._sink(by_code[code], time_ns, held_back - 1, "the last one held back by the throttle")
@@ -81,15 +84,15 @@ _DRIVEN = STEERING | {Mode.DETUMBLE}
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A row of the fact table: persistence of a fact, and the events that report its begin and end.
+    """A row of the fact table: the events that report begin and end of a fact, and the conditions for them.
 
-    Facts that the 40 Hz cycle updates count cycles; other facts count runs of the health task.
+    Facts that the 40 Hz control cycle updates are counted in cycles, other facts in runs of the health task.
 
     Attributes:
-        after: number of updates in a row with the condition true that make the fact active.
-        mended_after: number of updates in a row with the condition false that end the fact.
-        latching: whether the fact ends only when it is cleared by command.
-        modes: modes in which the fact is watched.
+        after: number of consecutive updates with a true condition that make the fact active.
+        mended_after: number of consecutive updates with a false condition that make the fact inactive.
+        latching: whether only a command can make the fact inactive.
+        modes: modes in which the fact is watched; in other modes it is inactive.
     """
 
     name: str
@@ -151,22 +154,22 @@ FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isin
 
 
 def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]) -> None:
-    """Validate the table; raises FlightError naming the row.
+    """Check the fact table, and raise FlightError with the name of an invalid row.
 
-    `modes_of` returns the modes in which a reaction has an effect. A fact that is watched in none of these
-    modes is an error.
+    `modes_of` is a function that returns the modes in which a reaction has an effect. A fact is invalid if it
+    is not watched in any of these modes.
     """
     seen: set[str] = set()
     for fact in facts:
         if fact.name in seen:
-            raise FlightError(f"fact {fact.name} stands twice in the table")
+            raise FlightError(f"fact {fact.name} is listed twice in the table")
         seen.add(fact.name)
         if fact.after < 1 or fact.mended_after < 1:
-            raise FlightError(f"fact {fact.name}: a count of statements must be at least 1")
+            raise FlightError(f"fact {fact.name}: a number of updates must be at least 1")
         if not fact.modes & modes_of(fact.begins.reaction):
             raise FlightError(
-                f"fact {fact.name}: in no mode in which it is watched does its reaction "
-                f"{fact.begins.reaction.name.lower()} do anything"
+                f"fact {fact.name}: its reaction {fact.begins.reaction.name.lower()} has no effect "
+                "in any mode in which the fact is watched"
             )
 
 
@@ -177,7 +180,7 @@ class _State:
 
 
 class Facts:
-    """Holds the state of every fact, and reports an event when a fact begins or ends."""
+    """The states of all facts; reports an event when a fact becomes active or inactive."""
 
     def __init__(self, event_log: EventLog) -> None:
         self._events = event_log
@@ -185,7 +188,7 @@ class Facts:
         self._mode = Mode.BOOT
 
     def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
-        """Update a fact with its condition, or None if unknown. `text` becomes the text of the event."""
+        """Update a fact with its condition, which is None if unknown. `text` is the text of the event."""
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:
             return
@@ -211,14 +214,14 @@ class Facts:
         return tuple(fact for fact in FACTS if self._states[fact.name].holds)
 
     def clear(self, event_name: str) -> bool:
-        """Reset the facts latched under an event's name; return whether there were any."""
+        """Make the latched facts of an event inactive, and return whether there were any."""
         found = [fact for fact in self.held() if fact.latching and fact.begins.name == event_name]
         for fact in found:
             self._states[fact.name] = _State()
         return bool(found)
 
     def enter(self, mode: Mode) -> None:
-        """Watch the facts of `mode`; reset the others."""
+        """Watch the facts of `mode`, and reset all facts that are not watched in this mode."""
         self._mode = mode
         for fact in FACTS:
             if mode not in fact.modes:
@@ -226,14 +229,14 @@ class Facts:
 
 
 LEAST_RATE = 0.8
-"""Fraction of the nominal rate below which a stream counts as slow."""
+"""Fraction of the nominal rate below which a stream is slow."""
 _SPAN = 2.0
 _SECOND = 1e-9
 _PERIODS = 5
 
 
 class StreamState(IntEnum):
-    """The quality of a stream; the values are the numbers in the health packet."""
+    """Quality of a stream; the values are the numbers in the health packet."""
 
     NOT_FITTED = 0
     NEVER = 1
@@ -245,9 +248,10 @@ class StreamState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class StreamLimits:
-    """Limits of a stream: nominal rate (Hz), age limit (s), and range of its value, in the value's unit.
+    """Limits of a stream: nominal rate (Hz), age limit (s), and range of its value in the value's unit.
 
-    `has_silence_alarm` is whether another fact reports the silence of this stream, so that `poor` ignores it.
+    `has_silence_alarm` states whether another fact reports missing readings, so that the fact `poor` does
+    not.
     """
 
     name: str
@@ -260,7 +264,7 @@ class StreamLimits:
 
 
 def streams_of(config: Config) -> tuple[StreamLimits, ...]:
-    """Return the streams of the devices that a configuration has."""
+    """Return the stream limits of the devices in a configuration."""
     unit, coils, field = config.inertial_unit, config.coils, config.field_range()
     rows = [
         StreamLimits("imu", float(unit.rate_hz), unit.max_age, IMU_POOR),
@@ -274,7 +278,7 @@ def streams_of(config: Config) -> tuple[StreamLimits, ...]:
         camera = config.camera
         longest = camera.period
         if camera.fine_period is not None or camera.streak_exposure is not None:
-            # An exposure time that depends on the rate shifts the times of frames.
+            # Frames are not periodic if the exposure time depends on the rate.
             longest = max(longest, camera.fine_period or 0.0)
             longest += max(camera.streak_exposure or (camera.exposure,))
         rows.append(StreamLimits("camera", 1.0 / longest, camera.max_age, CAMERA_POOR))
@@ -294,14 +298,16 @@ class StreamWatch:
         self._valid = True
 
     def begin(self, time_ns: int) -> None:
-        """Discard earlier readings; count from `time_ns`."""
+        """Discard earlier readings, and measure the rate from `time_ns` on."""
         self._times.clear()
         self._since_ns = time_ns
 
     def note(self, time_ns: int, value: float | None = None) -> None:
-        """Record a reading made at `time_ns`, with the value that is compared with the valid range."""
+        """Record a reading made at `time_ns`, and the value that must be within the valid range."""
         if self._times and time_ns - self._times[-1] > self._window_ns // 2:
-            self._since_ns = time_ns  # a gap is reported as stale, not as slow
+            self._since_ns = (
+                time_ns  # after a gap, the rate is measured again; the gap itself makes the stream stale
+            )
         self._times.append(time_ns)
         if value is not None:
             self._valid = self.stream.low <= value <= self.stream.high  # NaN compares false
@@ -311,7 +317,7 @@ class StreamWatch:
         return (now_ns - self._times[-1]) * _SECOND if self._times else float("inf")
 
     def rate(self, now_ns: int) -> float:
-        """Return the rate (Hz) over the window that ends now; NaN while the window is incomplete."""
+        """Return the rate (Hz) in the window that ends now, or NaN while the window is incomplete."""
         begin_ns = now_ns - self._window_ns
         if begin_ns < self._since_ns:
             return float("nan")
@@ -319,19 +325,19 @@ class StreamWatch:
         return count / (self._window_ns * _SECOND)
 
     def state(self, now_ns: int) -> StreamState:
-        """Return the state of the stream now."""
+        """Return the present state of the stream."""
         if not self._times:
             return StreamState.NEVER
         if self.age(now_ns) > self.stream.max_age:
             return StreamState.STALE
         if not self._valid:
             return StreamState.INVALID
-        if self.rate(now_ns) < LEAST_RATE * self.stream.rate_hz:  # False for NaN: an unknown rate is not slow
+        if self.rate(now_ns) < LEAST_RATE * self.stream.rate_hz:  # False for NaN, an unknown rate
             return StreamState.SLOW
         return StreamState.GOOD
 
     def poor(self, now_ns: int) -> tuple[bool | None, str]:
-        """Return whether the stream is poor (None if unknown or reported by another fact), and why."""
+        """Return whether the stream is poor, and why; None if unknown or reported by another fact."""
         stream, state = self.stream, self.state(now_ns)
         if state is StreamState.GOOD:
             return False, f"{stream.name}: good again"
@@ -346,18 +352,18 @@ class StreamWatch:
 
 
 class Streams:
-    """All streams of a flight by name. Readings of devices that the configuration lacks are ignored."""
+    """All streams of a flight by name. Readings from devices that are not configured are ignored."""
 
     def __init__(self, rows: tuple[StreamLimits, ...]) -> None:
         self._watches = {row.name: StreamWatch(row, 0) for row in rows}
 
     def begin(self, time_ns: int) -> None:
-        """Discard earlier readings; count from `time_ns`."""
+        """Discard earlier readings, and measure rates from `time_ns` on."""
         for watch in self._watches.values():
             watch.begin(time_ns)
 
     def note(self, name: str, time_ns: int, value: float | None = None) -> None:
-        """Record a reading of the named stream, if the configuration has it."""
+        """Record a reading of the named stream, if this stream is configured."""
         watch = self._watches.get(name)
         if watch is not None:
             watch.note(time_ns, value)
@@ -368,7 +374,7 @@ class Streams:
         return StreamState.NOT_FITTED if watch is None else watch.state(now_ns)
 
     def look(self, now_ns: int) -> list[tuple[StreamLimits, bool | None, str]]:
-        """Return for each stream the result of `StreamWatch.poor`."""
+        """Return the limits of each stream with the result of `StreamWatch.poor`."""
         return [(watch.stream, *watch.poor(now_ns)) for watch in self._watches.values()]
 
 

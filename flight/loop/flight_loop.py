@@ -1,6 +1,6 @@
-"""One flight from its release to its end: starts the tasks, runs the rate groups, switches the coils off.
+"""One flight from release to end: starts the tasks, runs the rate groups, and switches the coils off.
 
-`flight.app` opens and closes the devices and composes the tasks.
+The devices are opened and closed, and the tasks composed, by `flight.app`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hal.interfaces.wires import SECOND_NS
 
 @dataclass(frozen=True, slots=True)
 class RunLabel:
-    """The properties of a run that its first packet records."""
+    """Properties of a run that are recorded in its first packet."""
 
     config_text: str
     seed: int
@@ -36,7 +36,7 @@ class RunLabel:
 
 @dataclass(frozen=True, slots=True)
 class FlightProgress:
-    """Progress of a flight: times (s), currents (3,) A, and `attitude`, a text with target and attitude."""
+    """Progress of a flight: times (s), coil currents (3,), A, and a text about target and attitude."""
 
     mission_time: float
     duration: float
@@ -52,16 +52,16 @@ _BROKEN = {"x": COIL_X_BROKEN, "y": COIL_Y_BROKEN, "z": COIL_Z_BROKEN}
 
 @dataclass(frozen=True, slots=True)
 class FlightEnding:
-    """The state of a flight when its loop ended.
+    """State of a flight at the end of its loop.
 
     Attributes:
         mission_time: s.
         cycles: number of completed control cycles.
         mode: label of the mode.
-        alarms: names of the active facts.
-        faults: number of each event of severity fault, including events that the throttle held back.
-        warnings: number of each event of severity warning, including events that the throttle held back.
-        coils_left_out: axes of excluded coils.
+        alarms: names of the facts that are active at the end.
+        faults: number of events of severity fault, by kind, including events that the throttle held back.
+        warnings: number of events of severity warning, by kind, including events that the throttle held back.
+        coils_left_out: axes of the coils that were excluded because they are broken.
         coils_at_zero: whether the last command that the PWM chip acknowledged was zero current.
         coil_error: why the last write to the PWM chip failed; empty if it succeeded.
     """
@@ -87,12 +87,13 @@ def nothing() -> None:
 
 @dataclass(frozen=True, slots=True)
 class Supervisors:
-    """The services that supervise the loop.
+    """Services that supervise the control loop.
 
     Attributes:
-        beat: sends the guardian's heartbeat; called after each control cycle without an error.
-        keeper: stores the state that the next boot needs; None if no state is stored.
-        board: reads processor load, memory, free disk space and temperature; None in lock-step simulation.
+        beat: function that sends the guardian's heartbeat; called after each control cycle without an error.
+        keeper: keeper of the state for the next boot, or None if no state is stored.
+        board: reader of processor load, memory, free disk space and temperature, or None in a lock-step
+            simulation.
     """
 
     beat: Callable[[], None] = nothing
@@ -121,7 +122,7 @@ class FlightLoop:
         self._output: ControlOutput | None = None
         self._groups = self._rate_groups()
         tasks.health.watch(self._groups)
-        # In lock-step simulation jobs run in the calling thread. The execution time of a cycle excludes them.
+        # Jobs of a lock-step simulation run in this thread, and are excluded from execution times.
         jobs = services.jobs
         self._executive = CyclicExecutive(
             services.clock, self._groups, tasks.observer, lambda: time.perf_counter_ns() - jobs.borrowed_ns
@@ -138,15 +139,18 @@ class FlightLoop:
         self._executive.stop()
 
     def note(self, kind: EventKind, text: str) -> None:
-        """Store an event that occurred before the flight; it is reported when the flight starts."""
+        """Store an event from before the flight, which is reported when the flight starts."""
         self._notes.append((kind, text))
 
     def watch(self, progress: Callable[[FlightProgress], None]) -> None:
-        """Call `progress` once a second of mission time."""
+        """Call `progress` once per second of mission time."""
         self._show = progress
 
     def run(self, epoch_ns: int, label: RunLabel) -> str:
-        """Fly from `epoch_ns` on; return why the flight ended. The coils are off on return or error."""
+        """Fly from `epoch_ns` on, and return why the flight ended.
+
+        The coils are off afterwards, even if an error is raised.
+        """
         services = self._services
         self._begin(epoch_ns, label)
         try:
@@ -164,7 +168,7 @@ class FlightLoop:
         return reason
 
     def ending(self) -> FlightEnding:
-        """Return the state of the flight; after `run` it is the state at the end."""
+        """Return the state of the flight; after `run`, this is the state at its end."""
         facts, coils = self._services.facts, self._tasks.housekeeping.coils()
         counts: dict[Severity, dict[str, int]] = {Severity.FAULT: {}, Severity.WARNING: {}}
         for kind, count in self._services.events.counts.items():
@@ -182,7 +186,7 @@ class FlightLoop:
         )
 
     def _begin(self, epoch_ns: int, label: RunLabel) -> None:
-        """Start every task at mission time zero, and record the run."""
+        """Start all tasks at mission time zero, and record the properties of the run."""
         config, services, tasks, supervisors = self._config, self._services, self._tasks, self._supervisors
         recorder, clock = services.recorder, services.clock
         recorder.epoch_ns = epoch_ns
@@ -220,7 +224,7 @@ class FlightLoop:
             tasks.health.read_resources(supervisors.board, round(config.health.look_period * SECOND_NS))
 
     def _rate_groups(self) -> list[RateGroup]:
-        """Return the rate groups in order of importance, control first."""
+        """Return the rate groups in order of importance, with the control group first."""
         config, tasks = self._config, self._tasks
         camera, replan_period = config.camera, config.replan_period()
         control_ns = round(SECOND_NS / CONTROL_RATE_HZ)
@@ -264,7 +268,7 @@ class FlightLoop:
         self._show(progress)
 
     def _keep_state(self, now_ns: int) -> None:
-        """Pass the state for the next boot to its keeper, and report the keeper's events; no disk access."""
+        """Pass the state for the next boot to the keeper and report the keeper's events; no disk access."""
         keeper = self._supervisors.keeper
         if keeper is None:
             return

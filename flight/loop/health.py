@@ -1,15 +1,15 @@
-"""Health, housekeeping and performance: checks and records the loop itself.
+"""Health, housekeeping and performance: monitors and records the state of the flight software.
 
-The health task checks streams, progress and resources, and feeds the watchdog while every rate group and
-worker makes progress. A rate group is stalled if it has completed no cycle within its time limit. A worker is
-stalled if a job has run for longer than its time limit. A stalled ticker job is reported but does not stop
-the feeding, because a restart would not cure a slow disk or a hung bus. A `ResourceReader` samples processor,
-memory, disk and temperature (`Board` on Linux, a script in tests) on a ticker outside the control loop,
-because the kernel may take milliseconds to answer.
+The health task checks streams, progress and resources, and triggers the watchdog while all rate groups and
+workers make progress. A rate group is stalled if it has not completed a cycle within its time limit. A worker
+is stalled if a job runs longer than its time limit. A stalled ticker job is reported but does not stop the
+watchdog's trigger, because a restart would not cure a slow disk or a hung bus. A `ResourceReader` (`Board` on
+Linux, a script in tests) samples processor load, memory, disk space and temperature on a ticker outside the
+control loop, because the kernel may take milliseconds to answer.
 
-Housekeeping records the counters of devices and loop once a second, and checks the flight log. The
-performance record stores lateness and execution time of cycles in a separate log. Its observer reports
-skipped slots and failures as events, and zeroes the coils after a failed control cycle.
+Housekeeping records the counters of devices and tasks once a second, and checks the flight log. The
+performance record stores lateness and execution time of the control cycles in a separate log. Its observer
+reports skipped time slots and failures as events, and switches the coils off after a failed control cycle.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ _LEAST_SLOPE_SAMPLES = 8
 
 @dataclass(frozen=True, slots=True)
 class ResourceSample:
-    """One sample of the board's resources; NaN for values that are not available.
+    """A sample of the board's resources, with NaN for values that are not available.
 
     Attributes:
         time_ns: time of the sample by the monotonic clock.
         cpu: processor time (s) of the control process since its start.
-        resident: resident set size of the control process, bytes.
-        proportional: sum of the proportional set sizes of all flight processes, bytes.
-        disk_free: free space on the file system of the flight log, bytes.
-        temperature: temperature of the warmest thermal zone, degree C.
+        resident: resident set size (bytes) of the control process.
+        proportional: sum of the proportional set sizes (bytes) of all flight processes.
+        disk_free: free space (bytes) on the file system of the flight log.
+        temperature: temperature (degrees Celsius) of the warmest thermal zone.
     """
 
     time_ns: int
@@ -73,11 +73,11 @@ class ResourceReader(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ResourceState:
-    """Values derived from the samples; NaN while there are too few samples.
+    """Processor load and memory growth computed from samples, or NaN with too few samples.
 
     Attributes:
         cpu_share: processor time between the last two samples, as a fraction of one core.
-        memory_slope: growth of the memory use by least squares over the window, bytes/s.
+        memory_slope: growth of memory use (bytes/s) by a least squares fit over the window.
     """
 
     sample: ResourceSample | None = None
@@ -86,7 +86,7 @@ class ResourceState:
 
 
 class ResourceMonitor:
-    """Keeps the newest samples and updates the facts about resources."""
+    """Stores the newest samples of resources, and updates the facts about them."""
 
     def __init__(self, settings: Health) -> None:
         self._settings = settings
@@ -95,7 +95,7 @@ class ResourceMonitor:
         self.state = ResourceState()
 
     def adopt(self, settings: Health) -> None:
-        """Replace the bounds of resources."""
+        """Replace the limits of the resources."""
         self._settings = settings
 
     def ingest(self, sample: ResourceSample) -> None:
@@ -139,7 +139,7 @@ class ResourceMonitor:
 
 
 _CLOCK_STEP_NS = 500_000_000
-"""Smallest step of the wall clock that is reported (ns)."""
+"""Smallest step (ns) of the wall clock that is reported."""
 
 
 class ClockWatch:
@@ -152,7 +152,10 @@ class ClockWatch:
         self.steps = 0
 
     def look(self) -> float | None:
-        """Return the step (s) of the wall clock since the last call, or None. Slow drift is not reported."""
+        """Return the step (s) of the wall clock since the last call, or None if it made no step.
+
+        A slow drift of the clock is not reported.
+        """
         offset_ns = self._clock.utc_ns() - self._clock.now_ns()
         before_ns, self._offset_ns = self._offset_ns, offset_ns
         if before_ns is None or abs(offset_ns - before_ns) <= _CLOCK_STEP_NS:
@@ -177,7 +180,8 @@ class Board:
     def __call__(self, now_ns: int) -> ResourceSample:
         """Return the board's resources now."""
         process = os.getpid()
-        # The name in brackets may hold any character; user and system time are fields 14 and 15 (proc(5)).
+        # The name in brackets may contain any character.
+        # User and system time are fields 14 and 15 of the line (proc(5)).
         stat = _read(self._proc / str(process) / "stat").rpartition(")")[2].split()
         statm = _read(self._proc / str(process) / "statm").split()
         try:
@@ -198,7 +202,7 @@ class Board:
         )
 
     def _below(self, parent: int) -> Iterator[int]:
-        """Yield the identifiers of all descendants of the process `parent`."""
+        """Yield the process identifiers of all descendants of the process `parent`."""
         for task in sorted((self._proc / str(parent) / "task").glob("*/children")):
             for word in _read(task).split():
                 yield int(word)
@@ -214,7 +218,7 @@ class Board:
 
 
 def _read(path: Path) -> str:
-    """Return the content of a kernel file; empty when it cannot be read."""
+    """Return the content of a kernel file, or an empty text if it cannot be read."""
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -229,7 +233,8 @@ _SHORTEST_LIMIT_NS = 2_000_000_000
 class WorkerWatch:
     """A worker to watch.
 
-    `busy_since_ns` returns the start time of its running job, or None while it is idle.
+    The function `busy_since_ns` returns the start time (ns) of the running job, or None while the worker is
+    idle.
     """
 
     name: str
@@ -242,15 +247,15 @@ class GroupsAndWorkers:
 
     def __init__(self, groups: list[RateGroup], workers: list[WorkerWatch]) -> None:
         self._workers = workers
-        # The number of completed cycles of each group, and the time of the last increase.
+        # For each group: number of completed cycles, and time (ns) of the last increase.
         self._progress = {group: (group.completed, 0) for group in groups}
 
     def begin(self, time_ns: int) -> None:
-        """Restart the measurement of progress at `time_ns`."""
+        """Measure progress from `time_ns` on."""
         self._progress = {group: (completed, time_ns) for group, (completed, _) in self._progress.items()}
 
     def stalled(self, now_ns: int) -> list[str]:
-        """Return the names of the stalled groups and workers."""
+        """Return the names of the stalled rate groups and workers."""
         names = []
         for group, (completed, since_ns) in self._progress.items():
             if group.completed != completed:
@@ -265,7 +270,7 @@ class GroupsAndWorkers:
 
 
 def failing(tickers: Sequence[Ticker], now_ns: int) -> list[str]:
-    """Return a text for each ticker job that raises errors or is stalled."""
+    """Return a text for each ticker job that reports an error or is stalled."""
     problems = []
     for ticker in tickers:
         stood_ns = now_ns - ticker.served_ns
@@ -280,7 +285,7 @@ CONTROL = "control"
 
 
 class PerformanceObserver:
-    """Records every cycle, slip and failure that the executive reports."""
+    """Records the cycles that the executive reports, and reports skipped slots and failures as events."""
 
     def __init__(self, coils: TorqueCoils, services: Services) -> None:
         self._coils = coils
@@ -300,9 +305,9 @@ class PerformanceObserver:
             )
 
     def slipped(self, group: RateGroup, slots: int) -> None:
-        """Report skipped slots of the control group.
+        """Report skipped time slots of the control group.
 
-        Other groups skip slots only if the control group does.
+        Other groups are not reported, because they skip slots only if the control group does.
         """
         if group.name != CONTROL:
             return
@@ -310,7 +315,7 @@ class PerformanceObserver:
         self._events.report(events.CYCLE_SLIP, self._clock.now_ns(), text)
 
     def failed(self, group: RateGroup, error: Exception) -> None:
-        """Switch the coils off when the control task failed, and report where the error occurred."""
+        """Switch the coils off if the control task failed, and report where the error occurred."""
         if group.name == CONTROL:
             self._coils.off()
         last = traceback.extract_tb(error.__traceback__)[-1]
@@ -343,7 +348,7 @@ class PerformanceObserver:
 
 
 class Housekeeping:
-    """Writes the housekeeping packet."""
+    """Writes the housekeeping packet once a second."""
 
     def __init__(
         self,
@@ -355,9 +360,9 @@ class Housekeeping:
         log_error: Callable[[], str],
         services: Services,
     ) -> None:
-        """Record the counters of the given tasks.
+        """Collect the counters of the given tasks.
 
-        `log_error` returns the error of the log, or an empty text.
+        The function `log_error` returns the error of the flight log, or an empty text.
         """
         self._navigation = navigation
         self._planner = planner
@@ -375,7 +380,7 @@ class Housekeeping:
         return self._coils.state()
 
     def run(self, cycle: Cycle, state: SteeringState) -> None:
-        """Write the packet; `state` is the state of the coils in the newest control cycle."""
+        """Write the packet; `state` is the coils' state of use in the newest control cycle."""
         now_ns, power, log_error = cycle.start_ns, self._power, self._log_error()
         text = log_error or "packets reach the disk again"
         self._facts.update(facts.LOG_FAULT, bool(log_error), now_ns, text)
@@ -406,7 +411,7 @@ class Housekeeping:
         )
 
     def report_lost(self, now_ns: int) -> None:
-        """Report how many records were lost since the last call, and the newest reason."""
+        """Report the number of records lost since the last call, with the newest reason."""
         lost = self._recorder.lost
         if lost != self._lost:
             text = f"{lost - self._lost} more, the newest: {self._recorder.lost_text}"
@@ -424,7 +429,7 @@ _WORKER_EVENTS = {
 
 
 class HealthWatch:
-    """The task of the health rate group."""
+    """Task of the health rate group: checks streams, progress, resources and workers."""
 
     def __init__(
         self,
@@ -436,7 +441,10 @@ class HealthWatch:
         feed: Callable[[], None],
         services: Services,
     ) -> None:
-        """Watch the given tasks; `feed` is called while every rate group and worker makes progress."""
+        """Watch the given tasks.
+
+        The function `feed` triggers the watchdog; it is called while all rate groups and workers progress.
+        """
         self._modes = modes
         self._drive = drive
         self._power = power
@@ -447,7 +455,7 @@ class HealthWatch:
         self._recorder = services.recorder
         self._events = services.events
         self._jobs = services.jobs
-        # Events of workers are not throttled, because the budget of restarts limits their number.
+        # Worker events are not throttled, because the limited number of restarts limits them.
         self._worker_events = EventLog(services.recorder.event, 0)
         self._facts = services.facts
         self._streams = services.streams
@@ -458,7 +466,7 @@ class HealthWatch:
         self._ticker: Ticker | None = None
 
     def watch(self, groups: Sequence[RateGroup]) -> None:
-        """Watch the rate groups of the flight, control first."""
+        """Watch the rate groups of the flight, of which the first one must be the control group."""
         self._control = groups[0]
         self._progress = GroupsAndWorkers(list(groups), list(self._workers))
         self._counted = (self._control.cycles, self._control.completed)
@@ -472,11 +480,11 @@ class HealthWatch:
         self._ticker = self._clock.ticker("resources", period_ns, sample)
 
     def adopt(self, limits: Health) -> None:
-        """Replace the bounds of resources."""
+        """Replace the limits of the resources."""
         self._monitor.adopt(limits)
 
     def begin(self, time_ns: int) -> None:
-        """Start all measurements of progress and age now."""
+        """Measure progress and ages from `time_ns` on."""
         self._progress.begin(time_ns)
 
     def close(self) -> None:
@@ -517,7 +525,7 @@ class HealthWatch:
             self._facts.update(stream.poor, poor, now_ns, text)
 
     def _check_progress(self, now_ns: int) -> None:
-        """Feed the watchdog if nothing is stalled; update the fact that the control task keeps failing."""
+        """Trigger the watchdog if nothing is stalled, and report a control task that fails repeatedly."""
         before = self._counted
         if self._control.completed != before[1]:
             self._counted = (self._control.cycles, self._control.completed)

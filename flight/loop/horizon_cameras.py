@@ -1,8 +1,8 @@
-"""Task of the horizon cameras: passes frames to a worker, and the directions of Sun and nadir to the body.
+"""Task of the horizon cameras: passes frames to a worker, and directions of Sun and nadir to the body.
 
-All cameras are triggered together, and more often while the body needs their frames. A camera is reported if
-it gives no frame, repeats an image, or gives images that contradict a finely known attitude. The task runs
-once a second, independently of the control cycle. A frame is used at the time of its exposure.
+All horizon cameras are triggered together, more often while the body needs their frames. A camera is reported
+if it delivers no frame, repeats an image, or delivers images that contradict a fine attitude. The task runs
+once a second, independently of the control cycle. A frame is a measurement at the time of its exposure.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from knightcube.vision.horizon_camera_job import HorizonCameraResult
 
 WORKER = "wide"
 _SPARSE = 8
-"""Spacing (px) of the pixels that are compared with the last image to detect a repeated image."""
+"""Spacing (px) of the pixels that are compared with the last image to detect repeated images."""
 _NONE = [float("nan")] * 3
 
 
 @dataclass(frozen=True, slots=True)
 class HorizonCameraSettings:
-    """Times of the horizon cameras (ns).
+    """Durations that the task of the horizon cameras uses, in ns.
 
     Attributes:
-        exposures_ns: exposure time of each camera.
-        period_ns: time between triggers while frames are needed often.
-        fine_period_ns: time between triggers otherwise.
-        late_ns: longest delay of a frame after its trigger.
-        max_age_ns: time without a frame after which a camera counts as lost.
+        exposures_ns: exposure time (ns) of each camera.
+        period_ns: time (ns) between triggers while the body needs frames often.
+        fine_period_ns: time (ns) between triggers while the attitude is fine.
+        late_ns: longest time (ns) from a trigger to the arrival of a frame.
+        max_age_ns: time (ns) without a frame after which a camera is reported as lost.
     """
 
     exposures_ns: Sequence[int]
@@ -46,7 +46,7 @@ class HorizonCameraSettings:
 
 
 class HorizonCameraTask:
-    """Triggers and monitors the horizon cameras, and owns the frames of one trigger."""
+    """Triggers and monitors the horizon cameras, and collects the frames of a trigger."""
 
     def __init__(
         self,
@@ -69,16 +69,16 @@ class HorizonCameraTask:
         self._job: tuple[int, int, int] | None = None  # mid-exposure (ns), camera bit mask, submission (ns)
 
     def begin(self, time_ns: int) -> None:
-        """Measure the ages of frames from `time_ns` on, at which the first trigger is due."""
+        """Measure the ages of frames from `time_ns` on, when the first trigger is due."""
         self._triggered_ns = time_ns - self._settings.fine_period_ns
         self._seen_ns = [time_ns] * len(self._cameras)
 
     def busy_since_ns(self) -> int | None:
-        """Return the time (ns) at which the worker received the present frames; None while it is idle."""
+        """Return the time (ns) at which the worker received its frames, or None while it is idle."""
         return None if self._job is None else self._job[2]
 
     def run(self, now_ns: int) -> None:
-        """Collect the frames of a trigger, submit them, and trigger the cameras again when it is due."""
+        """Collect the frames of the last trigger, submit them to the worker, and trigger when it is due."""
         if self._waits:
             self._collect(now_ns)
         period_ns = self._settings.period_ns if self._sight.needed else self._settings.fine_period_ns
@@ -93,7 +93,7 @@ class HorizonCameraTask:
         self._watch(now_ns)
 
     def finish(self, result: JobResult, now_ns: int) -> None:
-        """Accept the worker's result."""
+        """Accept the worker's result, and pass the directions to the body."""
         job, self._job = self._job, None
         if job is None:
             return
@@ -103,11 +103,11 @@ class HorizonCameraTask:
             return
         found: HorizonCameraResult = result.value
         if found.false is not None:
-            # The attitude is known finely, so that each camera's image can be checked against it.
-            text = "all pictures are of what they must be"
+            # The images could be checked, because the attitude is known finely.
+            text = "all images agree with the attitude"
             if found.false:
                 names = ", ".join(str(number + 1) for number in found.false)
-                text = f"pictures of camera {names} are false: {next(iter(found.false.values()))}"
+                text = f"images of camera {names} contradict the attitude: {next(iter(found.false.values()))}"
             self._services.facts.update(facts.WIDE_FALSE, bool(found.false), now_ns, text)
         used = self._sight.accept(job[0], found)
         self._record(now_ns, job, found, used)
@@ -122,12 +122,12 @@ class HorizonCameraTask:
                 self._errors[number] = str(error)
                 continue
             if frame is None or frame.sequence <= self._sequences[number]:
-                continue  # a repeated frame does not reset the age
+                continue  # a repeated frame does not count as a new one
             self._sequences[number] = frame.sequence
             before = self._pictures[number]
             self._pictures[number] = frame.pixels[::_SPARSE, ::_SPARSE].tobytes()
             if self._pictures[number] == before:
-                self._errors[number] = "its picture is the last one again"
+                self._errors[number] = "it repeats its last image"
                 continue
             if frame.exposure_start_ns < self._triggered_ns:
                 continue  # the frame belongs to an earlier trigger
@@ -143,7 +143,7 @@ class HorizonCameraTask:
                 self._services.events.report(events.VISION_FAILED, now_ns, text)
 
     def _watch(self, now_ns: int) -> None:
-        """Report cameras without a frame for longer than the limit."""
+        """Report the cameras that have delivered no frame for longer than the limit."""
         limit_ns = self._settings.max_age_ns
         old = [number for number, seen in enumerate(self._seen_ns) if now_ns - seen > limit_ns]
         text = "frames come again"

@@ -56,7 +56,7 @@ def test_a_command_is_answered_once_and_mode_tries_the_flight(
     assert to_text(row["text"]) == text
     assert state.due == due
     (row,) = decode(state.answer(packed(command), 115.0))["command"]
-    assert to_text(row["text"]) == "the very same packet has come before"
+    assert to_text(row["text"]) == "an identical packet was received before"
     assert state.due == due
 
 

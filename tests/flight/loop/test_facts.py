@@ -183,9 +183,9 @@ def test_every_event_beyond_a_note_is_reacted_to_even_while_the_throttle_holds_i
 @pytest.mark.parametrize(
     ("broken", "problem"),
     [
-        ((facts.BLIND, facts.BLIND), "stands twice"),
+        ((facts.BLIND, facts.BLIND), "is listed twice"),
         ((replace(facts.BLIND, after=0),), "at least 1"),
-        ((replace(facts.BLIND, modes=frozenset({Mode.SAFE})),), "does its reaction safe do anything"),
+        ((replace(facts.BLIND, modes=frozenset({Mode.SAFE})),), "its reaction safe has no effect"),
     ],
 )
 def test_a_table_that_cannot_work_is_refused(broken: tuple[facts.Fact, ...], problem: str) -> None:
