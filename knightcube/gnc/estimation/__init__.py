@@ -1,1 +1,1 @@
-"""Measurements in, one state estimate with its covariance out."""
+"""Filters that estimate attitude, rate and slowly varying parameters from measurements."""

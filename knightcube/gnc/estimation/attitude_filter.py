@@ -1,12 +1,13 @@
-"""A MEKF of attitude, rate, gyro bias and disturbance that accepts late measurements.
+"""A multiplicative extended Kalman filter of attitude, rate and biases that accepts late measurements.
 
 Each measurement is applied at its own time. A late measurement is inserted at its own time, and all later
-measurements are applied again. This is done at once, or in small steps while the filter continues without the
-late measurement (module `replay`). A rate from a streaked image is the mean over the exposure: the attitude
-at the start of the exposure is kept until its end. The age of the inertial unit's samples may be estimated
-(module `mekf`). On the testbed's thread the same filter uses the component of each measurement about the
-thread, and all other states stay constant. Torsion and damping of the thread are known, or estimated beside
-the disturbance, from which they differ by their dependence on angle and rate.
+measurements are applied again. The work is done at once, or in small steps while the filter continues without
+the late measurement (module `replay`). The rate from a streaked image is the mean rate during the exposure.
+The filter therefore keeps the attitude at the start of an exposure until the exposure ends. The filter can
+also estimate the age of the inertial unit's samples (module `mekf`). For a body that hangs on the testbed's
+thread, the filter uses only the component of each measurement about the thread. The torsion and the damping
+of the thread are known or estimated. They are distinguished from the estimated disturbance because their
+torques depend on the angle and the rate.
 """
 
 from __future__ import annotations
@@ -54,27 +55,32 @@ from knightcube.gnc.estimation.rotation import exponential, twist
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterSettings:
-    """Noise and limits of the filter.
+    """Noise and limits of the attitude filter.
 
     Attributes:
-        current_noise: A, standard deviation of a driven coil's current, independent in each control cycle.
-        control_period: s, duration of a control cycle.
-        disturbance_walk: rad/s^2 per sqrt(s), random walk of the unmodelled acceleration.
-        disturbance_start: rad/s^2, standard deviation of the unmodelled acceleration at the start.
-        bias_walk: rad/s per sqrt(s), random walk of the gyro bias.
-        bias_start: rad/s, standard deviation of the gyro bias at the start.
-        torsion_start: 1/s^2, standard deviation of the thread's torsion at the start; zero if it is known.
-        damping_start: 1/s, standard deviation of the thread's damping at the start; zero if it is known.
-        gain_start: standard deviation of the coils' gain at the start; zero if it is known.
-        latency_start: s, standard deviation of the age of the inertial unit's samples; zero if it is known.
-        latency_walk: s per sqrt(s), random walk of that age.
-        field_bias_start: T, standard deviation of the magnetometer bias at the start; zero without one.
-        field_bias_walk: T per sqrt(s), random walk of the magnetometer bias and of the field model's error.
-        rate_walk: rad/s per sqrt(s), white acceleration in addition to that of the coils.
-        unknown_current: A, current assumed for each coil while it is unknown.
-        gate_sigma: gate; a measurement less likely than this many sigma of one component is rejected.
-        history_ns: largest delay of a measurement that is still used.
-        longest_step: s, longest step of propagation; a slowly rotating body permits longer steps.
+        current_noise: standard deviation of the current of a driven coil, A; independent in each control
+            cycle.
+        control_period: duration of a control cycle, s.
+        disturbance_walk: random walk of the unmodelled angular acceleration, rad/s^2 per sqrt(s).
+        disturbance_start: initial standard deviation of the unmodelled angular acceleration, rad/s^2.
+        bias_walk: random walk of the gyro bias, rad/s per sqrt(s).
+        bias_start: initial standard deviation of the gyro bias, rad/s.
+        torsion_start: initial standard deviation of the thread's torsion, 1/s^2; zero if the torsion is
+            known.
+        damping_start: initial standard deviation of the thread's damping, 1/s; zero if the damping is known.
+        gain_start: initial standard deviation of the coils' gain; zero if the gain is known.
+        latency_start: initial standard deviation of the age of the inertial unit's samples, s; zero if the
+            age is known.
+        latency_walk: random walk of the age of the inertial unit's samples, s per sqrt(s).
+        field_bias_start: initial standard deviation of the magnetometer bias, T; zero without a magnetometer.
+        field_bias_walk: random walk of the magnetometer bias and of the field model's error, T per sqrt(s).
+        rate_walk: random walk of the rate due to white torques other than those of the coils, rad/s per
+            sqrt(s).
+        unknown_current: current assumed for a coil whose current is unknown, A.
+        gate_sigma: a measurement less likely than a deviation of this many sigma in one component is
+            rejected.
+        history_ns: largest delay of a measurement that is still used, ns.
+        longest_step: longest step of propagation, s; a slowly rotating body permits longer steps.
     """
 
     current_noise: float
@@ -97,7 +103,7 @@ class FilterSettings:
     longest_step: float = LONGEST_STEP
 
     def gates(self) -> dict[int, float]:
-        """Return the chi-square bounds of the gate by degrees of freedom, 1 to 3."""
+        """Return the chi-square bound of the gate for 1, 2 and 3 degrees of freedom."""
         chance = math.erfc(self.gate_sigma / math.sqrt(2.0))
         return {degrees: chi_square.bound(chance, degrees) for degrees in (1, 2, 3)}
 
@@ -108,7 +114,7 @@ def free_axes(body: RigidBody) -> FloatArray:
 
 
 def process_noise(body: RigidBody, settings: FilterSettings) -> ProcessNoise:
-    """Return the process noise of a body."""
+    """Return the process noise of `body` according to the settings."""
     free = free_axes(body)
     walks = np.zeros(SIZE)
     walks[BIAS] = settings.bias_walk**2 * free
@@ -141,7 +147,7 @@ def first_checkpoint(
     attitude: AttitudeMeasurement,
     rate: RateMeasurement,
 ) -> Checkpoint:
-    """Return the first checkpoint, at the later measurement.
+    """Return the filter's first checkpoint, at the time of the later of the two measurements.
 
     For a suspended body, only the angle about the thread is taken from the measured attitude.
     """
@@ -152,7 +158,7 @@ def first_checkpoint(
     bias_variance = prior.bias_covariance
     covariance = np.zeros((SIZE, SIZE))
     covariance[ATTITUDE, ATTITUDE] = attitude.covariance * np.outer(free, free)
-    # The gyro measures the sum of rate and bias, so their errors are opposite.
+    # The gyro measures the sum of rate and bias, so the errors of the estimated rate and bias are opposite.
     covariance[RATE, RATE] = rate.covariance * np.outer(free, free) + bias_variance
     covariance[RATE, BIAS] = covariance[BIAS, RATE] = -bias_variance
     covariance[BIAS, BIAS] = bias_variance
@@ -163,7 +169,7 @@ def first_checkpoint(
     none = (0.0, 0.0, 0.0)
     state = FilterState(quaternion, (x, y, z), (bx, by, bz), none, prior.parameters, latency=prior.latency)
     newest: Measurement = attitude if attitude.time_ns >= rate.time_ns else rate
-    # The body moves by the age of the samples: the errors of attitude, rate and age are correlated.
+    # The body moves during the age of the samples, so the errors of attitude, rate and age are correlated.
     age = np.zeros(SIZE)
     age[ATTITUDE], age[RATE] = (x, y, z), model.rate_change(state, covariance, newest.time_ns).acceleration
     age[LATENCY] = 1.0
@@ -172,12 +178,15 @@ def first_checkpoint(
 
 
 OnApplied = Callable[[list[bool]], None]
-"""Function that receives one flag per late measurement: whether the measurement passed the gate."""
+"""Callback that receives, for each late measurement, whether the measurement passed the gate."""
 
 
 @dataclass(slots=True, eq=False)
 class _Branch:
-    """A replay with late measurements from the checkpoint `base` on; `applied` is called at its end."""
+    """A replay that starts at the checkpoint `base` and includes late measurements.
+
+    The callback `applied` is called when the replay ends.
+    """
 
     base: Checkpoint
     replay: Replay
@@ -186,23 +195,27 @@ class _Branch:
 
 
 class AttitudeFilter:
-    """Owns the estimate, its recent checkpoints and the recent commands.
+    """The attitude filter with its recent checkpoints and the recent coil commands.
 
     Attributes:
         refused: number of measurements that did not pass the gate.
         late: number of measurements that were too late to be inserted.
         restarts: number of times that the filter discarded its estimate.
-        nis: normalised innovation squared of the last measurement, NaN without one.
+        nis: normalised innovation squared of the last measurement; NaN if the last measurement was not
+            applied.
     """
 
     REJECTIONS_TO_RESTART = 40
-    """Number of rejections of attitudes, or of rates, in a row after which the filter restarts."""
+    """Number of consecutive rejections of measurements of one kind after which the filter restarts."""
     REJECTIONS_AT_THE_START = 3
-    """Number of consecutive rejections after which the filter restarts while it has not accepted more
-    measurements than it rejected, because its start may be wrong."""
+    """Smaller number of consecutive rejections that restarts the filter while few measurements have been
+    accepted, because the initial state may be wrong."""
 
     def __init__(self, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None) -> None:
-        """Use `prior` for the slow states of `body`; by default it follows from the settings."""
+        """Create a filter that has not started.
+
+        The prior of the slow states follows from the settings by default.
+        """
         self._settings = settings
         self._prior = prior or slow_prior(body, settings)
         self._commands = CommandHistory(body, settings.history_ns)
@@ -221,19 +234,20 @@ class AttitudeFilter:
     def command(
         self, time_ns: int, currents: FloatArray, field: FloatArray | None = None, known: bool = True
     ) -> None:
-        """Record the coil currents (3,) A in force from `time_ns` on, and the field (3,) T, reference axes.
+        """Record coil currents (3,) A that flow from `time_ns` on, and the field (3,) T, reference axes.
 
-        Commands come in order of time, each before the measurements that follow it. Without `field` the field
-        of the body is used. Currents that are not `known` are a guess.
+        Commands must be recorded in order of time, each before the measurements that follow it. The default
+        of `field` is the constant field of the body description. Pass `known=False` if the coils may carry
+        other currents.
         """
         check = self._check
         self._commands.record(max(time_ns, check.ended_ns), currents, field, known and not check.active)
 
     def mark_unknown(self, since_ns: int) -> None:
-        """Treat the currents recorded since then as unknown: the coils may not have carried them.
+        """Treat the coil currents recorded since `since_ns` as unknown.
 
-        The measurements since then are applied again, a part at each `catch_up`: an apparent disturbance or
-        change of parameters may have been caused by a current.
+        Wrong currents may have been mistaken for a disturbance or a change of parameters. The measurements
+        since that time are therefore applied again, some of them at each call of `catch_up`.
         """
         self.catch_up()
         self._commands.mark_unknown(since_ns)
@@ -245,7 +259,10 @@ class AttitudeFilter:
             self._branch = _Branch(base, Replay(self._model, base, again), (), lambda _: None)
 
     def start(self, attitude: AttitudeMeasurement, rate: RateMeasurement) -> None:
-        """Start from one attitude and one rate; a suspended body uses their components about the thread."""
+        """Start from an attitude and a gyro rate.
+
+        For a suspended body, only their components about the thread are used.
+        """
         first = first_checkpoint(self._model, self._settings, self._prior, attitude, rate)
         self._history.restart(first)
         self._discard_branch()
@@ -273,7 +290,7 @@ class AttitudeFilter:
         if self._is_newest(measurement):
             used = self._apply([measurement], measurement)
         elif (index := self._history.index_before(measurement.begin_ns)) > 0:
-            # Return to the first `index` checkpoints and apply the later measurements again.
+            # The first `index` checkpoints remain, and all later measurements are applied again.
             later = self._history.measurements_from(index)
             bisect.insort_right(later, measurement, key=lambda other: other.time_ns)
             self._history.replace_from(index, ())
@@ -291,10 +308,10 @@ class AttitudeFilter:
         return used
 
     def measure_late(self, late: Sequence[Measurement], applied: OnApplied) -> None:
-        """Insert late measurements at their own times, a part of the work at each `catch_up`.
+        """Insert late measurements at their own times, some of them at each call of `catch_up`.
 
-        `applied` is called at the end with one flag per measurement: whether it passed the gate. Until then
-        the estimate continues without them.
+        The estimate continues without the late measurements until all are inserted. Then the callback
+        `applied` receives, for each late measurement, whether the measurement passed the gate.
         """
         self.catch_up()
         index = self._history.index_before(min(m.begin_ns for m in late)) if self._history else 0
@@ -308,7 +325,7 @@ class AttitudeFilter:
         self._branch = _Branch(base, Replay(self._model, base, again), late, applied)
 
     def catch_up(self, maximum: int | None = None) -> None:
-        """Continue a replay by `maximum` measurements, or to its end, where it becomes the estimate."""
+        """Continue an unfinished replay by `maximum` measurements, by default to its end."""
         branch = self._branch
         if branch is None:
             return
@@ -325,35 +342,35 @@ class AttitudeFilter:
 
     @property
     def doubts_commands(self) -> bool:
-        """Whether the motion contradicts the commands, so that the coil currents are unknown."""
+        """Whether the coil currents are unknown because the motion contradicted the commands."""
         return self._check.active
 
     @property
     def latency(self) -> float:
-        """Estimated age of the inertial unit's samples at their time stamp, s, within plausible limits."""
+        """Estimated age (s) of the inertial unit's samples at their time stamps, between plausible limits."""
         found = self._history.newest.state.latency if self._history else self._prior.latency
         return min(max(found, 0.0), LONGEST_LATENCY)
 
     def at(self, time_ns: int) -> Estimate:
-        """Return the estimate propagated to `time_ns`; the filter does not change."""
+        """Return the newest estimate propagated to `time_ns`, without changing the filter."""
         return self._model.estimate(self._history.newest, time_ns, self.measured_ns)
 
     def past(self, time_ns: int) -> Estimate | None:
-        """Return the estimate at a past time; None before the first checkpoint of the history."""
+        """Return the estimate at a past time, or None for a time before the recorded history."""
         then = self._history.at(time_ns)
         return None if then is None else self._model.estimate(then, time_ns, then.time_ns)
 
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
-        """Return times (n,) ns and rates (n, 3) rad/s that span an interval; None outside the history."""
+        """Return times (n,) ns and rates (n, 3) rad/s of an interval, or None if the history is too short."""
         return self._history.rates(begin_ns, end_ns)
 
     def _is_newest(self, measurement: Measurement) -> bool:
         return bool(self._history) and measurement.begin_ns >= self._history.newest.time_ns
 
     def _apply(self, measurements: list[Measurement], asked: Measurement) -> bool:
-        """Apply measurements in order of time after the newest checkpoint.
+        """Apply measurements in order of time to the newest checkpoint.
 
-        Return whether `asked` was used.
+        Return whether the measurement `asked` passed the gate.
         """
         replay = Replay(self._model, self._history.newest, measurements)
         replay.advance()
@@ -363,9 +380,9 @@ class AttitudeFilter:
         return mine.used
 
     def _count(self, kind: type[Measurement], used: bool) -> None:
-        """Count consecutive rejections, and restart the filter after too many rejections.
+        """Count consecutive rejections, and restart the filter after too many of them.
 
-        Mean rates are too rare to restart the filter.
+        Rejected mean rates do not restart the filter, because mean rates are rare.
         """
         in_a_row = 0 if used else self._refused_in_a_row.get(kind, 0) + 1
         self._refused_in_a_row[kind] = in_a_row

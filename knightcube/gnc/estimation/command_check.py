@@ -1,15 +1,16 @@
 """Checks with the gyro whether the coils carry the commanded currents.
 
-A command is an assumption, a measured rate is not. While a coil is broken the model predicts an acceleration
-that does not occur: the innovations of the gyro, which agree with their covariance in every healthy flight,
-exceed it within one to a few samples. The currents are then unknown, from a little earlier on, and the filter
-follows the gyro. A change of the rate that no coil current can cause does not count as contradiction,
-because the gyro may be faulty.
+While a coil is broken, the model predicts an acceleration that does not occur. The innovations of the gyro
+then exceed their covariance within one to a few samples, which they do not in a healthy flight. The filter
+from then on treats the coil currents as unknown, also for the last half second, and follows the gyro. A
+change of the rate that no coil current can cause does not contradict the commands, because the gyro may be
+faulty.
 
-The commands are trusted again when the rate follows them. Over the last second the share g of the commanded
-change c of the rate is fitted to the gyro samples, z = b + g c. The commands must have moved the body enough
-to determine g, g must be 1, and the residuals must be white. A body that is not driven proves nothing. More
-gyro noise than assumed raises the scale of the departures and not an alarm.
+The commands are trusted again when the rate follows the commands. The model z = b + g c is fitted to the gyro
+samples z of the last second, where c is the change of the rate that the commands should cause. The response g
+must be determined well, be 1 within its uncertainty, and leave white residuals. A body whose coils are not
+driven therefore never restores the trust. If the gyro is noisier than assumed, the check widens its limits
+and does not raise an alarm.
 """
 
 from __future__ import annotations
@@ -25,36 +26,36 @@ from knightcube.gnc.estimation.measurements import RateMeasurement
 from knightcube.gnc.estimation.replay import Checkpoint, PropagationModel
 
 _DEPARTURES = {1: 5.5, 4: 5.5, 16: 7.5}
-"""Largest mean departure, in its standard deviations, by the number of consecutive samples that are averaged.
-Strong faults show in one sample, weak ones in the mean of many. Healthy flights reach 2.8, 4.0 and 7.0; over
-more samples the errors of the model add up."""
+"""Largest mean innovation of the gyro, in standard deviations, for each number of samples that are averaged.
+A strong fault is detected in one sample, a weak fault only in the mean of many samples. Healthy flights reach
+2.8, 4.0 and 7.0 standard deviations in the means of 1, 4 and 16 samples."""
 _BEFORE_NS = 500_000_000
-"""Time (ns) before the first sample of a departure from which the currents are unknown. The effects of a weak
-fault on the other states before its detection are undone."""
+"""Time (ns) by which the currents are treated as unknown before the first contradicting sample. The earlier
+start undoes the effects that a weak fault has on the other states before the fault is detected."""
 _MAXIMUM_CHANGE = 3.0
-"""Largest explained departure, as a multiple of the largest change of the rate by the coils: a reversed coil
-departs by two, and the age of a sample is uncertain."""
+"""Largest innovation that a coil fault can explain, as a multiple of the largest change of the rate by the
+coils. A reversed coil causes twice the change of the rate, and the uncertain age of a sample adds to this."""
 _SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
-"""Bounds of the time (s) between samples over which currents may have acted: a longer gap would explain any
-departure."""
+"""Bounds of the assumed time (s) between samples. Without an upper bound, a coil fault during a long gap
+could explain any innovation."""
 _PROOF = 1.0
-"""Duration (s) of the samples that confirm the commands again."""
+"""Time span (s) of the gyro samples that must confirm the commands before the commands are trusted again."""
 _SHARE_SIGMA = 0.2
-"""Largest standard deviation of the fitted share that proves something."""
+"""Largest standard deviation of the fitted response g at which the commands can be confirmed."""
 _WHITE = 0.5
-"""Minimum ratio of half the mean squared successive difference of the residuals to their mean square. The
-ratio is one for white noise (von Neumann 1941) and near zero for a drift."""
+"""Minimum ratio, for white residuals, of half their mean squared successive difference to their mean square.
+This ratio of the residuals is one for white noise (von Neumann 1941) and near zero for a drift."""
 _SCALE_OVER = 64.0
-"""Number of samples over which the scale of the departures is averaged."""
+"""Number of gyro samples over which the scale of the gyro noise is averaged."""
 _SHARE_ERROR = 0.15
-"""Error of the share that the error of the modelled coil gain explains."""
+"""Deviation of the fitted response g from 1 that the error of the modelled coil gain can explain."""
 
 
 class CommandCheck:
-    """Compares the gyro samples with the commands.
+    """Check of the commanded coil currents against the gyro samples.
 
     Attributes:
-        active: whether the coils may carry other currents than commanded.
+        active: whether the coils are suspected to carry other currents than commanded.
         ended_ns: time at which the commands were last trusted again.
     """
 
@@ -70,9 +71,9 @@ class CommandCheck:
         self._commanded: FloatArray = np.zeros(1)
 
     def judge(self, newest: Checkpoint) -> int | None:
-        """Return the time from which on the currents are unknown if the newest checkpoint raises the alarm.
+        """Return the time (ns) since which the currents are unknown if the newest checkpoint raises an alarm.
 
-        Otherwise, and for a checkpoint of another measurement than a rate, return None.
+        Return None without an alarm, and if the measurement of the checkpoint is not a gyro rate.
         """
         rate = newest.measurement
         if not isinstance(rate, RateMeasurement) or not self._model.noise.unknown_current:
@@ -80,7 +81,7 @@ class CommandCheck:
         if self.active:
             self._test_recovery(newest.state, rate)
             return None
-        assert newest.variance is not None  # only the first checkpoint, which is not judged, has none
+        assert newest.variance is not None  # only the first checkpoint has no variance, and it is not checked
         spreads = [math.sqrt(variance) for variance in newest.variance.diagonal().tolist()]
         departure = [value / spread for value, spread in zip(newest.innovation, spreads, strict=True)]
         largest = _DEPARTURES[1] * self._scale
@@ -100,10 +101,10 @@ class CommandCheck:
         return None
 
     def _explains(self, newest: Checkpoint) -> bool:
-        """Return whether coil currents together with the noise can have caused a departure."""
+        """Return whether wrong coil currents together with the noise can explain the newest innovation."""
         assert newest.variance is not None
         gap = (newest.time_ns - self._departures[-1][0]) * 1e-9 if self._departures else _SHORTEST_GAP
-        # The largest change of the rate, rad/s, by unknown currents.
+        # Below, `change` is the largest change of the rate (rad/s) that unknown currents can cause.
         state, model, duration = newest.state, self._model, min(max(gap, _SHORTEST_GAP), _LONGEST_GAP)
         idle = model.body.linearise(state.quaternion, state.rate, state.parameters, model.commands.idle, 0.0)
         change = model.noise.unknown_current * np.abs(idle.by_current).sum(axis=1) * duration
@@ -112,7 +113,7 @@ class CommandCheck:
         return bool((np.abs(newest.innovation) <= noise + _MAXIMUM_CHANGE * most).all())
 
     def _test_recovery(self, state: FilterState, rate: RateMeasurement) -> None:
-        """Record a sample, and trust the commands again if the rate follows them."""
+        """Record a gyro sample, and trust the commands again if the rate follows the commands."""
         before_ns = self._samples[-1][0] if self._samples else rate.time_ns
         commanded, natural = self._changes(state, before_ns, rate.time_ns)
         self._natural = self._natural + natural
@@ -126,9 +127,9 @@ class CommandCheck:
                 return
 
     def _follows(self, variance: FloatArray) -> bool:
-        """Return whether the recorded rates are b + c, c the commanded changes.
+        """Return whether the recorded rates are a constant plus the changes that the commands should cause.
 
-        Set the scale of the noise.
+        If so, also set the scale of the gyro noise.
         """
         _, rates, commanded = zip(*self._samples, strict=True)
         weight = 1.0 / np.sqrt(variance)
@@ -151,7 +152,7 @@ class CommandCheck:
         self._natural = self._commanded = np.zeros(1)
 
     def _changes(self, state: FilterState, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Return the modelled change of the rate, rad/s, by the commanded coils and by all other causes."""
+        """Return the modelled changes of the rate (rad/s) by the coil commands and by all other causes."""
         commanded, natural = np.zeros(3), np.zeros(3)
         for torquing, span_ns in self._model.commands.spans(from_ns, to_ns):
             found = self._model.body.accelerate(state.quaternion, state.rate, state.parameters, torquing)
@@ -161,7 +162,7 @@ class CommandCheck:
         return commanded[self._axes], natural[self._axes]
 
     def _variance(self, state: FilterState, rate: RateMeasurement) -> FloatArray:
-        """Return the variance of a sample, including that of the coils' noise after half of `_PROOF`."""
+        """Return the variance of a gyro sample plus that of the rate due to the noise of the coils."""
         model = self._model
         idle = model.body.linearise(state.quaternion, state.rate, state.parameters, model.commands.idle, 0.0)
         by_coils = 0.5 * _PROOF * model.noise.current * (idle.by_current**2).sum(axis=1)

@@ -1,4 +1,4 @@
-"""State, prior and estimate of the attitude filter, and the parameters of the model that it may estimate."""
+"""State, prior and estimate of the attitude filter, and the model parameters that the filter may estimate."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from knightcube.gnc.estimation.rotation import Quaternion, Vector
 
 ATTITUDE, RATE, BIAS, DISTURBANCE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 PARAMETERS, LATENCY, FIELD_BIAS = slice(12, 15), 15, slice(16, 19)
-"""Indices of the parts of the error state in the covariance (19, 19)."""
+"""Indices of attitude, rate and the other components of the error state in the covariance (19, 19)."""
 SIZE = 19
 """Size of the error state."""
 
 
 class Parameters(NamedTuple):
-    """Uncertain parameters of the model, which may be estimated.
+    """Uncertain parameters of the body's model, which the filter may estimate.
 
     Attributes:
-        torsion: 1/s^2, k / J22 of the thread.
-        damping: 1/s, c / J22 of the thread.
-        gain: ratio of the true to the modelled acceleration by the coils (dipole times field over inertia).
+        torsion: stiffness k of the thread divided by the moment of inertia J22, 1/s^2.
+        damping: damping constant c of the thread divided by the moment of inertia J22, 1/s.
+        gain: ratio of the true to the modelled angular acceleration by the coils.
     """
 
     torsion: float = 0.0
@@ -37,7 +37,7 @@ NOMINAL = Parameters()
 
 
 class Knowledge(Enum):
-    """Accuracy with which the attitude is known."""
+    """Accuracy class of the attitude estimate."""
 
     FINE = "fine"
     COARSE = "coarse"
@@ -46,18 +46,19 @@ class Knowledge(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """The estimate at `time_ns`.
+    """The estimate of the attitude filter at the time `time_ns`.
 
     Attributes:
-        quaternion: (4,) reference into body.
-        rate: (3,) rad/s, body axes.
-        bias: (3,) rad/s, of the gyro.
-        disturbance: (3,) rad/s^2, angular acceleration that the model does not contain.
-        parameters: torsion and damping of the thread, gain of the coils.
-        covariance: (19, 19) of the error state: small rotations about the body axes, rate, and so on.
-        measured_ns: time of the newest measurement used.
-        latency: s, age of the inertial unit's samples at their time stamp.
-        field_bias: (3,) T, bias of the magnetometer, body axes.
+        quaternion: attitude (4,), from reference axes into body axes.
+        rate: body rate (3,) in body axes, rad/s.
+        bias: gyro bias (3,) in body axes, rad/s.
+        disturbance: angular acceleration (3,) that the model does not contain, rad/s^2.
+        parameters: estimated torsion and damping of the thread, and gain of the coils.
+        covariance: covariance (19, 19) of the error state, whose attitude error is a rotation vector in body
+            axes.
+        measured_ns: time of the newest accepted measurement, ns.
+        latency: age of the inertial unit's samples at the time of their time stamps, s.
+        field_bias: magnetometer bias (3,) in body axes, T.
     """
 
     time_ns: int
@@ -76,9 +77,9 @@ class FilterState(NamedTuple):
     """The state of the filter at one time, as tuples of floats.
 
     Attributes:
-        kept: attitudes at the starts of exposures, in order of time, each with its measurement.
-        latency: s, age of the inertial unit's samples at their time stamp.
-        field_bias: T, of the magnetometer, body axes.
+        kept: attitude at the start of each unfinished exposure, with the mean rate measured in that exposure.
+        latency: age of the inertial unit's samples at the time of their time stamps, s.
+        field_bias: magnetometer bias in body axes, T.
     """
 
     quaternion: Quaternion
@@ -97,12 +98,12 @@ class FilterState(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlowPrior:
-    """Prior of the states that change slowly or not at all; a variance of zero marks a known state.
+    """Prior of the slowly changing and constant states; a state with zero variance is not estimated.
 
     Attributes:
-        bias: (3,) rad/s of the gyro, and `bias_covariance` (3, 3).
-        parameters: of the model, and `parameters_covariance` (3, 3).
-        latency: s, age of the inertial unit's samples at their time stamp, and `latency_variance`.
+        bias: gyro bias (3,), rad/s, with covariance `bias_covariance` (3, 3).
+        parameters: parameters of the body's model, with covariance `parameters_covariance` (3, 3).
+        latency: age of the inertial unit's samples at the time of their time stamps, s.
     """
 
     bias: FloatArray = field(default_factory=lambda: np.zeros(3))

@@ -1,16 +1,17 @@
 """The body rate from the magnetometer: an extended Kalman filter of rate, field and field derivative.
 
-In a rotating body the field rotates on a cone about the rate, so that the direction of the field over time
-gives all three components of the rate, including the one along the field. Only a spin exactly along the field
-is not observable until the field has rotated (by about two revolutions an orbit). A gyro gives that spin at
-once. The states are in body axes: rate w, field B, inertial time derivative v of the field, and a small
-rotation a of the principal axes from those of the assumed inertia. At a fast spin of a long body, the
-gyroscopic torque by 2 deg of such a rotation is the largest error of the model:
+Relative to a rotating body, the field direction moves on a cone about the rate vector. The motion of the
+field direction therefore gives all three components of the rate, including the component along the field.
+Only a spin exactly along the field is not observable until the field direction has changed, which it does by
+about two revolutions per orbit. A gyro sample resolves a spin along the field at once. The states, in body
+axes, are the rate w, the field B, the inertial time derivative v of the field, and a small rotation a of the
+principal axes from the assumed principal axes. For a fast spinning long body, principal axes that are wrong
+by 2 deg cause the largest error of the torque model. The equations of motion are
 
     J(a) w' = m x B - w x J(a) w,    B' = v - w x B,    v' = -w x v,    a' = 0.
 
-The dipole m of the coils is known, so that the coils may act between measurements. The filter also integrates
-the rotation since its start, so that the initial body axes serve as an inertial frame.
+The dipole moment m of the coils is known, so the coils may be driven between field measurements. The filter
+also integrates the rotation since its start, so the initial body axes can serve as an inertial frame.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ from knightcube.gnc.estimation.rotation import (
 RATE, FIELD, CHANGE, AXES = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 SIZE = 12
 LARGEST_ROTATION = 0.15
-"""Largest rotation (rad) in a step of integration."""
+"""Largest rotation (rad) of the body in one integration step."""
 _AGREEING = 3
-"""Number of samples that start the filter."""
+"""Number of consecutive consistent field samples that start the filter."""
 _EYE: FloatArray = np.eye(SIZE)
 _NONE: Vector = (0.0, 0.0, 0.0)
 
@@ -50,21 +51,23 @@ class FieldRateSettings:
     """Noise of the filter.
 
     Attributes:
-        inertia: (3, 3) kg m^2, body axes.
-        field_sigma: T per axis of a measurement, including constant errors of the magnetometer.
-        rate_start: rad/s, standard deviation of the rate along the field at the start.
-        change_start: T/s, standard deviation of the field's inertial time derivative at the start.
-        change_walk: T/s per sqrt(s), random walk of the field's inertial time derivative.
-        torque_walk: rad/s per sqrt(s) per axis, from torques that are not modelled.
-        axes_sigma: rad, rotation of the principal axes from those of `inertia` at the start.
-        inertia_error: error of the gyroscopic torque, as a fraction of it, in addition to the effect of
-            rotated principal axes.
-        gate_sigma: gate; a measurement less likely than this many sigma of one component is refused.
+        inertia: assumed inertia tensor (3, 3) in body axes, kg m^2.
+        field_sigma: standard deviation of a field measurement per axis, including constant magnetometer
+            errors, T.
+        rate_start: initial standard deviation of the rate along the field, rad/s.
+        change_start: initial standard deviation of the field's inertial time derivative, T/s.
+        change_walk: random walk of the field's inertial time derivative, T/s per sqrt(s).
+        torque_walk: random walk of the rate per axis due to unmodelled torques, rad/s per sqrt(s).
+        axes_sigma: initial standard deviation of the rotation of the principal axes from those of `inertia`,
+            rad.
+        inertia_error: relative error of the gyroscopic torque, without the effect of wrong principal axes.
+        gate_sigma: a measurement less likely than a deviation of this many sigma in one component is
+            rejected.
         refusals: number of consecutively rejected measurements after which the filter restarts, or the gyro
             is excluded.
-        gyro_sigma: rad/s per axis, bound of the gyro bias.
-        longest_gap: s, largest time between the samples that start the filter, because longer gaps can hide
-            fast spins.
+        gyro_sigma: assumed bound of the gyro bias per axis, rad/s.
+        longest_gap: longest time between the samples that start the filter, s; longer gaps can hide a fast
+            spin.
     """
 
     inertia: FloatArray
@@ -82,12 +85,12 @@ class FieldRateSettings:
 
 
 def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatArray:
-    """Return the rate (3,) rad/s across the field that rotated `before` into `after` (3,) T, body axes.
+    """Return the body rate (3,) rad/s that rotated the field `before` into `after`, both (3,) T in body axes.
 
-    The result is exact for a steady rotation across the field by less than half a revolution, and zero
-    without a field.
+    Only the rate across the field can be found. It is exact for a steady rotation of less than half a
+    revolution across the field, and zero without a field.
     """
-    rotated = np.cross(after, before)  # -w x B: the field rotates opposite to the body
+    rotated = np.cross(after, before)  # the field rotates opposite to the body
     length = float(np.linalg.norm(rotated))
     if length == 0.0:
         return np.zeros(3)
@@ -96,7 +99,7 @@ def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatA
 
 
 class FieldRate:
-    """The filter; `restarts` counts the restarts after failed predictions."""
+    """The rate filter with its count `restarts` of restarts after failed predictions."""
 
     def __init__(self, settings: FieldRateSettings) -> None:
         self._settings = settings
@@ -105,13 +108,13 @@ class FieldRate:
         self._inertia_rows, self._inverse_rows = rows_of(inertia), rows_of(self._inverse)
         moments = np.linalg.eigvalsh(inertia)
         self._differences = float(moments[-1] - moments[0]) / np.diag(inertia)
-        # About as rare as `gate_sigma` of one component, by the exponential part of the tail.
+        # This bound of chi-square is exceeded about as rarely as `gate_sigma` by one normal component.
         self._gate = (settings.gate_sigma + 1.0) ** 2
         self.restarts = 0
         self.restart()
 
     def restart(self) -> None:
-        """Reset the filter except for the count `restarts`."""
+        """Reset the filter, but keep the count of restarts."""
         self._waiting: list[tuple[float, FloatArray]] = []
         self._since = 0.0
         self._refused = self._gyro_refused = 0
@@ -129,27 +132,27 @@ class FieldRate:
 
     @property
     def rate(self) -> FloatArray:
-        """Body rate (3,) rad/s, body axes."""
+        """Body rate (3,) in body axes, rad/s."""
         return np.array(self._rate or _NONE)
 
     @property
     def field(self) -> FloatArray:
-        """Field (3,) T, body axes, at the end of the last `advance`."""
+        """Predicted field (3,) in body axes after the last `advance`, T."""
         return np.array(self._field)
 
     @property
     def change(self) -> FloatArray:
-        """Time derivative (3,) of the field in inertial axes, T/s, expressed in body axes."""
+        """Time derivative (3,) of the field relative to inertial space, expressed in body axes, T/s."""
         return np.array(self._change)
 
     @property
     def rotation(self) -> FloatArray:
-        """Rotation (4,) since the start, from the body axes at the start into the present ones."""
+        """Quaternion (4,) of the rotation from the body axes at the start into the present body axes."""
         return np.array(self._rotation)
 
     @property
     def inverse(self) -> FloatArray:
-        """Inverse (3, 3) of the inertia with the estimated principal axes."""
+        """Inverse (3, 3) of the inertia tensor with the estimated principal axes."""
         return self._inverse
 
     @property
@@ -159,11 +162,11 @@ class FieldRate:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance (12, 12) of rate, field, derivative and axes (RATE, FIELD, ...)."""
+        """Covariance (12, 12) of the rate, the field, its derivative and the principal axes."""
         return self._covariance
 
     def advance(self, dipole: FloatArray, seconds: float) -> None:
-        """Propagate by `seconds` under a dipole (3,) A m^2, body axes."""
+        """Propagate the state by `seconds` under a dipole moment (3,) A m^2 of the coils, body axes."""
         self._since += seconds
         if self._rate is None:
             return
@@ -174,9 +177,9 @@ class FieldRate:
             self._step((mx, my, mz), seconds / steps)
 
     def measure(self, field: FloatArray, age: float = 0.0) -> bool:
-        """Apply the field (3,) T measured `age` s ago with the coils off; return whether it was plausible.
+        """Apply a field (3,) T measured `age` s ago with the coils off; return whether it passed the gate.
 
-        The field is propagated to the present with the body rate.
+        The measured field is rotated into the present body axes with the body rate.
         """
         if not np.all(np.isfinite(field)):
             return False
@@ -200,11 +203,12 @@ class FieldRate:
         return True
 
     def measure_rate(self, rate: FloatArray) -> None:
-        """Apply the present gyro rate (3,) rad/s, if it is more accurate than the filter.
+        """Apply the present gyro rate (3,) rad/s if the gyro is more accurate than the filter.
 
-        The error of the gyro is a bias: frequent use would reduce the covariance below that bias. A gyro that
-        contradicts the filter several times in a row, or after which the predictions of the field failed, is
-        excluded until `restart`. If it contradicts an estimate that used it, the filter restarts.
+        The error of the gyro is mostly a bias, and frequent use of the gyro would reduce the covariance below
+        that bias. A gyro that contradicts the filter several times in a row is excluded until `restart`. The
+        gyro is also excluded if the field predictions fail after its rate was used. If the gyro contradicts
+        an estimate that used the gyro, the filter restarts.
         """
         settings, covariance = self._settings, self._covariance
         if self._rate is None or self._gyro_refused >= settings.refusals or not np.all(np.isfinite(rate)):
@@ -228,7 +232,7 @@ class FieldRate:
         self.restarts += 1
 
     def _correct(self, gain: FloatArray, innovation: FloatArray, measured: slice) -> None:
-        """Correct the state by a gain (12, 3) and an innovation (3,) of the states `measured`."""
+        """Correct the state by a gain (12, 3) and an innovation (3,) of the components `measured`."""
         assert self._rate is not None
         change = (gain @ innovation).tolist()
         self._rate = added(self._rate, change[RATE])
@@ -240,17 +244,17 @@ class FieldRate:
         self._update_unexplained()
 
     def _update_unexplained(self) -> None:
-        """Set the unexplained share of the gyroscopic torque to the uncertainty of the principal axes.
+        """Set the relative error of the gyroscopic torque to the uncertainty of the principal axes.
 
-        The filter is linearised, so that its covariance would become too small while the rotation of the axes
-        is poorly known. The least certain direction is omitted, because a rotation about the axis of a
-        symmetric body is not observable.
+        Otherwise the covariance of the linearised filter would become too small while the principal axes are
+        poorly known. The least certain axis is omitted, because a rotation about the axis of a symmetric body
+        is not observable.
         """
         unknown = float(np.linalg.eigvalsh(self._covariance[AXES, AXES])[1])
         self._unexplained = max(self._settings.inertia_error, math.sqrt(unknown))
 
     def _start(self, field: FloatArray) -> None:
-        """Start with the rate across the field if three consecutive samples agree; otherwise wait."""
+        """Start with the rate across the field once three consecutive field samples agree."""
         settings = self._settings
         if self._since > settings.longest_gap:
             self._waiting.clear()
@@ -276,7 +280,7 @@ class FieldRate:
         self._rate, self._field, self._change = _floats(rate), _floats(last), _NONE
         along = np.outer(last, last) / square
         across = 2.0 * (settings.field_sigma / span) ** 2 / square + settings.torque_walk**2 * span
-        # Between the samples, the rate across the field rotates about the field in body axes.
+        # The rate across the field rotates about the field, in body axes, between the samples.
         across += (float(rate @ rate) * span) ** 2
         self._covariance[RATE, RATE] = (
             across * np.eye(3) + (settings.rate_start**2 + float(rate @ rate)) * along
@@ -287,7 +291,7 @@ class FieldRate:
         self._update_unexplained()
 
     def _rotate_axes(self, inertia: FloatArray, vector: Sequence[float]) -> None:
-        """Rotate the principal axes of `inertia` by a rotation vector (3,) rad."""
+        """Set the inertia to `inertia` with the principal axes rotated by a rotation vector (3,) rad."""
         x, y, z = vector
         rotation = np.array(matrix(exponential(x, y, z))).T
         self._inertia = rotation @ inertia @ rotation.T
@@ -306,14 +310,14 @@ class FieldRate:
         rotated = exponential(dt * middle[0], dt * middle[1], dt * middle[2])
         rotation = matrix(rotated)
         self._rate = _moved(rate, acceleration, dt)
-        # The rotation of the field is exact: by the midpoint rule its length would grow over an hour.
+        # The field is rotated exactly, because the midpoint rule would change its strength within an hour.
         self._field = _moved(times(rotation, field), times(rotation, change), dt)
         self._change = times(rotation, change)
         self._rotation = compose(rotated, self._rotation)
         transition = _EYE + flow + 0.5 * (flow @ flow)
         covariance = transition @ self._covariance @ transition.T
         settings = self._settings
-        # The error of the gyroscopic torque keeps its sign while the body rotates by a radian.
+        # The error of the gyroscopic torque is correlated while the body rotates by less than about a radian.
         speed = math.sqrt(middle[0] ** 2 + middle[1] ** 2 + middle[2] ** 2)
         walks = covariance.reshape(-1)[:: SIZE + 1]
         gyroscopic = self._unexplained * self._differences
@@ -326,14 +330,14 @@ class FieldRate:
         return times(self._inverse_rows, _difference(cross(dipole, field), cross(rate, momentum)))
 
     def _flow(self, rate: Vector, field: Vector, change: Vector, dipole: Vector, dt: float) -> FloatArray:
-        """Return the derivative (12, 12) of the change of the states over dt by the states."""
+        """Return the Jacobian (12, 12) of the change of the states during dt with respect to the states."""
         cross_rate = np.array(skew(rate))
         momentum = times(self._inertia_rows, rate)
         torque = _difference(cross(dipole, field), cross(rate, momentum))
         flow = np.zeros((SIZE, SIZE))
         gyroscopic = np.array(skew(momentum))
         flow[RATE, RATE] = self._inverse @ (gyroscopic - cross_rate @ self._inertia)
-        # A small rotation d changes J w by d x J w - J (d x w), and J^-1 T in the same way.
+        # A small rotation d of the axes changes J w by d x J w - J (d x w), and J^-1 T in the same way.
         by_rotation = self._inverse @ (
             np.array(skew(torque)) - cross_rate @ (self._inertia @ cross_rate - gyroscopic)
         )

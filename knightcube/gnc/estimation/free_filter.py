@@ -1,20 +1,20 @@
 """The navigation filter of a free satellite: attitude, rate, biases, residual dipole and torques.
 
-A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
-gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. Unlike
-`attitude_filter`, which replays each late sample at its own time, a late attitude is propagated to the
-present with the present rate, and its innovation includes the error of that rate. This is accurate for some
-seconds, in which the rate of a body that is slow enough for star images is nearly constant. One step with its
-gyro sample takes 0.3 ms.
+A multiplicative extended Kalman filter integrates Euler's equation with the coils' dipole moment, the gravity
+gradient and the estimated disturbances, in steps of a second or two. Gyro samples are treated as
+measurements. The filter propagates a late attitude to the present with the present rate, whose error enters
+the innovation. This is accurate for some seconds, because the rate of a body that rotates slowly enough for
+star images is nearly constant in that time. The module `attitude_filter` instead applies each late sample at
+its own time. A filter step with one gyro sample takes 0.3 ms.
 
-The residual dipole has a constant part and a part proportional to the sunlight. The sizes of the torques of
-`knightcube.astro.earth.disturbance` are states too. A further state is a small rotation of the principal axes
-from the assumed axes. At a fast spin of a long body, the gyroscopic torque by this rotation is the largest
-unknown torque, and would otherwise be attributed to the gyro bias.
+The residual dipole moment has a constant part and a part proportional to the sunlight. The sizes of the
+disturbance torques of `knightcube.astro.earth.disturbance` are states of the filter. A small rotation of the
+principal axes from the assumed axes is a further state. In a fast spinning long body, wrong principal axes
+cause the largest unknown torque, which would otherwise be attributed to the gyro bias.
 
-The error of the field model is a vector that keeps its sign for minutes: a Gauss-Markov process of first
-order in body axes. While the attitude is known accurately, the standard deviation of this error is estimated
-by expectation maximisation (Dempster, Laird & Rubin 1977), from the squared estimate and its variance.
+The error of the field model is correlated over minutes and is modelled as a first-order Gauss-Markov process
+in body axes. While the attitude is known accurately, the standard deviation of this error is estimated by
+expectation maximisation (Dempster, Laird & Rubin 1977), from the squared estimate and its variance.
 """
 
 from __future__ import annotations
@@ -43,15 +43,16 @@ AXES = slice(18 + SIZES, 21 + SIZES)
 SLOW = slice(GYRO.start, AXES.stop)
 FIELD = slice(21 + SIZES, 24 + SIZES)
 STATES = 24 + SIZES
-"""Indices of the parts of the error state. SLOW are the slowly varying states, from GYRO to AXES."""
+"""Indices of the components of the error state. The slice SLOW contains the slowly varying states, from GYRO
+to AXES."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterEnvironment:
-    """The environment of the satellite at one time, ICRS.
+    """The environment of the satellite at one time, ICRS axes.
 
-    `field` (3,) T, `position` (3,) m, `pressures` of air and light, and the visible share `sunlit` of the
-    Sun.
+    `field` (3,) is the magnetic field (T), `position` (3,) the position (m), `pressures` the pressures of air
+    and sunlight, and `sunlit` the visible fraction of the Sun's disk.
     """
 
     field: FloatArray
@@ -61,20 +62,20 @@ class FilterEnvironment:
 
 
 class FreeMotion:
-    """Euler's equation of a satellite in orbit, whose principal axes may be rotated."""
+    """Euler's equation of a satellite in orbit, with principal axes that can be corrected."""
 
     def __init__(self, inertia: FloatArray) -> None:
-        """`inertia` (3, 3) kg m^2, body axes."""
+        """Create the equation for an assumed inertia tensor (3, 3) kg m^2 in body axes."""
         self._assumed: FloatArray = np.asarray(inertia, dtype=float)
         moments = np.linalg.eigvalsh(self._assumed)
         self.largest_difference = float(moments[-1] - moments[0])
-        """Largest difference of the principal moments, kg m^2."""
+        """Largest difference between two principal moments of inertia, kg m^2."""
         self._areas = box_areas(self._assumed)
         self._rotation: FloatArray = np.zeros(3)
         self._set_inertia(self._assumed)
 
     def rotate_axes(self, rotation: FloatArray) -> None:
-        """Rotate the principal axes from the assumed ones by a rotation vector (3,) rad, body axes."""
+        """Set the principal axes to the assumed axes rotated by a rotation vector (3,) rad, body axes."""
         if np.array_equal(rotation, self._rotation):
             return
         self._rotation = rotation.copy()
@@ -85,14 +86,14 @@ class FreeMotion:
         self.inertia: FloatArray = inertia
         self.inverse: FloatArray = np.asarray(np.linalg.inv(inertia), dtype=float)
         self.by_torque: FloatArray = self.inverse @ self.inverse
-        """Covariance (3, 3) of the acceleration per variance of the torque."""
+        """Covariance (3, 3) of the angular acceleration per variance of each torque component."""
 
     def acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
         """Return the angular acceleration (3,) rad/s^2 at a rate (3,) rad/s under a torque (3,) N m."""
         return np.asarray(self.inverse @ (torque - cross_matrix(rate) @ (self.inertia @ rate)))
 
     def stiffness(self, rate: FloatArray) -> FloatArray:
-        """Return the derivative (3, 3) of the acceleration by the rate (3,) rad/s."""
+        """Return the derivative (3, 3) of the angular acceleration with respect to the rate (3,) rad/s."""
         return np.asarray(
             self.inverse @ (cross_matrix(self.inertia @ rate) - cross_matrix(rate) @ self.inertia)
         )
@@ -102,7 +103,7 @@ class FreeMotion:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the torque (3,) N m, and the error dynamics (6, 33) without the columns of rate and axes.
 
-        `dipole` (3,), A m^2, is the sum of the coils' and the residual dipole. `sizes` (9,), N m, are the
+        `dipole` (3,) A m^2 is the sum of the coils' and the residual dipole moment. `sizes` (9,) N m are the
         sizes of the disturbance torques.
         """
         to_body = attitude_matrix(quaternion)
@@ -124,51 +125,50 @@ class FreeMotion:
         return torque, flow
 
     def by_axes(self, rate: FloatArray, acceleration: FloatArray) -> FloatArray:
-        """Return the derivative (3, 3) of the acceleration by a rotation of the axes, without gravity."""
+        """Return the derivative (3, 3) of the gyroscopic acceleration by a rotation of the principal axes."""
         return np.asarray(
             -self.inverse @ (cross_matrix(rate) @ self._by_rotation(rate) + self._by_rotation(acceleration))
         )
 
     def _by_rotation(self, vector: FloatArray) -> FloatArray:
-        """Return the derivative (3, 3) of J v by a small rotation d of J: d x J v - J (d x v)."""
+        """Return the derivative (3, 3) of J v by a small rotation d of J, which adds d x J v - J (d x v)."""
         return np.asarray(self.inertia @ cross_matrix(vector) - cross_matrix(self.inertia @ vector))
 
 
 LASTING = 20.0
-"""Correlation time (s) of errors of the coils and of the inertia, which scales the white noise that models
-these errors."""
+"""Correlation time (s) of coil and inertia errors, for the white noise that models these errors."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
-"""Expected sizes of the torques, relative to the size of the torque by air. The constant torque is small,
-because the rotation of the principal axes has its own states. At one attitude the torques cannot be
-distinguished, and a torque by air that is attributed to the constant torque is wrong at every other
+"""Expected sizes of the constant, air and sunlight torques, relative to the size of the air torque. The
+expected constant torque is small, because wrong principal axes have their own states. At one attitude the
+torques cannot be distinguished. Air torque that is attributed to the constant torque is wrong at every other
 attitude."""
 PLAUSIBLE = 4.0
-"""Largest plausible deviation of a slow state, in standard deviations at the start."""
+"""Largest plausible value of a slow state, in initial standard deviations of the state."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeFilterSettings:
     """Noise and limits of the filter.
 
-    A pair of values is the standard deviation at the start and the random walk per sqrt(s).
+    Each pair of values holds the initial standard deviation of a state and its random walk per sqrt(s).
 
     Attributes:
         gyro: rad/s, gyro bias.
-        dipole, sunlit: A m^2, residual dipole: constant part, and part in sunlight.
-        magnet: T, magnetometer bias.
-        field: T per axis, error of the field model before it is learned.
-        field_memory: s, correlation time of the error of the field model.
-        torque: N m, size of the torque by air; the sizes of the other torques follow from the ratios of this
-            module.
-        torque_noise: N m sqrt(s), white noise of all other torques.
-        coil_error: relative error of the coils' dipole for tens of seconds, in any direction.
-        coil_noise: A m^2 sqrt(s), white noise of each coil while the coils are driven.
-        axes: rad, rotation of the principal axes.
-        inertia_error: error of the gyroscopic torque, as a fraction of it, in addition to the effect of
-            rotated principal axes.
-        rate_start: rad/s, error of the first rate.
-        fine, coarse: rad, largest sigma of the worst axis of a fine and of a coarse attitude.
-        gate_sigma: gate; a measurement less likely than this many sigma of one component is refused.
+        dipole, sunlit: constant and sunlit part of the residual dipole moment, A m^2.
+        magnet: magnetometer bias, T.
+        field: initial standard deviation per axis of the field model's error, T.
+        field_memory: correlation time of the field model's error, s.
+        torque: size of the air torque, N m; it also scales the other disturbance torques.
+        torque_noise: white noise of all unmodelled torques, N m sqrt(s).
+        coil_error: relative error of the coils' dipole moment in any direction, correlated over tens of
+            seconds.
+        coil_noise: white noise of each coil's dipole moment while the coils are driven, A m^2 sqrt(s).
+        axes: rotation of the principal axes from the assumed axes, rad.
+        inertia_error: relative error of the gyroscopic torque, without the effect of wrong principal axes.
+        rate_start: standard deviation of the initial rate apart from the gyro bias, rad/s.
+        fine, coarse: largest standard deviation of the worst axis of a fine and of a coarse attitude, rad.
+        gate_sigma: a measurement less likely than a deviation of this many sigma in one component is
+            rejected.
     """
 
     gyro: tuple[float, float] = (1e-3, 2e-6)
@@ -189,33 +189,34 @@ class FreeFilterSettings:
     gate_sigma: float = 5.0
 
     def of_slow(self, which: int) -> FloatArray:
-        """Return the start deviations (`which` 0) or the random walks (1) of the slow states, (24,)."""
+        """Return the initial deviations (`which` = 0) or the random walks (1) of the slow states (24,)."""
         start, walk = self.torque
         torques = [(share * start, walk) for share in (CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE)]
         pairs = [self.gyro, self.dipole, self.sunlit, self.magnet, *torques, self.axes]
         return np.repeat([pair[which] for pair in pairs], 3)
 
     def plausible(self, values: FloatArray, at: IntArray | slice = slice(None)) -> BoolArray:
-        """Return which `values` (k,) of the slow states with the indices `at` are plausible."""
+        """Return whether each value (k,) of the slow states with the indices `at` is plausible."""
         return np.asarray(np.abs(values) <= PLAUSIBLE * self.of_slow(0)[at])
 
 
 LARGEST_ROTATION = 0.1
-"""Largest rotation (rad) in a step of integration."""
+"""Largest rotation (rad) of the body in one integration step."""
 FIELD_LEARNED = 2_000.0
-"""Time (s) over which the size of the field model's error is averaged."""
+"""Averaging time (s) of the estimated variance of the field model's error."""
 MINIMUM_FIELD_ERROR = 1e-8
-"""Minimum error (T per axis) of the field model, equal to the variation of the magnetometer's own errors."""
+"""Minimum standard deviation (T per axis) of the field model's error, as large as the magnetometer's own
+errors."""
 CURRENTS = 1e-7
-"""Error (T per axis) of the field model due to auroral currents, which must not cause the rejection of a
-measurement."""
+"""Field (T per axis) of auroral currents; it is added to the noise so that no measurement is rejected because
+of it."""
 _EYE: FloatArray = np.eye(3)
 _FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlowStates:
-    """The slow states: `values` (24,) and their covariance (24, 24)."""
+    """The values (24,) of the slowly varying states and their covariance (24, 24)."""
 
     values: FloatArray
     covariance: FloatArray
@@ -223,7 +224,7 @@ class SlowStates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeMemory:
-    """A copy of the estimate: the attributes of the filter with the same names."""
+    """A copy of the filter's estimate; the attributes have the names that they have in the filter."""
 
     quaternion: FloatArray
     rate: FloatArray
@@ -234,23 +235,23 @@ class FreeMemory:
 
 
 class FreeFilter:
-    """Owns the estimate. `refused` counts the measurements that did not pass the gate.
+    """The navigation filter; `refused` counts the measurements that did not pass the gate.
 
     Attributes:
-        quaternion: (4,) ICRS into body.
-        rate: (3,) rad/s, body axes.
-        acceleration: (3,) rad/s^2, body axes, of the last step.
-        covariance: (33, 33) of the error state (ATTITUDE, RATE, ...).
-        field_error: T per axis, standard deviation of the field model's error.
-        changes: number of changes of the estimate.
+        quaternion: attitude (4,), from ICRS into body axes.
+        rate: body rate (3,) in body axes, rad/s.
+        acceleration: angular acceleration (3,) of the last step in body axes, rad/s^2.
+        covariance: covariance (33, 33) of the error state, in the order ATTITUDE, RATE, ..., FIELD.
+        field_error: standard deviation per axis of the field model's error, T.
+        changes: number of times that the estimate changed.
     """
 
     def __init__(
         self, inertia: FloatArray, settings: FreeFilterSettings, slow: SlowStates | None = None
     ) -> None:
-        """Use `inertia` (3, 3) kg m^2, body axes.
+        """Create a filter for the assumed inertia tensor (3, 3) kg m^2 in body axes.
 
-        `slow` is the prior of the slow states, by default the settings.
+        The prior of the slow states is `slow`, or follows from the settings by default.
         """
         self.motion = FreeMotion(inertia)
         self._settings = settings
@@ -275,10 +276,10 @@ class FreeFilter:
     def start(
         self, quaternion: FloatArray, covariance: FloatArray, gyro: FloatArray, *, doubted: bool = False
     ) -> None:
-        """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro rate (3,) rad/s.
+        """Start from an attitude (4,) with covariance (3, 3) rad^2 in body axes, and a gyro rate (3,) rad/s.
 
-        The slow states are kept. If the estimate was contradicted (`doubted`), their covariance is reset to
-        the values of the settings, and implausible values are set to zero.
+        The slow states are kept. If measurements contradicted the estimate (`doubted`), the covariance of the
+        slow states is reset to the settings, and implausible values are set to zero.
         """
         self.changes += 1
         if doubted:
@@ -291,38 +292,38 @@ class FreeFilter:
         self.covariance[ATTITUDE, ATTITUDE] = covariance
         bias = self.covariance[GYRO, GYRO]
         self.covariance[RATE, RATE] = bias + self._settings.rate_start**2 * _EYE
-        # The gyro measures the sum of rate and bias, so their errors are opposite.
+        # The gyro measures the sum of rate and bias, so the errors of both estimates are opposite.
         self.covariance[RATE, GYRO] = self.covariance[GYRO, RATE] = -bias
         self.quaternion, self.rate = quaternion, gyro - self._constants[GYRO]
         self.started = True
 
     @property
     def knowledge(self) -> Knowledge:
-        """Accuracy with which the attitude is known."""
+        """Accuracy class of the attitude estimate."""
         if not self.started or (sigma := self.worst_sigma) > self._settings.coarse:
             return Knowledge.LOST
         return Knowledge.FINE if sigma <= self._settings.fine else Knowledge.COARSE
 
     @property
     def worst_sigma(self) -> float:
-        """Standard deviation of the attitude about its worst axis, rad."""
+        """Standard deviation of the attitude about the least certain axis, rad."""
         covariance = self.covariance
         return math.sqrt(max(covariance[0, 0], covariance[1, 1], covariance[2, 2]))
 
     @property
     def slow(self) -> SlowStates:
-        """The slow states and their covariance."""
+        """Values and covariance of the slowly varying states."""
         return SlowStates(self._constants[SLOW].copy(), self.covariance[SLOW, SLOW].copy())
 
     def memory(self) -> FreeMemory:
-        """Return a copy of the estimate, for `recall`."""
+        """Return a copy of the estimate that `recall` can restore."""
         constants, covariance = self._constants.copy(), self.covariance.copy()
         return FreeMemory(
             self.quaternion, self.rate, self.acceleration, constants, covariance, self.field_error
         )
 
     def recall(self, then: FreeMemory) -> None:
-        """Restore an earlier estimate from its copy `then`."""
+        """Restore an earlier estimate from the copy `then`."""
         self.changes += 1
         self.quaternion, self.rate, self.acceleration = then.quaternion, then.rate, then.acceleration
         self._constants, self.covariance = then.constants.copy(), then.covariance.copy()
@@ -335,29 +336,30 @@ class FreeFilter:
 
     @property
     def magnet_bias(self) -> FloatArray:
-        """Magnetometer bias (3,) T, body axes."""
+        """Magnetometer bias (3,) in body axes, T."""
         return self._constants[MAGNET].copy()
 
     @property
     def torque_sizes(self) -> FloatArray:
-        """Sizes (9,) N m of the disturbance torques."""
+        """Sizes (9,) of the disturbance torques, N m."""
         return self._constants[TORQUES].copy()
 
     @property
     def axes_rotation(self) -> FloatArray:
-        """Rotation (3,) rad of the principal axes from the assumed ones, body axes."""
+        """Rotation vector (3,) of the principal axes from the assumed axes, in body axes, rad."""
         return self._constants[AXES].copy()
 
     def residual_dipole(self, sunlit: float) -> FloatArray:
-        """Return the residual dipole (3,) A m^2, body axes, for the visible share `sunlit` of the Sun."""
+        """Return the residual dipole moment (3,) A m^2, body axes, for a visible fraction of the Sun."""
         return np.asarray(self._constants[DIPOLE] + sunlit * self._constants[SUNLIT])
 
     def advance(
         self, seconds: float, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0
     ) -> None:
-        """Propagate by `seconds`, a second or two, under the coils' dipole (3,) A m^2, body axes.
+        """Propagate by `seconds`, a second or two, under the coils' dipole moment (3,) A m^2 in body axes.
 
-        `doubt` A m^2 is the standard deviation per axis of the dipole, if it may differ from the command.
+        `doubt` (A m^2) is the standard deviation per axis of the dipole moment if it may differ from the
+        command.
         """
         speed = math.sqrt(float(self.rate @ self.rate))
         steps = max(1, math.ceil(speed * seconds / LARGEST_ROTATION))
@@ -369,8 +371,8 @@ class FreeFilter:
     ) -> bool:
         """Apply a gyro rate (3,) rad/s with its covariance (3, 3); return whether it passed the gate.
 
-        For a mean over the past, `change` (3,) rad/s is the change of the rate since the middle of the mean,
-        `since` s ago, by the acceleration of the last step.
+        For a mean over a past interval, `since` (s) is the age of the middle of the interval. `change` (3,)
+        rad/s is then the change of the rate since that time by the acceleration of the last step.
         """
         rows = -since * self._slope
         rows[:, RATE] += _EYE
@@ -379,25 +381,25 @@ class FreeFilter:
         return self._update(value if change is None else value + change, rows, covariance)
 
     def mean_rate(self, rate: FloatArray, covariance: FloatArray, change: FloatArray) -> bool:
-        """Apply a rate (3,) rad/s free of gyro bias, as from streaks, with its covariance (3, 3).
+        """Apply a rate (3,) rad/s measured without the gyro, such as from streaks, with covariance (3, 3).
 
-        `change` (3,) rad/s is the change of the rate since then.
+        `change` (3,) rad/s is the change of the body rate since the measurement.
         """
         rows = np.zeros((3, STATES))
         rows[:, RATE] = _EYE
         return self._update(rate + change - self.rate, rows, covariance)
 
     def attitude(self, quaternion: FloatArray, covariance: FloatArray, age: float = 0.0) -> bool:
-        """Apply an attitude (4,) measured `age` s ago; covariance (3, 3) rad^2 in the present body axes."""
+        """Apply an attitude (4,) that is `age` s old, with covariance (3, 3) rad^2, present body axes."""
         since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self.acceleration)
         rows = np.zeros((3, STATES))
-        # The rotation since the measurement has the error of the rate.
+        # The rotation since the measurement is computed from the rate and has its error.
         rows[:, ATTITUDE], rows[:, RATE] = _EYE, -age * _EYE
         error = multiply(multiply(since, quaternion), conjugate(self.quaternion))
         return self._update(to_rotation_vector(error), rows, covariance)
 
     def direction(self, observed: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
-        """Apply a direction: unit vectors (3,) in body axes and ICRS, covariance (3, 3) rad^2, body axes."""
+        """Apply a direction given in body axes and ICRS, with covariance (3, 3) rad^2 in body axes."""
         expected = attitude_matrix(self.quaternion) @ reference
         across = tangent_basis(expected)
         rows = np.zeros((2, STATES))
@@ -405,7 +407,7 @@ class FreeFilter:
         return self._update(across @ observed, rows, across @ covariance @ across.T)
 
     def field(self, measured: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
-        """Apply the field (3,) T, body axes, with its model (3,) T, ICRS, and covariance (3, 3) T^2."""
+        """Apply a measured field (3,) T in body axes, given the modelled field (3,) T in ICRS axes."""
         expected = attitude_matrix(self.quaternion) @ reference
         rows = np.zeros((3, STATES))
         rows[:, ATTITUDE], rows[:, MAGNET], rows[:, FIELD] = cross_matrix(expected), _EYE, _EYE
@@ -413,13 +415,13 @@ class FreeFilter:
         return self._update(measured - expected - bias, rows, covariance + CURRENTS**2 * _EYE)
 
     def _reset_field(self) -> None:
-        """Forget the error of the field model except for its size."""
+        """Reset the estimated error of the field model, but keep its standard deviation."""
         self._constants[FIELD] = 0.0
         self.covariance[FIELD] = self.covariance[:, FIELD] = 0.0
         self.covariance[FIELD, FIELD] = self.field_error**2 * _EYE
 
     def _propagate_field_error(self, dt: float) -> None:
-        """Let the error of the field model decay, and learn its size while the attitude is fine."""
+        """Propagate the error of the field model, and estimate its variance while the attitude is fine."""
         covariance, error = self.covariance, self._constants[FIELD]
         if self.worst_sigma <= self._settings.fine:
             square = (float(error @ error) + float(covariance[FIELD, FIELD].trace())) / 3.0
@@ -432,7 +434,7 @@ class FreeFilter:
         covariance.reshape(-1)[_FIELD_DIAGONAL] += (1.0 - kept**2) * self.field_error**2
 
     def _step(self, dt: float, dipole: FloatArray, around: FilterEnvironment, doubt: float) -> None:
-        """Take one step of the midpoint rule, with its covariance."""
+        """Propagate state and covariance by one step of the midpoint rule."""
         self.changes += 1
         motion = self.motion
         motion.rotate_axes(self._constants[AXES])
@@ -464,11 +466,11 @@ class FreeFilter:
         self._propagate_field_error(dt)
 
     def rate_noise(self, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0) -> FloatArray:
-        """Return the noise density (3, 3) rad^2/s^3 of the acceleration for the coils' dipole (3,) A m^2."""
+        """Return the noise density (3, 3) rad^2/s^3 of the acceleration for a dipole moment of the coils."""
         settings, motion, square = self._settings, self.motion, float(dipole @ dipole)
         coils = LASTING * (settings.coil_error**2 * square / 3.0 + doubt**2)
         coils += settings.coil_noise**2 if square else 0.0
-        # The error of the gyroscopic torque keeps its sign while the body rotates by two radians.
+        # The error of the gyroscopic torque is correlated while the body rotates by less than two radians.
         speed = math.sqrt(float(self.rate @ self.rate))
         gyroscopic = speed**2 * settings.inertia_error * motion.largest_difference
         lasting = LASTING if LASTING * speed < 2.0 else 2.0 / speed
@@ -480,7 +482,7 @@ class FreeFilter:
         return np.asarray(density)
 
     def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:
-        """Correct by an innovation (k,), derivative (k, 33) and noise (k, k); return whether it was used."""
+        """Correct by an innovation (k,), if it passes the gate, and return whether it passed."""
         cross = self.covariance @ rows.T
         weight = np.linalg.inv(rows @ cross + noise)
         if not 0.0 <= float(value @ weight @ value) <= self._gates[len(value)]:  # a NaN does not pass

@@ -1,7 +1,8 @@
 """Measurements of the attitude filter: attitudes, gyro rates, mean rates, directions and fields.
 
-`latency` belongs to a unit whose samples are older than their time stamps by an age that the filter
-estimates. It is the time (s) that was subtracted from the stamp to give `time_ns`. None marks a known time.
+A measurement has a `latency` if it comes from a unit whose samples are older than their time stamps, by an
+age that the filter estimates. The latency is the assumed age (s) that was subtracted from the time stamp to
+give `time_ns`. None marks a known time.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ class _AtOneTime:
 
     @property
     def begin_ns(self) -> int:
-        """The first time that the measurement depends on."""
+        """Earliest time (ns) on which the measurement depends."""
         return self.time_ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeMeasurement(_AtOneTime):
-    """An attitude: quaternion (4,) reference into body, covariance (3, 3) rad^2 of small rotations, body."""
+    """A measured attitude (4,) from reference into body axes, with covariance (3, 3) rad^2 in body axes."""
 
     time_ns: int
     quaternion: FloatArray
@@ -35,7 +36,7 @@ class AttitudeMeasurement(_AtOneTime):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RateMeasurement(_AtOneTime):
-    """A gyro's body rate (3,) rad/s, bias included, and its covariance (3, 3)."""
+    """A body rate (3,) rad/s measured by a gyro, with the gyro's bias, and its covariance (3, 3)."""
 
     time_ns: int
     rate: FloatArray
@@ -45,9 +46,9 @@ class RateMeasurement(_AtOneTime):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanRateMeasurement:
-    """The mean body rate (3,) rad/s of an exposure, free of the gyro's bias, and its covariance (3, 3).
+    """The mean body rate (3,) rad/s during an exposure, measured without the gyro, and its covariance (3, 3).
 
-    It is the constant rate that takes the attitude at `since_ns` to that at `time_ns`.
+    The mean rate is the constant rate that rotates the attitude at `since_ns` into the attitude at `time_ns`.
     """
 
     since_ns: int
@@ -57,7 +58,7 @@ class MeanRateMeasurement:
 
     @property
     def begin_ns(self) -> int:
-        """The start of the exposure."""
+        """Start of the exposure, ns."""
         return self.since_ns
 
 
@@ -66,7 +67,7 @@ class DirectionMeasurement(_AtOneTime):
     """A direction observed from the body, such as of the Sun or nadir.
 
     `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors. `covariance` (3, 3)
-    rad^2 is that of `observed` in body axes; its part along the direction has no effect.
+    rad^2 is the covariance of `observed` in body axes; its component along the direction has no effect.
     """
 
     time_ns: int
@@ -77,9 +78,10 @@ class DirectionMeasurement(_AtOneTime):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldMeasurement(_AtOneTime):
-    """A magnetometer's `field` (3,) T in body axes, bias included, and the model's `reference` (3,) T.
+    """A field (3,) T measured by a magnetometer, with bias, in body axes, and the model's `reference` (3,) T.
 
-    `covariance` (3, 3) T^2, body axes, is that of the white noise; the filter estimates the constant part.
+    `covariance` (3, 3) T^2 is the covariance of the white noise in body axes; the filter estimates the
+    constant error.
     """
 
     time_ns: int

@@ -1,18 +1,19 @@
 """The correction of a multiplicative extended Kalman filter by one measurement.
 
-The attitude error is a small rotation about the body axes (Lefferts, Markley and Shuster 1982), moved into
-the quaternion at each correction; the covariance is then rotated to the new axes (Markley and Crassidis 2014,
-6.2.4: the reset). The rate is a state driven by Euler's equation, because the plant model predicts it more
-accurately than the gyro measures it. Past attitudes that later measurements need are appended to the state
-(stochastic cloning, Roumeliotis and Burdick 2002).
+The attitude error is a small rotation about the body axes (Lefferts, Markley and Shuster 1982). Each
+correction applies the estimated error to the quaternion and then rotates the covariance to the corrected
+axes, which is the reset of Markley and Crassidis 2014, section 6.2.4. The rate is a state driven by Euler's
+equation, because the plant model predicts it more accurately than the gyro measures it. Past attitudes that
+later measurements need are appended to the state (stochastic cloning, Roumeliotis and Burdick 2002).
 
-The age of the inertial unit's samples at their time stamp is a constant that the filter estimates. The line,
-a driver's buffer or the unit's own filters make a sample older than its stamp. An attitude sample of some age
-lacks rate times age of rotation, and a rate sample acceleration times age; the innovations therefore depend
-on the age. Attitudes estimate the age. The acceleration at a rate sample is mostly that of the coils, which
-respond to the noise of earlier samples: an estimate from rates would be identification in closed loop, and
-the age would drift with the noise while the attitude is held. For rates the age is therefore considered
-(Schmidt 1966) and not estimated: its variance and correlations enter the gains of all other states.
+The filter estimates the age that the inertial unit's samples have at their time stamps. A sample is older
+than its time stamp because of the serial line, a driver's buffer or the filters inside the unit. During its
+age, a sampled attitude changes by rate times age, and a sampled rate by acceleration times age. The
+innovations therefore depend on the age. Only attitude samples correct the estimated age. Rate samples cannot,
+because the acceleration is mostly caused by the coils, which respond to the noise of earlier samples. An
+estimate of the age from rate samples would be an identification in closed loop and would drift with the noise
+while the attitude is held. A rate sample therefore treats the age as a considered parameter (Schmidt 1966):
+its variance and correlations enter the gains of all other states.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ from knightcube.gnc.estimation.rotation import (
 )
 
 LONGEST_LATENCY = 0.25
-"""Largest plausible latency, s."""
+"""Largest plausible age (s) of an inertial unit's sample at its time stamp."""
 
 _ACCELERATIONS = slice(DISTURBANCE.start, PARAMETERS.stop)
 _BY_ACCELERATIONS: FloatArray = np.eye(3, 6)
@@ -65,10 +66,10 @@ _EYE: FloatArray = np.eye(3)
 
 
 class RateChange(NamedTuple):
-    """The change of the rate around the time of a sample.
+    """The angular acceleration (rad/s^2) at the time of a sample, and its uncertainty.
 
-    `acceleration` is in rad/s^2. `uncertainty` (3, 3) rad^2/s^2 is the covariance of the rate by effects that
-    are not linear in the age.
+    `uncertainty` (3, 3) rad^2/s^2 is the covariance of the sampled rate due to effects that are not linear in
+    the age.
     """
 
     acceleration: Vector
@@ -78,10 +79,11 @@ class RateChange(NamedTuple):
 def rate_change(
     before: Accelerated, after: Accelerated, disturbance: Vector, covariance: FloatArray
 ) -> RateChange:
-    """Return the change of the rate with the age, from the model one sigma of the age before and after.
+    """Return the change of the rate at a sample from the model accelerations before and after the sample.
 
-    Half the difference of the two accelerations, as by a command that begins or ends between them, is treated
-    as noise. So is the product of the errors of age and acceleration.
+    The two accelerations apply one standard deviation of the age before and after the sample. They differ if
+    a coil command begins or ends in between. Half their difference is treated as noise, and so is the product
+    of the errors of age and acceleration.
     """
     pairs = zip(before.acceleration, after.acceleration, disturbance, strict=True)
     x, y, z = (0.5 * (a + b) + d for a, b, d in pairs)
@@ -98,9 +100,9 @@ def rate_change(
 
 
 def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[Vector, FloatArray]:
-    """Return innovation and rows, corrected for age, of a quantity that changes by `change` per second.
+    """Return innovation and Jacobian of a quantity that changes by `change` per second, corrected for age.
 
-    `more` is the difference between the estimated age and the age subtracted from the time stamp, s.
+    `more` (s) is the estimated age minus the assumed age that was subtracted from the time stamp.
     """
     x, y, z = change
     rows = rows.copy()
@@ -109,7 +111,7 @@ def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[
 
 
 class Innovation(NamedTuple):
-    """The innovation y = H error + noise: `value` y, `rows` H, `noise` its covariance R."""
+    """An innovation y = H e + n, with `value` y, Jacobian `rows` H and the covariance `noise` of n."""
 
     value: tuple[float, ...]
     rows: FloatArray
@@ -121,12 +123,12 @@ def innovation(
 ) -> Innovation:
     """Return the innovation of `measurement`; for a suspended body, only its component about the thread.
 
-    A direction is compared in the plane across it: its covariance along the direction has no effect. A field
-    is compared as a vector, because its strength depends on the magnetometer's bias too. `change` is needed
-    for a rate whose age is estimated.
+    The innovation of a direction lies in the plane normal to the direction. The innovation of a magnetic
+    field is a whole vector, because the field strength also depends on the magnetometer's bias. `change` is
+    needed for rate samples whose age is estimated.
     """
     size, noise = SIZE + 3 * len(state.kept), measurement.covariance
-    # Rotations of a suspended body about x and z have no variance, so whole directions and fields apply too.
+    # A suspended body has no variance about x and z, so directions and fields need no projection.
     if isinstance(measurement, DirectionMeasurement):
         return _direction(state, measurement, size)
     if isinstance(measurement, FieldMeasurement):
@@ -155,9 +157,9 @@ def innovation(
 
 
 def _mean_rate(state: FilterState, measurement: MeanRateMeasurement, size: int) -> tuple[Vector, FloatArray]:
-    """Return innovation and rows of the mean rate between the kept attitude and the present one.
+    """Return innovation and Jacobian of the mean rate between the kept attitude and the present attitude.
 
-    The rotation vector p from one to the other changes by Jr^-1(p) (e - A e_0), where e and e_0 are the
+    The rotation vector p between the two attitudes changes by Jr^-1(p) (e - A e_0), where e and e_0 are the
     errors of the present and the kept attitude.
     """
     span = (measurement.time_ns - measurement.since_ns) * 1e-9
@@ -179,10 +181,10 @@ def _mean_rate(state: FilterState, measurement: MeanRateMeasurement, size: int) 
 
 
 def _direction(state: FilterState, measurement: DirectionMeasurement, size: int) -> Innovation:
-    """Return innovation and rows of a direction.
+    """Return the innovation of a direction.
 
-    With the estimated attitude A and its error e, b is A r - e x A r: in the plane across A r, b - A r is
-    [A r x] e.
+    For the estimated attitude A with the error e, the observed direction is b = A r - e x A r. In the plane
+    normal to A r, the innovation b - A r is therefore [A r x] e.
     """
     rx, ry, rz = measurement.reference.tolist()
     expected = times(matrix(state.quaternion), (rx, ry, rz))
@@ -194,7 +196,7 @@ def _direction(state: FilterState, measurement: DirectionMeasurement, size: int)
 
 
 def _field(state: FilterState, measurement: FieldMeasurement, size: int) -> Innovation:
-    """Return innovation and rows of a magnetometer reading: m - A B - bias."""
+    """Return the innovation m - A B - bias of a magnetometer reading m."""
     bx, by, bz = measurement.reference.tolist()
     expected = times(matrix(state.quaternion), (bx, by, bz))
     rows = np.zeros((3, size))
@@ -206,7 +208,7 @@ def _field(state: FilterState, measurement: FieldMeasurement, size: int) -> Inno
 
 @functools.cache
 def _rows(firsts: tuple[int, ...], size: int) -> FloatArray:
-    """Return the rows (3, size) of a sum of parts of the error state, given by their first indices."""
+    """Return the Jacobian (3, size) of the sum of the error components that begin at the indices `firsts`."""
     rows = np.zeros((3, size))
     for first in firsts:
         rows[:, first : first + 3] += _EYE
@@ -214,7 +216,7 @@ def _rows(firsts: tuple[int, ...], size: int) -> FloatArray:
 
 
 def normalised_square(found: Innovation, covariance: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Return y^T S^-1 y, a chi-square with the degrees of freedom of y; the gain P H^T S^-1; and S."""
+    """Return the normalised square y^T S^-1 y of an innovation y, the gain P H^T S^-1 and covariance S."""
     cross = covariance.dot(found.rows.T)
     spread = found.rows.dot(cross) + found.noise
     weight = _inverted(spread)
@@ -225,11 +227,11 @@ def normalised_square(found: Innovation, covariance: FloatArray) -> tuple[float,
 def correct(
     state: FilterState, covariance: FloatArray, found: Innovation, gain: FloatArray
 ) -> tuple[FilterState, FloatArray]:
-    """Return the corrected state and covariance, by Joseph's form, symmetric and positive."""
-    # ndarray.dot takes two thirds of the time of @ for small matrices.
+    """Return corrected state and covariance; Joseph's form keeps the covariance symmetric and positive."""
+    # For small matrices, ndarray.dot takes two thirds of the time of the @ operator.
     keep = _identity(len(covariance)) - gain.dot(found.rows)
     error = gain.dot(found.value).tolist()
-    # The reset: the remaining error refers to axes rotated by half the correction.
+    # The reset rotates the axes of the remaining attitude error by half the correction.
     for first in (0, *range(SIZE, len(covariance), 3)):
         x, y, z = error[first : first + 3]
         reset = np.array(((1.0, 0.5 * z, -0.5 * y), (-0.5 * z, 1.0, 0.5 * x), (0.5 * y, -0.5 * x, 1.0)))
@@ -258,7 +260,7 @@ def correct(
 def keep_attitude(
     state: FilterState, covariance: FloatArray, measurement: MeanRateMeasurement
 ) -> tuple[FilterState, FloatArray]:
-    """Return state and covariance with the present attitude appended, for the exposure that begins now."""
+    """Return state and covariance with the present attitude appended for an exposure that begins now."""
     pick = [*range(len(covariance)), 0, 1, 2]
     kept = (*state.kept, (measurement, state.quaternion))
     return state._replace(kept=kept), covariance[np.ix_(pick, pick)]
@@ -267,7 +269,7 @@ def keep_attitude(
 def release_attitude(
     state: FilterState, covariance: FloatArray, measurement: MeanRateMeasurement
 ) -> tuple[FilterState, FloatArray]:
-    """Return state and covariance without the attitude that was kept for an exposure."""
+    """Return state and covariance without the attitude that was kept for a finished exposure."""
     index = state.kept_index(measurement)
     first = SIZE + 3 * index
     pick = [*range(first), *range(first + 3, len(covariance))]

@@ -1,7 +1,8 @@
-"""Replay of measurements in order of time, the recent coil commands, and the filter's recent checkpoints.
+"""Replay of measurements in order of time, with histories of coil commands and filter checkpoints.
 
-After a late measurement all later ones are applied again. A second of measurements takes more time than a
-control cycle has, so that the work can be spread over cycles while the filter continues unchanged.
+After a late measurement is inserted, all later measurements are applied again. Applying one second of
+measurements takes longer than a control cycle. The work can therefore be spread over several cycles, during
+which the filter continues without the late measurement.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody, Torqui
 
 
 class CommandHistory:
-    """The recent commands in order of time; before the first command no coil is driven.
+    """The recent coil commands in order of time; no coil is driven before the first command.
 
     Attributes:
-        idle: the torquing without driven coils.
+        idle: state of the coils when no coil is driven.
     """
 
     def __init__(self, body: RigidBody, history_ns: int) -> None:
@@ -51,7 +52,7 @@ class CommandHistory:
     def record(
         self, time_ns: int, currents: FloatArray, field: FloatArray | None, known: bool = True
     ) -> None:
-        """Record the coil currents (3,) A in force from `time_ns` on, in the field (3,) T, reference axes."""
+        """Record coil currents (3,) A that flow from `time_ns` on, and the field (3,) T, reference axes."""
         torquing = self._body.torquing(currents, field, known)
         if self._torquings and self._torquings[-1] == torquing:
             return
@@ -62,7 +63,7 @@ class CommandHistory:
             del self._times[:oldest], self._torquings[:oldest]
 
     def mark_unknown(self, since_ns: int) -> None:
-        """Treat the currents in force from `since_ns` on as unknown."""
+        """Treat the coil currents from `since_ns` on as unknown."""
         first = bisect.bisect_left(self._times, since_ns)
         if self._torquings and (first == len(self._times) or self._times[first] > since_ns):
             self._torquings.insert(first, self.at(since_ns))
@@ -70,12 +71,12 @@ class CommandHistory:
         self._torquings[first:] = [replace(torquing, known=False) for torquing in self._torquings[first:]]
 
     def at(self, time_ns: int) -> Torquing:
-        """Return the torquing in force at a time."""
+        """Return the coil dipole, field and flags (`Torquing`) that apply at a time."""
         index = max(bisect.bisect_right(self._times, time_ns) - 1, 0)
         return self._torquings[index] if self._torquings else self.idle
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Torquing, int]]:
-        """Yield each torquing in force between two times and its duration in ns, in order of time."""
+        """Yield each coil command between two times with its duration (ns), in order of time."""
         time_ns = from_ns
         index = max(bisect.bisect_right(self._times, from_ns) - 1, 0)
         while time_ns < to_ns:
@@ -89,19 +90,20 @@ class CommandHistory:
 
 
 _RATE_ONLY = {size: chi_square.bound(0.025, size) for size in (1, 3)}
-"""Normalised square of a gyro sample, by its size, above which it corrects the rate only. Through the model
-of the coils a sample corrects angle, disturbance and coil gain too. In the tenths of a second before a broken
-coil is detected this is wrong: the angle error reached 40 sigma while the rate was right. In a consistent
-filter one sample in forty exceeds the limit."""
+"""Normalised squared innovation above which a gyro sample corrects only the rate, by the number of axes.
+Normally a gyro sample also corrects angle, disturbance and coil gain, by their correlations with the rate.
+Before a broken coil is detected these corrections are wrong: the angle error reached 40 sigma while the rate
+was right. In a consistent filter one gyro sample in forty exceeds this limit."""
 
 
 @dataclass(slots=True, eq=False)
 class Checkpoint:
-    """A measurement, whether it passed the gate, and the state just after it.
+    """A measurement, whether it passed the gate, and the filter state just after it.
 
     Attributes:
-        innovation: components in the unit of the measurement; empty at the start.
-        variance: covariance of the innovation; None at the start.
+        innovation: components of the innovation, in the unit of the measurement; empty for the first
+            checkpoint.
+        variance: covariance of the innovation, or None for the first checkpoint.
     """
 
     measurement: Measurement
@@ -120,7 +122,7 @@ class Checkpoint:
 
 @dataclass(frozen=True, slots=True)
 class PropagationModel:
-    """Model of propagation: body, noise and commands; `gate` by the degrees of freedom of a measurement."""
+    """Body, process noise, coil commands, and the gate by the degrees of freedom of a measurement."""
 
     body: RigidBody
     noise: ProcessNoise
@@ -131,7 +133,7 @@ class PropagationModel:
     def propagate(
         self, state: FilterState, covariance: FloatArray, from_ns: int, to_ns: int
     ) -> tuple[FilterState, FloatArray]:
-        """Return state and covariance propagated forward under the commands between two times."""
+        """Return state and covariance propagated between two times under the recorded coil commands."""
         for torquing, span_ns in self.commands.spans(from_ns, to_ns):
             state, covariance = propagate(
                 self.body, self.noise, state, covariance, torquing, span_ns * 1e-9, self.longest_step
@@ -139,9 +141,9 @@ class PropagationModel:
         return state, covariance
 
     def estimate(self, then: Checkpoint, time_ns: int, measured_ns: int) -> Estimate:
-        """Return the estimate at `time_ns` propagated from a checkpoint.
+        """Return the estimate at `time_ns`, propagated from a checkpoint.
 
-        The last measurement is `measured_ns`.
+        `measured_ns` is the time of the last accepted measurement.
         """
         state, covariance = self.propagate(then.state, then.covariance, then.time_ns, time_ns)
         return Estimate(
@@ -158,7 +160,7 @@ class PropagationModel:
         )
 
     def rate_change(self, state: FilterState, covariance: FloatArray, time_ns: int) -> RateChange:
-        """Return the change of the rate around the time of a sample whose age is estimated."""
+        """Return the change of the rate at the time of a gyro sample whose age is estimated."""
         half_ns = round(0.5e9 * math.sqrt(covariance[LATENCY, LATENCY]))
         first, last = self.commands.at(time_ns - half_ns), self.commands.at(time_ns + half_ns)
         before = self.body.accelerate(state.quaternion, state.rate, state.parameters, first)
@@ -169,7 +171,7 @@ class PropagationModel:
 
 
 class Replay:
-    """Applies measurements in order of time; `checkpoints` holds the results so far."""
+    """An application of measurements in order of time that collects its results in `checkpoints`."""
 
     def __init__(
         self, model: PropagationModel, start: Checkpoint, measurements: Sequence[Measurement]
@@ -177,18 +179,18 @@ class Replay:
         self._model = model
         self._state, self._covariance, self._time_ns = start.state, start.covariance, start.time_ns
         self._pending = deque(measurements)
-        # Exposures that have not begun yet; the next one is the last element.
+        # The list holds the exposures that have not begun yet, the next exposure last.
         self._exposures = [m for m in measurements if isinstance(m, MeanRateMeasurement)]
         self._exposures.sort(key=lambda m: m.since_ns, reverse=True)
         self.checkpoints: list[Checkpoint] = []
 
     @property
     def done(self) -> bool:
-        """Whether all measurements are applied."""
+        """Whether all measurements of the replay have been applied."""
         return not self._pending
 
     def add(self, measurement: Measurement) -> None:
-        """Append a measurement that is not older than the others and is not a mean over an exposure."""
+        """Append a measurement that is not older than the others and is not a mean rate."""
         self._pending.append(measurement)
 
     def advance(self, maximum: int | None = None) -> None:
@@ -211,7 +213,7 @@ class Replay:
         found = innovation(state, measurement, model.body.suspended, change)
         nis, gain, variance = normalised_square(found, covariance)
         used = 0.0 <= nis <= model.gate[len(found.value)]  # a NaN does not pass
-        # Joseph's form is right for any gain.
+        # Changing the gain is allowed because Joseph's form is valid for any gain.
         if is_rate and model.noise.unknown_current and nis > _RATE_ONLY[len(found.value)]:
             rate_gain = np.zeros_like(gain)
             rate_gain[RATE] = gain[RATE]
@@ -237,12 +239,12 @@ class Replay:
 
 
 _SPARE_NS = 1_000_000_000
-"""Duration kept beyond the history, so that checkpoints are dropped in batches."""
+"""Extra length (ns) of the history before old checkpoints are dropped in a batch."""
 _TIME = attrgetter("time_ns")
 
 
 class CheckpointHistory:
-    """Holds the checkpoints of the last `history_ns`; it is empty before the filter starts."""
+    """The checkpoints of the last `history_ns` nanoseconds; empty before the filter starts."""
 
     def __init__(self, history_ns: int) -> None:
         self._history_ns = history_ns
@@ -261,19 +263,19 @@ class CheckpointHistory:
 
     @property
     def newest_used(self) -> Checkpoint:
-        """The newest checkpoint whose measurement passed the gate, otherwise the newest one."""
+        """The newest checkpoint whose measurement passed the gate, or the newest one if none passed."""
         return next((c for c in reversed(self._checkpoints) if c.used), self._checkpoints[-1])
 
     def at(self, time_ns: int) -> Checkpoint | None:
-        """Return the last checkpoint up to a time; None before the first checkpoint."""
+        """Return the last checkpoint up to a time, or None for a time before the first checkpoint."""
         index = bisect.bisect_right(self._checkpoints, time_ns, key=_TIME)
         return self._checkpoints[index - 1] if index else None
 
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
-        """Return times (n,) ns and rates (n, 3) rad/s from the last checkpoint up to `begin_ns` on.
+        """Return times (n,) ns and rates (n, 3) rad/s of the checkpoints that enclose an interval.
 
-        They end with the first checkpoint from `end_ns` on, or with the newest. None if no checkpoint is old
-        enough.
+        Without a checkpoint at or after `end_ns` the rates end with the newest checkpoint. Return None if no
+        checkpoint is as old as `begin_ns`.
         """
         first = bisect.bisect_right(self._checkpoints, begin_ns, key=_TIME)
         last = bisect.bisect_left(self._checkpoints, end_ns, key=_TIME)
@@ -283,7 +285,10 @@ class CheckpointHistory:
         return np.array([c.time_ns for c in spanning]), np.array([c.state.rate for c in spanning])
 
     def index_before(self, begin_ns: int) -> int:
-        """Return the number of checkpoints up to `begin_ns`, or up to the start of a mean that spans it."""
+        """Return the number of checkpoints up to `begin_ns`.
+
+        If `begin_ns` is within the exposure of a mean rate, count up to the start of that exposure.
+        """
         while True:
             index = bisect.bisect_right(self._checkpoints, begin_ns, key=_TIME)
             spanning = [c.measurement.begin_ns for c in self._checkpoints[index:]]
@@ -293,11 +298,11 @@ class CheckpointHistory:
             begin_ns = earliest
 
     def measurements_from(self, index: int) -> list[Measurement]:
-        """Return the measurements of the checkpoints from `index` on."""
+        """Return the measurements of the checkpoints from the index `index` on."""
         return [checkpoint.measurement for checkpoint in self._checkpoints[index:]]
 
     def replace_from(self, index: int, checkpoints: Sequence[Checkpoint]) -> None:
-        """Replace the checkpoints from `index` on."""
+        """Replace the checkpoints from the index `index` on."""
         self._checkpoints[index:] = checkpoints
 
     def index_of(self, checkpoint: Checkpoint) -> int:
@@ -305,7 +310,7 @@ class CheckpointHistory:
         return next(k for k in range(len(self) - 1, -1, -1) if self._checkpoints[k] is checkpoint)
 
     def restart(self, first: Checkpoint | None) -> None:
-        """Drop all checkpoints and start with `first`."""
+        """Drop all checkpoints, and start with `first` unless it is None."""
         self._checkpoints = [] if first is None else [first]
 
     def forget(self, now_ns: int) -> None:

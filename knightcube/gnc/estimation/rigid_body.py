@@ -1,16 +1,17 @@
-"""The motion of a rigid body as the filters model it: Euler's equation, propagation, uncertainty.
+"""The motion of a rigid body as the filters model it: Euler's equation and propagation with covariance.
 
-J w' = -w x J w + m x A(q) B + thread (Sease 5.2 corrected), m the dipole moment of the coils. On the
-testbed's thread the body rotates only about its y axis. The thread balances all other torques, so that a
-torque T causes the acceleration T_y / J22 about y, and the thread adds the torque -k theta - c w (Sease 5.4).
+The equation of motion is J w' = -w x J w + m x A(q) B + thread torque (Sease, eq. (5.2), corrected), where m
+is the dipole moment of the coils. A body on the testbed's thread rotates only about its y axis. A torque T
+then causes the acceleration T_y / J22 about y, and the thread adds the torque -k theta - c w (Sease, eq.
+(5.4)).
 
-`propagate` integrates state and covariance. The attitude error is a small rotation about the body axes; all
-accelerations that the model does not contain are random walks.
+`propagate` integrates state and covariance. The attitude error is a small rotation about the body axes.
+Accelerations that the model does not contain are random walks.
 
-Without torque the acceleration is a quadratic form of the rate, w' = Q p(w), with the six products p of the
-rate's components. Errors of the inertia tensor, and of the gyro's scale and alignment, only change the
-coefficients Q. A fit with the changes of Q as nuisance parameters is therefore insensitive to these errors
-(Psiaki 2005, JGCD 28(4); Pittelkau 2001, JGCD 24(6)).
+Without torque the angular acceleration is a quadratic form of the rate, w' = Q p(w), where p are the six
+products of the rate's components. Errors of the inertia tensor, and of the gyro's scale and alignment, only
+change the coefficients Q. A fit with the changes of Q as nuisance parameters is therefore insensitive to
+these errors (Psiaki 2005, JGCD 28(4), and Pittelkau 2001, JGCD 24(6)).
 """
 
 from __future__ import annotations
@@ -51,9 +52,10 @@ from knightcube.gnc.estimation.rotation import (
 
 @dataclass(frozen=True, slots=True)
 class Torquing:
-    """Coils in a field: dipole moment (body axes, A m^2), field (reference axes, T), 1 for each driven coil.
+    """The coils' dipole moment (A m^2, body axes), the field (T, reference axes) and a flag per driven coil.
 
-    `known` is false while the PWM chip does not respond to commands, because any coil may then be driven.
+    `known` is false while any coil may carry an unknown current, for example while the PWM chip does not
+    respond to commands.
     """
 
     dipole: Vector
@@ -63,7 +65,7 @@ class Torquing:
 
 
 class Accelerated(NamedTuple):
-    """Angular acceleration w' (rad/s^2), and its derivatives (3, 3) by torsion, damping and gain."""
+    """Angular acceleration w' (rad/s^2) and its derivatives (3, 3) by torsion, damping and coil gain."""
 
     acceleration: Vector
     by_parameters: Matrix
@@ -72,9 +74,9 @@ class Accelerated(NamedTuple):
 class Linearised(NamedTuple):
     """Angular acceleration w' (rad/s^2) and its derivatives.
 
-    `by_attitude`, `by_rate` and `by_current` (3, 3) are the derivatives by a small rotation about the body
-    axes, by the rate and by the currents of the coils (rad/s^2/A); `by_parameters` (3, 3) those by torsion,
-    damping and gain.
+    `by_attitude`, `by_rate` and `by_current` (3, 3) are the derivatives with respect to a small rotation
+    about the body axes, the rate and the coil currents (A). `by_parameters` (3, 3) are the derivatives with
+    respect to torsion, damping and gain.
     """
 
     acceleration: Vector
@@ -86,15 +88,15 @@ class Linearised(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidBody:
-    """The constants of the body, its coils, the field and the thread.
+    """The constants of the body, its coils, the magnetic field and the thread.
 
     Attributes:
-        inertia: (3, 3) kg m^2, body axes.
-        dipole_per_ampere: n A of each coil, m^2.
-        field: (3,) T, reference axes, unless a command gives another field.
-        suspended: on the thread, free to rotate about body y only.
-        stiffness: nominal k of the thread, N m/rad.
-        damping: nominal c of the thread, N m s/rad.
+        inertia: inertia tensor (3, 3) in body axes, kg m^2.
+        dipole_per_ampere: dipole moment per current of each coil (turns times area), m^2.
+        field: magnetic field (3,) in reference axes if a command gives no other field, T.
+        suspended: whether the body hangs on the thread and rotates only about its y axis.
+        stiffness: nominal torsion stiffness k of the thread, N m/rad.
+        damping: nominal damping constant c of the thread, N m s/rad.
     """
 
     inertia: FloatArray
@@ -108,7 +110,7 @@ class RigidBody:
     _inertia: Matrix = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
-        """Raise UsageError for constants that no body can have."""
+        """Raise UsageError for constants that are physically impossible."""
         inertia = np.asarray(self.inertia, dtype=float)
         if inertia.shape != (3, 3) or not np.all(np.isfinite(inertia)):
             raise UsageError(f"inertia {inertia.tolist()} must be (3, 3) and finite")
@@ -132,7 +134,10 @@ class RigidBody:
     def torquing(
         self, currents: FloatArray, reference_field: FloatArray | None = None, known: bool = True
     ) -> Torquing:
-        """Return the torquing of `currents` (3,) A in `reference_field` (3,) T, by default the body's own."""
+        """Return the effect of coil currents (3,) A in a field (3,) T, reference axes.
+
+        The default field is the constant field of the body description.
+        """
         x, y, z = (float(i) for i in currents)
         bx, by, bz = (float(b) for b in (self.field if reference_field is None else reference_field))
         n = self.dipole_per_ampere
@@ -148,10 +153,10 @@ class RigidBody:
     def linearise(
         self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing, ahead: float
     ) -> Linearised:
-        """Return the acceleration under `torquing` at attitude q, with its derivatives.
+        """Return the angular acceleration under `torquing` at attitude q, with its derivatives.
 
-        The gyroscopic torque is computed for the rate `ahead` s later, so that the midpoint step of a
-        tumbling body is of second order.
+        The gyroscopic torque is computed for the rate `ahead` seconds later. The midpoint step of a tumbling
+        body is then of second order.
         """
         x, y, z = times(self._response, self._gyroscopic(rate))
         rate = (rate[0] + ahead * x, rate[1] + ahead * y, rate[2] + ahead * z)
@@ -159,7 +164,7 @@ class RigidBody:
         field_body = times(matrix(q), torquing.field)
         (mx, my, mz), (bx, by, bz) = torquing.dipole, field_body
         dot = mx * bx + my * by + mz * bz
-        # The derivative of m x B by a small rotation e of the body: m x (B x e) = B m.e - e m.B.
+        # A small rotation e of the body changes m x B by m x (B x e) = B m.e - e m.B.
         by_rotation = (
             (bx * mx - dot, bx * my, bx * mz),
             (by * mx, by * my - dot, by * mz),
@@ -178,7 +183,7 @@ class RigidBody:
     def accelerate(
         self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing
     ) -> Accelerated:
-        """Return the acceleration under `torquing` at attitude q."""
+        """Return the angular acceleration under `torquing` at attitude q."""
         torsion, damping, gain = parameters
         cx, cy, cz = times(self._response, cross(torquing.dipole, times(matrix(q), torquing.field)))
         fx, fy, fz = times(self._response, self._gyroscopic(rate))
@@ -191,7 +196,7 @@ class RigidBody:
         return cross(times(self._inertia, rate), rate)
 
     def _by_rate(self, rate: Vector) -> Matrix:
-        """Return the derivative of -w x J w by w, which is [J w x] - [w x] J."""
+        """Return the derivative of -w x J w with respect to w, which is [J w x] - [w x] J."""
         (a, b, c), (d, e, f), (g, h, i) = self._inertia
         x, y, z = rate
         jx, jy, jz = times(self._inertia, rate)
@@ -203,19 +208,19 @@ class RigidBody:
 
 
 LONGEST_STEP = 0.025
-"""Default of the longest step, s: the period of the testbed's loop."""
+"""Default of the longest propagation step (s), equal to the control period of the testbed."""
 _UNKNOWN_FOR = 0.3
-"""Time (s) over which an unknown current has the same effect as the white noise that models it. It exceeds
-the time after which the guardian switches off the coils of a hung loop."""
+"""Correlation time (s) of an unknown coil current, for the white noise that models it. The time exceeds the
+delay after which the guardian switches off the coils of a hung control loop."""
 
 
 class ProcessNoise(NamedTuple):
     """Spectral densities of the process noise, and the largest current of a coil.
 
-    `current` is the density of the current noise of one driven coil, A^2 s. `rate` (3, 3), rad^2/s^3, is the
-    density of the angular acceleration. `walks` (19,) are the densities of the random walks of the error
-    state, each in the squared unit of the element divided by s. `unknown_current`, A, is the current assumed
-    for each coil while its current is unknown.
+    `current` is the spectral density of the current noise of one driven coil, A^2 s. `rate` (3, 3),
+    rad^2/s^3, is the spectral density of the unmodelled angular acceleration. `walks` (19,) are the variances
+    per second that the components of the error state gain by random walks. `unknown_current` (A) is the
+    current assumed for each coil while its current is unknown.
     """
 
     current: float
@@ -233,11 +238,11 @@ def propagate(
     duration: float,
     longest_step: float = LONGEST_STEP,
 ) -> tuple[FilterState, FloatArray]:
-    """Propagate over `duration` s under one torquing, in steps of at most `longest_step` s."""
+    """Propagate over `duration` s under one coil command, in steps of at most `longest_step` s."""
     steps = max(1, math.ceil(duration / longest_step - 1e-9))
     dt = duration / steps
     half = 0.5 * dt
-    for _ in range(steps):  # midpoint rule; attitudes kept from earlier times do not change
+    for _ in range(steps):  # propagate with the midpoint rule; attitudes kept for exposures do not change
         wx, wy, wz = state.rate
         middle = compose(exponential(half * wx, half * wy, half * wz), state.quaternion)
         model = body.linearise(middle, state.rate, state.parameters, torquing, half)
@@ -251,10 +256,10 @@ def propagate(
 
 
 def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
-    """Return the rows (6, 19) of attitude and rate of I + F dt + (F dt)^2 / 2.
+    """Return the rows (6, 19) for attitude and rate of the transition matrix I + F dt + (F dt)^2 / 2.
 
-    The other rows equal the rows of I. F is the dynamics of the error: rotation' = -w x rotation + rate
-    error, and so on.
+    F is the matrix of the linearised error dynamics, such as e' = -w x e + rate error for the attitude error
+    e. The other rows of the transition matrix equal the rows of I.
     """
     x, y, z = rate
     flow = _FLOW.copy()
@@ -263,7 +268,7 @@ def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
     flow[RATE, RATE] = model.by_rate
     flow[RATE, PARAMETERS] = model.by_parameters
     flow *= dt
-    # Only attitude and rate change, so the square of F needs only their columns.
+    # Only attitude and rate have nonzero rows in F, so F^2 needs only the columns of attitude and rate.
     half = flow[:, _MOTION] * 0.5
     half += _IDENTITY
     transition = np.asarray(half.dot(flow))
@@ -279,15 +284,15 @@ def _propagated_covariance(
     torquing: Torquing,
     dt: float,
 ) -> FloatArray:
-    """Return the covariance after a step.
+    """Return the covariance after a propagation step.
 
-    Only rows and columns of attitude and rate change, apart from random walks. The rest is copied, so that it
-    stays exactly symmetric.
+    Apart from random walks, only the rows and columns of attitude and rate change. All other elements are
+    copied, so the covariance stays exactly symmetric.
     """
     transition = _transition(rate, model, dt)
     moved = transition.dot(covariance[:SIZE])
     among = moved[:, :SIZE].dot(transition.T)
-    # White angular acceleration over dt.
+    # White angular acceleration during dt adds to the covariance of attitude and rate.
     steady = 0.0 if torquing.known else noise.unknown_current**2 * _UNKNOWN_FOR
     weights = [noise.current * driven + steady for driven in torquing.driven]
     density = noise.rate
@@ -312,23 +317,23 @@ _FLOW[RATE, DISTURBANCE] = np.eye(3)
 
 
 _FIRST, _SECOND = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
-"""Axes of the six products: xx, yy, zz, yz, zx, xy."""
+"""Axes of the two rates in each of the six products xx, yy, zz, yz, zx and xy."""
 _DRAWS = 2000
-"""Number of random bodies that give the covariance of Q. With 1000 and 4000 bodies the six largest modes
-agree within 5 %."""
+"""Number of random bodies from which the covariance of Q is computed. The six largest modes of Q agree within
+5 % between 1000 and 4000 random bodies."""
 _NEGLIGIBLE = 1e-6
-"""Variance of a mode, relative to the largest, below which the mode is omitted."""
+"""Variance of a mode of Q, relative to the largest variance, below which the mode is omitted."""
 
 
 @dataclass(frozen=True, slots=True)
 class BodyErrors:
-    """Largest errors of the description of a body, each drawn uniformly.
+    """Largest errors of the description of a body; random errors are drawn uniformly up to these values.
 
     Attributes:
-        moments: relative error of the principal moments of inertia.
-        axes: rotation of the principal axes about each body axis, rad.
-        gyro_scale: relative error of the gyro's scale factors.
-        gyro_alignment: misalignment of each gyro axis toward each other axis, rad.
+        moments: largest relative error of the principal moments of inertia.
+        axes: largest rotation of the principal axes about each body axis, rad.
+        gyro_scale: largest relative error of the gyro's scale factors.
+        gyro_alignment: largest misalignment of each gyro axis toward each other axis, rad.
     """
 
     moments: float = 0.1
@@ -338,20 +343,20 @@ class BodyErrors:
 
 
 def rate_products(rates: FloatArray) -> FloatArray:
-    """Return the six products (n, 6) of rates (n, 3): xx, yy, zz, yz, zx, xy."""
+    """Return the products xx, yy, zz, yz, zx and xy (n, 6) of the components of rates (n, 3)."""
     return rates[:, _FIRST] * rates[:, _SECOND]
 
 
 def gyroscopic_coefficients(inertia: FloatArray) -> FloatArray:
-    """Return Q (..., 3, 6) of tensors (..., 3, 3): Q p(w) is the torque-free acceleration."""
+    """Return the coefficients Q (..., 3, 6) of inertia tensors; Q p(w) is the torque-free acceleration."""
     return _folded(_quadratic(inertia))
 
 
 def coefficient_modes(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
-    """Return changes (k, 3, 6) of Q whose sum, with independent weights of variance 1, spans the errors.
+    """Return the principal components (k, 3, 6) of Q over random bodies near an assumed `inertia` (3, 3).
 
-    They are the principal components of Q over random bodies near an assumed `inertia` (3, 3), without
-    tensors that violate the triangle inequality. The draws have a fixed seed.
+    The error of Q is a sum of these components with independent weights of variance 1. Random tensors that
+    violate the triangle inequality are omitted. The random bodies are drawn with a fixed seed.
     """
     generator = np.random.default_rng(0)
     moments, axes = np.linalg.eigh(inertia)
@@ -372,13 +377,13 @@ def coefficient_modes(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:
-    """Return T (..., 3, 3, 3) of tensors (..., 3, 3), with the acceleration w'_i = T_ijk w_j w_k."""
+    """Return T (..., 3, 3, 3) of inertia tensors, with the torque-free acceleration w'_i = T_ijk w_j w_k."""
     crosses = cross_matrices(np.eye(3))
     return np.asarray(-np.einsum("...il,jlm,...mk->...ijk", np.linalg.inv(inertia), crosses, inertia))
 
 
 def _folded(quadratic: FloatArray) -> FloatArray:
-    """Return the coefficients (..., 3, 6) of the products, of T (..., 3, 3, 3)."""
+    """Return the coefficients Q (..., 3, 6) of the six rate products from T (..., 3, 3, 3)."""
     folded = quadratic[..., _FIRST, _SECOND] + quadratic[..., _SECOND, _FIRST]
     folded[..., :3] *= 0.5
     return np.asarray(folded)

@@ -1,7 +1,8 @@
 """Rotations as tuples of floats: the algebra of `knightcube.astro.quaternion` for the control cycle.
 
-The conventions are the same (scalar last, A(compose(p, q)) = A(p) A(q)); a test compares the two modules. A
-numpy call on three or four numbers takes ten times as long as the arithmetic.
+The conventions of the two modules are the same (scalar last, A(compose(p, q)) = A(p) A(q)), and a test
+compares them. Tuples are used because a numpy call on three or four numbers takes ten times as long as plain
+arithmetic.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ Matrix = tuple[Vector, Vector, Vector]
 
 
 def compose(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Return the rotation q followed by p, of unit length."""
+    """Return the unit quaternion of the rotation q followed by the rotation p."""
     p1, p2, p3, p4 = p
     q1, q2, q3, q4 = q
     a = p4 * q1 + p3 * q2 - p2 * q3 + p1 * q4
@@ -34,16 +35,16 @@ def inverse(q: Quaternion) -> Quaternion:
 
 
 def exponential(x: float, y: float, z: float) -> Quaternion:
-    """Return the rotation by the rotation vector (x, y, z), rad."""
+    """Return the quaternion of a rotation vector (x, y, z), rad."""
     square = 0.25 * (x * x + y * y + z * z)
     half = math.sqrt(square)
-    # Below 1e-4 rad the next term of the series, x^4/120, is below rounding.
+    # Below 1e-4 rad the first omitted term of the sine series, x^4/120, is smaller than the rounding error.
     scale = 0.5 * (math.sin(half) / half if half > 1e-4 else 1.0 - square / 6.0)
     return scale * x, scale * y, scale * z, math.cos(half)
 
 
 def logarithm(q: Quaternion) -> Vector:
-    """Return the rotation vector of a unit quaternion, rad, of the shorter rotation."""
+    """Return the rotation vector (rad) of a unit quaternion, with an angle of at most half a revolution."""
     x, y, z, w = q if q[3] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 * math.atan2(sine, w) / sine if sine > 1e-9 else 2.0
@@ -56,7 +57,7 @@ def twist(q: Quaternion) -> float:
 
 
 def matrix(q: Quaternion) -> Matrix:
-    """Return the rows of the attitude matrix A(q) (Sease 4.8 corrected)."""
+    """Return the rows of the attitude matrix A(q) (Sease, eq. (4.8), corrected)."""
     x, y, z, w = q
     xx, yy, zz = x * x, y * y, z * z
     xy, xz, yz = x * y, x * z, y * z
@@ -69,7 +70,7 @@ def matrix(q: Quaternion) -> Matrix:
 
 
 def times(rows: Matrix, v: Vector) -> Vector:
-    """Return the product of a matrix and a vector."""
+    """Return the product of a matrix (3, 3) and a vector (3,)."""
     (a, b, c), (d, e, f), (g, h, i) = rows
     x, y, z = v
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
@@ -81,7 +82,7 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def skew(v: Vector) -> Matrix:
-    """Return the rows of [v x], so that times(skew(v), u) = v x u."""
+    """Return the rows of the cross-product matrix [v x], for which times(skew(v), u) = v x u."""
     x, y, z = v
     return (0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)
 
