@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import pty
+import signal
 import socket
 import subprocess
 import sys
@@ -208,8 +209,14 @@ def test_one_link_at_a_time_has_the_counters(lines: dict[str, str]) -> None:
     ],
 )
 def test_wrong_use_is_one_line(
-    lines: dict[str, str], words: list[str], problem: str, capsys: pytest.CaptureFixture[str]
+    lines: dict[str, str],
+    words: list[str],
+    problem: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(os, "nice", int)  # the link's low priority would be that of all later tests
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
     keys = f"{lines['place']}/keys/ground"
     assert main([word.format(keys=keys) for word in words]) == 2
     assert problem in capsys.readouterr().err
