@@ -9,8 +9,9 @@ from knightcube.reference.corner_streaks.rate import estimate_rate
 from knightcube.reference.corner_streaks.settings import DetectorName, StreakSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.streaks import EXPOSURE
 from tests.support.scenes import FIELD, slew
+
+EXPOSURE = 0.2
 
 
 @pytest.mark.parametrize(
