@@ -5,8 +5,8 @@
     solution = StarTracker(fov_deg=11.4).solve(image)
 
 The names exported here are the public interface. The modules below `knightcube` can also be imported, but
-they may change with any release. This package needs neither a clock nor a configuration file, a device or a
-socket.
+they may change with any release. The package `knightcube` needs neither a clock nor a configuration file, a
+device or a socket.
 
 Each name is imported at its first use, so that `import knightcube` takes almost no time. A new name must be
 added to both lists below: the first is for type checkers and editors, the second for the interpreter.

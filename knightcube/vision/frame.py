@@ -1,9 +1,9 @@
 """Properties of a frame that are needed for frames of points and frames of streaks.
 
 Background. The level and noise of the background are clipped moments of a sub-sample of each block of pixels.
-Streaks, slow gradients of stray light and hot pixels hardly change these moments. The thesis uses the mean of
-the image as threshold, but noise lifts half of all pixels above the mean (errata, chapter 3). The sum over 3
-x 3 pixels is close to the matched filter of a star that is one pixel wide.
+Streaks, slow gradients of stray light and hot pixels hardly change the estimated background. The thesis uses
+the mean of the image as threshold, but noise lifts half of all pixels above the mean (errata, chapter 3). The
+sum over 3 x 3 pixels is close to the matched filter of a star that is one pixel wide.
 
 Hot pixels are bright pixels with dark neighbours, which no optics can produce. If a star's image has a
 standard deviation of more than 0.5 px, the four neighbours of its brightest pixel have at least 15 % of the
@@ -217,7 +217,7 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
     yy = np.bincount(owner, light * dy * dy, count) / whole
     xy = np.bincount(owner, light * dx * dy, count) / whole
     # The point spread increases both principal moments by the same amount.
-    # The difference of the principal moments is therefore that of a line of length L, which is L^2/12.
+    # For a line of length L, the difference of the principal moments is L^2/12 for any point spread.
     spread = np.hypot(xx - yy, 2.0 * xy)
     return Moments(
         flux,
@@ -312,8 +312,8 @@ _LEAST_PLATEAU, _PILED_UP, _PLATEAU_REACH = 4, 2.0, 0.02
 """Limits for saturation in a frame of points.
 
 The first limit is the minimum number of pixels with the highest count. The second limit is the minimum ratio
-of the pixels with the highest count to the pixels just below this count. The third limit is the width of the
-range just below the highest count, as a fraction of the range of all counts.
+of the pixels with the highest count to the pixels with slightly smaller counts. The third limit is the width
+of the range just below the highest count, as a fraction of the range of all counts.
 """
 
 

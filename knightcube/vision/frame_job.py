@@ -6,7 +6,7 @@
    image are identified.
 
 2. Stars at rest are searched near their predicted positions if there is a prior attitude. Without a prior
-   attitude, or if this search does not succeed, stars are searched in the whole frame.
+attitude, or if the stars are not found near their predictions, the whole frame is searched.
 
 3. The positions of streaked stars at mid-exposure are identified like points. The streaks are fitted a second
    time with a corrected focal length or with the directions of the identified stars.

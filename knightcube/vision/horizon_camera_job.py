@@ -2,9 +2,9 @@
 
 The solar strings determine which camera is read first. The solar strings also give the Sun direction if no
 camera finds the Sun. The nadir direction is fitted to the limbs in all images at once. If no image shows a
-limb, the Earth may fill one camera while the others are dark. The brightness of all images then gives a
-coarse nadir direction. The estimators are imported when they are used, because the control process does not
-need them.
+limb, the Earth may fill one camera while the others are dark. The brightness of all images gives a coarse
+nadir direction if no image shows a limb. The estimators are imported when they are used, because the control
+process does not need them.
 """
 
 from __future__ import annotations

@@ -522,8 +522,8 @@ def lens_accuracy(
 
     The accuracies of focal length and centre are taken from the fit `found` without the omitted terms. The
     change of the focal length relative to the fit `whole` with all terms is added to the error of the focal
-    length. The accuracy of the distortion is the relative displacement of an image corner. This displacement
-    includes the uncertainty with all terms and the difference between the two fits.
+    length. The accuracy of the distortion is the relative displacement of an image corner. The distortion
+    accuracy includes the uncertainty with all terms and the difference between the two fits.
     """
     lens, sigma = found.lens, found.sigma
     changed = whole.lens.focal_length - lens.focal_length

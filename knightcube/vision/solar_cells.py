@@ -6,7 +6,7 @@ string's normal, and zero if the Sun is behind the string. The Earth also illumi
 third as strongly as the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of the light from
 the half sky around nadir e. Earth light correlates the errors of the strings. The correlation pattern is
 known if nadir is known, otherwise the mean pattern over all nadir directions is used. The covariance of the
-Sun direction includes this pattern.
+Sun direction includes the correlation by Earth light.
 
 The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if any
 one string fails in any way. The magnetic field does not determine the rotation about the field direction. All

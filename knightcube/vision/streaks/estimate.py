@@ -1,18 +1,17 @@
 """Estimation of the camera's motion during one exposure from all pixels of all star streaks.
 
 The bright regions of the frame give initial guesses of the motion, and each guess is fitted to the brightest
-stars. A matched filter along each fitted motion then detects faint stars. The result is a joint fit of the
-motion and the bright stars, in which the flux of the faint stars is modelled. A final check verifies that
-each modelled streak matches one complete streak. A rotation that is too small divides a streak into segments,
-and a rotation that is too large joins several streaks. The functions of this module are pure and
-deterministic.
+stars. A matched filter along each fitted motion detects faint stars. The result is a joint fit of the motion
+and the bright stars, in which the flux of the faint stars is modelled. A final check verifies that each
+modelled streak matches one complete streak. A rotation that is too small divides a streak into segments, and
+a rotation that is too large joins several streaks. The functions of this module are pure and deterministic.
 
 With a rolling shutter, a star that moves in the readout direction is exposed longer than a star that moves
-against it. A motion and its time reversal therefore produce streaks of different lengths. A prior rate
-determines the sign of the rotation before the fit. Without a prior rate, both signs of the rotation are
-fitted, and the better fit is selected. If neither sign fits significantly better, the sign remains unknown,
-and the rate is the mean of one fit and the reversed other fit. The covariance of this mean includes the
-difference between the two fits.
+against it. With a rolling shutter, a motion and its time reversal produce streaks of different lengths. A
+prior rate determines the sign of the rotation before the fit. Without a prior rate, both signs of the
+rotation are fitted, and the better fit is selected. If neither sign fits significantly better, the sign
+remains unknown, and the rate is the mean of one fit and the reversed other fit. The covariance of the
+averaged rate includes the difference between the two fits.
 """
 
 from __future__ import annotations
@@ -324,9 +323,9 @@ class StreakVerdict(Enum):
 def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> StreakVerdict:
     """Return whether the trusted streaks of `scene` have confirmed ends and no gaps.
 
-    In a crowded frame, one apparent star may be a blend of several stars. A few streaks with gaps therefore
-    make a motion only doubtful, and enough streaks with two confirmed ends outweigh these gaps. A motion is
-    also doubtful if no streak has both ends in the frame, or if most streaks with both ends in the frame
+    In a crowded frame, one apparent star may be a blend of several stars. A motion is only doubtful if a few
+    streaks have gaps, and is accepted if enough other streaks have two confirmed ends. A motion is also
+    doubtful if no streak has both ends in the frame, or if most streaks with both ends in the frame
     contradict the motion. A motion with too many wrong streak ends is rejected.
     """
     stars = np.concatenate([scene.stars, faint.stars])
@@ -386,12 +385,12 @@ class _Candidate:
     """A motion from the joint fit, with its streaks.
 
     Attributes:
-        result: result of the estimation with this motion.
+        result: estimation result with the motion.
         rotation: (3,) rad, rotation vector over the exposure.
-        verdict: verdict of the streak check on this motion.
-        middles: (n, 2) px, centres of the bright streaks. For a global shutter, `middles` is empty.
-        excess: (n,) chi-square minus the number of pixels of each bright streak. For a global shutter,
-            `excess` is empty.
+        verdict: verdict of the streak check on the motion.
+        middles: (n, 2) px, centres of the bright streaks. The array `middles` is empty for a global shutter.
+        excess: (n,) chi-square minus the number of pixels of each bright streak. The array `excess` is empty
+            for a global shutter.
     """
 
     result: MotionResult
@@ -436,7 +435,7 @@ def _rolling_result(
         return None
     known = [found for found in both if found.result.rate is not None]
     if len(known) < 2:
-        # If the fit for one sign does not succeed, this sign may still be the true one.
+        # If the fit for one sign of the rotation does not succeed, the sign may still be the true one.
         return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
     one, other = known
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)

@@ -4,9 +4,9 @@ A streak at the pixel p is parallel to B(p) u, where u is the rotation vector an
 The unit normal n of the streak therefore gives the linear equation n.B(p) u = 0, which holds for either
 direction of motion along the streak. Pairs of regions propose rotation axes, the other regions vote for the
 proposed axes, and least squares refines the axis with most votes. All stars rotate by the same angle, and the
-lengths of the regions vote for this angle. A region that is truncated by the border of the frame gives only a
-lower limit of the angle. Fragments of one streak lie on one circle about the rotation axis, and their total
-length also votes for the angle.
+lengths of the regions vote for the rotation angle. A region that is truncated by the border of the frame
+gives only a lower limit of the angle. Fragments of one streak lie on one circle about the rotation axis, and
+their total length also votes for the angle.
 
 If few streaks lie completely in the frame, a scan finds the rotation angle. Along a circle about the rotation
 axis, the intensity of a star is a box function whose length is the rotation angle. The samples around the

@@ -172,8 +172,8 @@ def without_glare(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame |
     """Return `frame` with limbs and reflections excluded, or None if there are none.
 
     A limb or a reflection is a region that contains a square larger than any star. A net of crossing streaks
-    does not contain such a large square. A margin around limbs and reflections is also excluded, because the
-    background map does not follow steep gradients.
+    is not excluded, because it contains no square larger than a star. A margin around limbs and reflections
+    is also excluded, because the background map does not follow steep gradients.
     """
     area = np.bincount(regions.owner, minlength=len(regions))
     broad = area > _BROAD * np.maximum(regions.length, _LEAST_LENGTH)
@@ -254,9 +254,9 @@ def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | N
     """Return the standard deviation (px) of the point spread before pixel convolution, or None if unknown.
 
     The autocorrelation of a streak of Gaussian width w at a displacement d across the streak is proportional
-    to exp(-d^2/(4 w^2)). The product of the autocorrelations along columns and rows has this form for every
-    direction and curvature of the streak. The median over the brightest regions is insensitive to blended
-    stars and bright limbs.
+    to exp(-d^2/(4 w^2)). The product of the autocorrelations along columns and rows is also Gaussian, for
+    every direction and curvature of the streak. The median over the brightest regions is insensitive to
+    blended stars and bright limbs.
     """
     chosen = np.flatnonzero(regions.owner < _MOST_WIDTH_REGIONS)
     owner, columns = regions.owner[chosen], frame.shape[1]

@@ -2,8 +2,8 @@
 
 Time is measured in exposures and is zero at mid-exposure. With the rate u at mid-exposure and the angular
 acceleration g in camera axes, the rate at time t is u + g t, and the direction v of a star obeys v' = -(u + g
-t) x v. The rotation vector since mid-exposure is u t + g t^2/2 + (u x g) t^3/12 (Magnus expansion). This
-rotation vector is exact if g is zero, and has an error of fourth order in t otherwise. Terms of third and
+t) x v. The rotation vector since mid-exposure is u t + g t^2/2 + (u x g) t^3/12 (Magnus expansion). The
+Magnus expansion is exact if g is zero, and otherwise has an error of fourth order in t. Terms of third and
 higher order in t that the navigation filter provides are added to the rotation vector. A star is identified
 by its pixel coordinates at mid-exposure.
 """
@@ -264,7 +264,7 @@ def sensitivities_and_velocity(
 
 
 # The functions below use vector arrays (..., 3, m), so that each component is contiguous in memory.
-# The functions above this line return transposed views of (..., 3, m) arrays.
+# The public functions above return transposed views of (..., 3, m) arrays.
 
 
 def _flow(pinhole: Pinhole, there: FloatArray) -> FloatArray:
@@ -520,7 +520,7 @@ def chained_stars(
 
     If the assumed rotation is too small, each streak is modelled as a chain of shorter streaks of equal flux
     `light` (n,) on one circle about the rotation axis, and each segment fits as well as a complete streak.
-    Different stars rarely form such a chain of segments by chance.
+    Different stars rarely form a chain of equal segments by chance.
     """
     polar, azimuth = polar_angles(pinhole, motion, stars)
     rotations = azimuth_differences(azimuth[:judged], azimuth)

@@ -2,11 +2,11 @@
 
 The fit iterates until the steps of the shared parameters are small. The fit covers only a few pixels beyond
 the ends of the streaks, so that it can converge to a wrong rotation angle. With a rotation that is too small,
-the model may match only one end of every streak. The function `true_ends` detects flux beyond the streak ends
-of such a model. With a rotation that is too large, the modelled streaks extend over dark pixels. The function
+the model may match only one end of every streak. The function `true_ends` detects flux beyond the modelled
+streak ends. With a rotation that is too large, the modelled streaks extend over dark pixels. The function
 `unbroken` detects streaks with dark segments. If a modelled end lies more than a few point-spread widths
 beyond the true end, the pixels around it contain no starlight and do not attract the end. The function
-`stretched` then searches a longer distance for the true ends and corrects the streak length.
+`stretched` therefore searches a longer distance for the true ends and corrects the streak length.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from knightcube.vision.streaks.normal_equations import (
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
 # Work (pixels) after which no further motion is fitted.
-# A fit in progress is always completed, so that the work on a frame may be twice this limit.
+# A fit in progress is always completed, so that the work on a frame may be twice the limit.
 _MOST_WORK = 1_600_000
 # Fixed overhead of one model evaluation, in equivalent pixels.
 _EVALUATION = 15_000
@@ -366,7 +366,7 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
 def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
     """Return the fraction of the tested stars with faint flux, a trail, beyond a streak end.
 
-    A wrong angular acceleration in the fit causes such trails.
+    A wrong angular acceleration in the fit causes trails of flux beyond streak ends.
     """
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
     faint = _TRAIL * expected_brightness(scene.light, length)
@@ -716,7 +716,7 @@ def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
 def _excessive(motion: CameraMotion) -> bool:
     """Return whether the angular acceleration exceeds the range of the model.
 
-    A motion from the navigation filter is never excessive.
+    The check does not reject a motion from the navigation filter.
     """
     if motion.higher_terms.any():
         return False

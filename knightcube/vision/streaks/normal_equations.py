@@ -2,8 +2,8 @@
 
 Long streaks are fitted on strips of pixels, and spots on square patches. The flux per px of a streak is
 inversely proportional to the speed of the star. The strip model expands the flux per px to first order around
-each block, which does not hold if the speed is near zero. If the rate increases from zero or decreases to
-zero, a patch therefore covers the slow part of each streak.
+each block, which does not hold if the speed is near zero. A patch covers the slow part of each streak if the
+rate increases from zero or decreases to zero.
 
 The weight of a pixel is the inverse of the variance that the model predicts. The iteration therefore
 converges to the maximum likelihood for Poisson noise. The residual of a pixel is its value minus the modelled
@@ -12,8 +12,8 @@ equations, which leaves the shared parameters (rate, acceleration, width). Stars
 coupled, and a few conjugate-gradient iterations account for the coupling.
 
 Each star also provides its own estimate of the shared parameters. A blend of two stars is wider or longer
-than a single star, and flux of a neighbouring star shifts the ends of a streak. Stars that disagree with the
-majority for this reason are no longer trusted.
+than a single star, and flux of a neighbouring star shifts the ends of a streak. Blended stars disagree with
+the majority in their estimates and are no longer trusted.
 """
 
 from __future__ import annotations
@@ -230,7 +230,8 @@ def _strips_and_patches(
 def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return start and end times (n, 2) of the fast part of each path, for a strip, and of its slow part.
 
-    The slow part is at the end at which the rate is smaller. A part that does not exist has zero duration.
+    The slow part is at the end at which the rate is smaller. If a path has no fast or no slow part, the times
+    of that part are equal.
     """
     motion = scene.motion
     if motion.constant or not motion.rotation.any():
@@ -516,7 +517,7 @@ def apply_information(
     """Return the product of the information matrix of all stars with the vector (`shared`, `alone`).
 
     `shared` (SHARED,) holds the shared parameters, and `alone` (n, ALONE) the parameters of each star. The
-    coupling of stars by shared pixels is included.
+    product includes the coupling of stars by shared pixels.
     """
     n = len(alone)
     vector = np.concatenate([np.broadcast_to(shared, (n, SHARED)), alone], axis=1)
@@ -789,8 +790,8 @@ def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
 def step_significance(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
     """Return the squared significance of a `step` (SHARED,) of the shared parameters, and the star count.
 
-    If the stars scatter more than their noise, the scatter is used in the significance. A single blended star
-    then does not make a step significant.
+    If the stars scatter more than their noise, the scatter is used in the significance. The use of the
+    scatter prevents a single blended star from making a step significant.
     """
     alone = star_equations(evaluation, step != 0.0)
     if alone is None:

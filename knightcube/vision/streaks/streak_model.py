@@ -110,8 +110,8 @@ def cut_strips(
 ) -> Strips:
     """Return the pixels within `width` px of the paths of `stars` (n, 2) px in the intervals `times` (n, 2).
 
-    The mask `ending` (n, 2) states which of the times are ends of a path. Pixels beyond these ends are
-    included. If `ending` is None, all times are ends of a path.
+    The mask `ending` (n, 2) states which of the times are ends of a path. Pixels beyond the ends of a path
+    are included. If `ending` is None, all times are ends of a path.
     """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
     if ending is not None:
@@ -483,7 +483,7 @@ def _draw(
     out[:, 5] += u
     across *= np.float32(1.0 / width**2)
     np.multiply(across, light, out=out[:, 1])
-    # This basis image is the first moment of the counts along the path, between the streak ends.
+    # `out[:, 2]` is the first moment of the counts along the path, between the streak ends.
     along *= out[:, 1]
     across *= np.float32(width**2)
     across *= out[:, 3] - out[:, 4]

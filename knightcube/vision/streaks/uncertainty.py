@@ -4,7 +4,7 @@ Photon noise gives a lower limit of the covariance. The covariance is increased 
 beyond their noise, and by calibration errors of the camera that the stars do not determine. Two errors affect
 all stars equally and cause no scatter: a point spread with an unexpected width or shape, which moves the ends
 of all streaks, and vibration of the body. The residuals at the ends and along the streaks give upper limits
-for these two errors.
+for both errors.
 """
 
 from __future__ import annotations
@@ -425,9 +425,9 @@ def reversal_improvement(camera: FitProblem, scene: StreakScene) -> float:
     The improvement is 0 if no reversing rotation fits better, if the rate is far from zero, or if the motion
     is from the navigation filter. For a rate that changes linearly, the intensity along a path is
     proportional to 1/sqrt(s) at a distance of s px from the point of rest. A rotation that reverses covers
-    the first part of the path twice, which doubles the intensity of this part. If the durations before and
-    after the reversal are equal, the intensity equals that of a motion from rest, and the pixels do not
-    distinguish the two motions.
+    the first part of the path twice, which doubles the intensity there. If the durations before and after the
+    reversal are equal, the intensity equals that of a motion from rest, and the pixels do not distinguish the
+    two motions.
     """
     motion, change = scene.motion, scene.motion.relative_acceleration
     if abs(change) < _NEAR_REST or motion.higher_terms.any():
@@ -620,9 +620,9 @@ def _corrected_lens(
 ) -> tuple[FitProblem, StreakFit, _LensEffect]:
     """Return camera and fit after correction of the most likely lens errors, and the remaining effect.
 
-    Large displacements of streaks are underestimated. The fit is therefore repeated with the corrected lens
-    until the correction is small. The lens is corrected if the stars show an error, or if the lens
-    contributes most of the uncertainty.
+    Large displacements of streaks are underestimated. The fit is repeated with the corrected lens until the
+    correction is small. The lens is corrected if the stars show an error, or if the lens contributes most of
+    the uncertainty.
     """
     first = lens = _lens_effect(camera, whole, exposure, None)
     if not lens.seen and np.trace(lens.described) < _WORTHWHILE**2 * np.sum(whole.scene.motion.rotation**2):

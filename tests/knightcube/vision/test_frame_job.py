@@ -85,7 +85,7 @@ def test_a_streaked_frame_without_a_known_rate_is_solved(
 ) -> None:
     """Without a rate prior, the sign of the rotation is unknown.
 
-    The attitude at mid-exposure is not affected.
+    The attitude at mid-exposure does not depend on the sign of the rotation.
     """
     frame = _frame(40.0)
     found = run(replace(_job(frame, estimator), rate_prior=None))

@@ -50,7 +50,7 @@ def test_an_edge_is_placed_at_its_steepest_point_at_the_scale_that_covers_it(
 ) -> None:
     """The slope of a Gaussian edge of w px at the scale s is (1 + (w/s)^2)^-1/2.
 
-    The next scale is chosen at a gain of 1.4, which is w = 1.37 s.
+    The next scale is chosen if it increases the slope by 1.4, which is at w = 1.37 s.
     """
     edges, lines = find_edges(step(130.3, width), FEW)
     assert len(edges) == 8
@@ -135,7 +135,7 @@ def test_pixels_above_three_tenths_of_the_span_are_bright(grey: float, place: fl
 
 @pytest.mark.parametrize(("sigmas", "lit"), [(5.5, False), (6.5, True)])
 def test_pixels_within_six_sigma_of_the_dark_ones_are_not_bright(sigmas: float, lit: bool) -> None:
-    """A quarter at 100 sigma determines the span, and a threshold of 1 % of the span is below the noise."""
+    """The span is that of a quarter of the image at 100 sigma, and 1 % of the span is below the noise."""
     noise = np.random.default_rng(3).normal(0.0, 1.0, (SIZE, SIZE))
     image = bars(0.0, sigmas, 0.0, 100.0) + noise
     low = EdgeSettings(lines=8, threshold=0.01, run=1)

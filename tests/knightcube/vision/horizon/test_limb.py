@@ -123,7 +123,7 @@ def _arc(view: LimbView, generator: np.random.Generator, sigma: float) -> FloatA
 def test_the_fits_covariance_is_that_of_its_errors() -> None:
     """The summed NEES of 200 fits is a chi-square of 400 degrees of freedom.
 
-    Its 99.9 % limits are 310 and 497.
+    The 99.9 % limits of the sum are 310 and 497.
     """
     generator = np.random.default_rng(7)
     sigma, prior = 3e-4, Prior(0.05, 1000.0, 50.0)

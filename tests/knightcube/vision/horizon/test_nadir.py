@@ -231,7 +231,7 @@ def test_impossible_knowledge_is_refused(wrong: dict[str, object], complaint: st
 def test_a_photograph_from_orbit_is_fitted_to_less_than_half_a_pixel() -> None:
     """The photograph from OPS-SAT-1 has 27 scan lines.
 
-    Its README reports an independent fit with 0.44 px rms.
+    The README of the photograph reports an independent fit with 0.44 px rms.
     """
     if not PHOTOGRAPH.exists():
         pytest.skip("needs ../shared/data/limb")

@@ -65,7 +65,7 @@ def test_the_triangles_are_those_of_enumeration() -> None:
 def test_any_circle_has_triangles_of_its_brightest_stars_beside_a_cluster_too() -> None:
     """A hundred stars within a few degrees are brighter than all others.
 
-    Their neighbours therefore have low ranks.
+    Stars near the cluster therefore have low brightness ranks.
     """
     near = np.array([0.0, 0.0, 1.0]) + 0.05 * _strewn(100, 2)
     direction = np.concatenate([near / np.linalg.norm(near, axis=-1, keepdims=True), _strewn(3000)])
