@@ -1,0 +1,296 @@
+"""Commands over the link: reports, changes of keys, repetition, and files within the transmission rate."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from flight.link.files.store import Store
+from flight.link.files.units import DOWN, UP, UnitPacker, is_unit
+from flight.link.frames import LONGEST_FRAME
+from flight.link.process import directives
+from flight.link.process.commanding import Report, Request, Stage
+from flight.link.process.directives import NewKey, SendFile
+from flight.link.security import NEXT, Association, Vault
+from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
+from flight.link.telemetry.packets import LAYOUTS, Packer
+from ground.link import commanding
+from ground.link.terminal import make_keys
+from knightcube.errors import FlightError, UsageError
+
+S = 1_000_000_000
+
+
+def report(stage: Stage, text: str = "", counter: int = 0, spi: int = 1) -> Report:
+    """Return a report on a command."""
+    return Report(spi, counter, stage, "ping", text, Request(0, 0))
+
+
+class FakeTerminal:
+    """A terminal that keeps what is sent, and answers with given reports."""
+
+    def __init__(self, vault: Vault | None = None, *answers: list[Report]) -> None:
+        self.vault = vault
+        self.answers = list(answers)
+        self.sent: list[bytes] = []
+        self.names: list[Any] = []
+
+    def sealer(self, spi: int, block: int) -> Any:
+        return SimpleNamespace(name=spi, block=block, _name=spi)
+
+    def send(self, packet: bytes, spi: int = 1) -> int:
+        return self.send_by(SimpleNamespace(_name=spi), packet)
+
+    def send_by(self, sealer: Any, packet: bytes) -> int:
+        self.sent.append(packet)
+        self.names.append(sealer._name)
+        return len(self.sent)
+
+    def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
+        yield from (self.answers.pop(0) if self.answers else [])
+
+
+def terminal(vault: Vault | None = None, *answers: list[Report]) -> Any:
+    """Return a terminal that answers with lists of reports."""
+    return FakeTerminal(vault, *answers)
+
+
+@pytest.mark.parametrize(
+    ("stages", "obeyed", "text"),
+    [
+        ([], False, ""),
+        ([Stage.ACCEPTED], False, ""),
+        ([Stage.ACCEPTED, Stage.STARTED], True, ""),
+        ([Stage.ACCEPTED, Stage.STARTED, Stage.COMPLETED], True, ""),
+        ([Stage.REFUSED], False, "0"),
+        ([Stage.ACCEPTED, Stage.FAILED], False, "1"),
+    ],
+)
+def test_the_last_report_shows_whether_a_command_was_obeyed(
+    stages: list[Stage], obeyed: bool, text: str
+) -> None:
+    reports = [report(stage, str(k)) for k, stage in enumerate(stages)]
+    assert commanding.obeyed(reports) is obeyed
+    assert commanding.failed(reports) == text
+
+
+def test_each_report_is_shown_and_none_is_an_error() -> None:
+    shown: list[Report] = []
+    answers = [report(Stage.ACCEPTED), report(Stage.COMPLETED)]
+    assert commanding.command(terminal(None, answers), b"x", 1, 2.0, shown.append) == answers == shown
+    with pytest.raises(FlightError, match=r"within 2\.5 s"):
+        commanding.command(terminal(), b"x", 1, 2.5, shown.append)
+
+
+@pytest.fixture
+def vault(tmp_path: Path) -> Vault:
+    """Return the keys of the ground."""
+    make_keys(tmp_path / "keys")
+    return Vault(tmp_path / "keys" / "ground")
+
+
+def sent_key(packet: bytes) -> NewKey:
+    """Return the key change in a command packet."""
+    directive = directives.unpack(packet)
+    assert isinstance(directive, NewKey)
+    return directive
+
+
+def test_a_new_command_key_replaces_the_old_one_when_the_satellite_has_it(vault: Vault) -> None:
+    line = terminal(vault, [report(Stage.COMPLETED)])
+    old = vault.read(1)
+    assert old is not None
+    assert commanding.obeyed(commanding.change_key(line, vault, 1, 2, 1.0, lambda _: None))
+    order = sent_key(line.sent[0])
+    now = vault.read(1)
+    assert now is not None
+    assert (order.spi, order.generation, bytes(order.key)) == (1, old.generation + 1, now.key)
+    assert (now.generation, now.unused, now.key == old.key) == (2, 0, False)
+    assert vault.read(f"1-{NEXT}") is None
+
+
+def test_a_refused_key_is_kept_for_the_next_attempt(vault: Vault) -> None:
+    refused = terminal(vault, [report(Stage.REFUSED)])
+    commanding.change_key(refused, vault, 1, 2, 1.0, lambda _: None)
+    kept, old = vault.read(f"1-{NEXT}"), vault.read(1)
+    assert kept is not None
+    assert old is not None
+    assert (kept.generation, old.generation) == (2, 1)
+    silent = terminal(vault, [], [report(Stage.COMPLETED)])
+    commanding.change_key(silent, vault, 1, 2, 1.0, lambda _: None)
+    assert silent.names == [f"1-{NEXT}", 2], "a ping by the new key, then the same key again"
+    assert bytes(sent_key(silent.sent[1]).key) == kept.key
+
+
+def test_a_key_that_the_satellite_already_has_is_adopted_by_a_ping(vault: Vault) -> None:
+    vault.write(Association(1, 2, 0, bytes(32)), f"1-{NEXT}")
+    line = terminal(vault, [report(Stage.COMPLETED)])
+    assert len(commanding.change_key(line, vault, 1, 2, 1.0, lambda _: None)) == 1
+    assert line.names == [f"1-{NEXT}"]
+    now = vault.read(1)
+    assert now is not None
+    assert (now.generation, now.key) == (2, bytes(32))
+
+
+def test_a_kept_key_of_another_generation_is_replaced(vault: Vault) -> None:
+    vault.write(Association(3, 7, 0, bytes(32)), f"3-{NEXT}")
+    line = terminal(vault, [report(Stage.COMPLETED)])
+    commanding.change_key(line, vault, 3, 2, 1.0, lambda _: None)
+    order = sent_key(line.sent[0])
+    assert (len(line.sent), order.spi, order.generation) == (1, 3, 2), "no ping by a telemetry key"
+    kept, old = vault.read(f"3-{NEXT}"), vault.read(3)
+    assert kept is not None
+    assert old is not None
+    assert (kept.generation, old.generation) == (2, 1), "the first frame under the new key replaces it"
+
+
+def test_a_key_that_is_lost_on_the_ground_cannot_be_changed(vault: Vault) -> None:
+    vault.remove(1)
+    with pytest.raises(UsageError, match=r"SPI 1 .*new keys"):
+        commanding.change_key(terminal(vault), vault, 1, 2, 1.0, lambda _: None)
+
+
+def session(folder: Path, line: Any, rate: float = 1e6) -> commanding.FileSession:
+    """Return a session whose rate is in bytes/s."""
+    return commanding.FileSession(line, Store(folder), 1, rate, 0)
+
+
+def verification(counter: int, stage: Stage) -> bytes:
+    """Return a verification packet."""
+    values: dict[str, Any] = {
+        field.name: "" if field.kind.startswith("S") else 0 for field in VERIFICATION.fields
+    }
+    return Packer().pack(VERIFICATION, 0, {**values, "counter": counter, "spi": 1, "stage": int(stage)})
+
+
+def test_an_unanswered_directive_is_repeated_every_five_seconds(tmp_path: Path) -> None:
+    line = terminal()
+    files = session(tmp_path, line)
+    files.ask(SendFile("a"), 0)
+    files.transmit(5 * S - 1)
+    assert len(line.sent) == 1
+    files.transmit(5 * S)
+    files.transmit(10 * S - 1)
+    assert len(line.sent) == 2
+    files.take([(0, verification(9, Stage.COMPLETED))], 6 * S)
+    assert files.reports() == [], "of another command"
+    files.take([(0, verification(2, Stage.ACCEPTED))], 7 * S)
+    files.transmit(10 * S)
+    assert len(line.sent) == 3, "acceptance is not yet an answer"
+    files.take([(0, verification(3, Stage.COMPLETED))], 11 * S)
+    files.transmit(20 * S)
+    assert len(line.sent) == 3
+    assert [one.stage for one in files.reports()] == [Stage.ACCEPTED, Stage.COMPLETED]
+    assert files.reports() == []
+    assert files.received_ns == 11 * S
+
+
+def test_units_are_sent_within_the_rate(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(bytes(200_000))
+    line = terminal()
+    files = session(tmp_path / "store", line, rate=20_000.0)
+    progress = files.put(tmp_path / "file", "name", 0)
+    assert progress.name == "name"
+    files.transmit(0)
+    assert line.sent == [], "without time there is no credit"
+    for step in range(1, 41):
+        files.transmit(step * S // 20)
+    assert all(is_unit(packet, UP) for packet in line.sent)
+    overhead = commanding._FRAME_BYTES
+    spent = sum(len(packet) + overhead for packet in line.sent)
+    assert 40_000 - 1200 <= spent <= 40_000 + 1200
+    before = len(line.sent)
+    files.transmit(100 * S)
+    burst = sum(len(packet) + overhead for packet in line.sent[before:])
+    assert burst <= 2 * LONGEST_FRAME + 1200, "unused rate accumulates for a short time only"
+
+
+def test_the_satellites_reason_goes_before_our_own(tmp_path: Path) -> None:
+    files = session(tmp_path, terminal())
+    ours = SimpleNamespace(source=2, number=7, said="timeout")
+    assert files.reason_of(cast(Any, ours)) == "timeout"
+    values: dict[str, Any] = {
+        field.name: "" if field.kind.startswith("S") else 0 for field in TRANSFER.fields
+    }
+    files.take([(0, Packer().pack(TRANSFER, 0, {**values, "source": 2, "number": 7, "text": "no room"}))], 1)
+    assert files.reason_of(cast(Any, ours)) == "no room"
+
+
+def test_units_of_an_unknown_kind_are_ignored(tmp_path: Path) -> None:
+    files = session(tmp_path, terminal())
+    files.take([(0, UnitPacker(DOWN).pack(b"\xff\xff\xff", 0))], 5)
+    assert files.received_ns == 5
+    files.close(6)
+
+
+def test_a_checksum_is_that_of_the_file(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    assert commanding.sha256_of(tmp_path / "a") == hashlib.sha256(b"abc").digest()
+    with pytest.raises(FlightError, match="missing"):
+        commanding.sha256_of(tmp_path / "missing")
+
+
+def _answering(server: socket.socket, answer: bytes) -> threading.Thread:
+    """Answer one datagram in a thread."""
+
+    def run() -> None:
+        data, sender = server.recvfrom(4096)
+        server.sendto(answer + data, sender)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_a_packet_is_exchanged_over_udp_and_over_a_unix_socket(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        server.bind(("127.0.0.1", 0))
+        thread = _answering(server, b"udp ")
+        assert commanding.exchange(f"127.0.0.1:{server.getsockname()[1]}", b"ping", 20.0) == b"udp ping"
+        thread.join(20.0)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
+        server.bind(str(tmp_path / "s"))
+        thread = _answering(server, b"unix ")
+        assert commanding.exchange(str(tmp_path / "s"), b"ping", 20.0) == b"unix ping"
+        thread.join(20.0)
+        with pytest.raises(FlightError, match=r"within 0\.01 s"):
+            commanding.exchange(str(tmp_path / "s"), b"ping", 0.01)
+
+
+@pytest.mark.parametrize("timeout", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_timeout_is_a_positive_number(timeout: float) -> None:
+    with pytest.raises(UsageError, match="--timeout"):
+        commanding.exchange("nowhere", b"", timeout)
+
+
+def test_an_address_without_a_flight_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(FlightError, match="no flight"):
+        commanding.exchange(str(tmp_path / "none"), b"x", 1.0)
+    with pytest.raises((UsageError, FlightError), match="99999"):
+        commanding.exchange("127.0.0.1:99999", b"x", 1.0)
+
+
+def test_a_link_needs_the_keys_of_the_ground() -> None:
+    parser = argparse.ArgumentParser()
+    commanding.add_link_options(parser, parser.add_mutually_exclusive_group())
+    options = parser.parse_args(["--link", "tcp:127.0.0.1:9"])
+    assert (options.link, options.keys, options.spacecraft, options.frame_bytes) == (
+        "tcp:127.0.0.1:9",
+        None,
+        0x1A5,
+        1115,
+    )
+    with pytest.raises(UsageError, match="--keys"):
+        commanding.terminal_of(options)
+
+
+def test_the_first_bytes_of_the_packets_are_those_of_the_table() -> None:
+    assert LAYOUTS["verification"].identifier.to_bytes(2, "big") == commanding._VERIFICATION
