@@ -1,15 +1,16 @@
-"""A first orbit of an object from directions alone, observed from a known orbit, by all sightings at once.
+"""The orbit of an object from directions alone, fitted to all sightings from a satellite in a known orbit.
 
-The unknowns are the direction, the velocity divided by the distance, and the logarithm of the distance, at
-the middle of the arc. Sightings of one pass determine the first five well and the distance badly: free fall
-close to the observer looks the same at every distance apart from the curvature by gravity. The distance is
-therefore scanned (as over the admissible region of Milani et al., Celestial Mechanics 90, 2004). For each
-distance the other five unknowns are fitted by Gauss-Newton, and the best fit is refined in all six. The
-interval of distances whose chi-square is within the 95 % bound of the minimum shows whether the arc suffices.
-Gauss's method gives the same distance with the noise of three sightings.
+At the middle of the arc, the six unknowns are the direction, the relative velocity divided by the distance,
+and the logarithm of the distance. Sightings of one pass determine all unknowns except the distance well. Only
+the curvature of the path by gravity distinguishes the distances of an object in free fall near the observer.
+The distance is therefore scanned (as over the admissible region of Milani et al., Celestial Mechanics 90,
+2004). For each distance the other five unknowns are fitted by Gauss-Newton, and the best fit is refined in
+all six. The arc is long enough for an orbit if the 95 % confidence interval of the distance, found from
+chi-square, is short. Gauss's method finds the same distance, but with the noise of only three sightings.
 
-Forces: a spherical Earth and J2. Directions are those in which a star at rest would appear: light time and
-aberration shift an object by its velocity relative to the Sun.
+The forces are the gravity of a spherical Earth and J2. The directions of an object are compared with
+catalogue directions of stars, so light time and aberration shift the object by its velocity relative to the
+Sun.
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ from knightcube.errors import FlightError
 _LONGEST_STEP = 10.0
 _SMOOTHING_ROUNDS = 3
 _STATE_STEPS = np.repeat([1.0, 1e-3], 3)
-"""Steps of the finite differences, m and m/s."""
+"""Steps of position (m) and velocity (m/s) for finite differences."""
 
 
 def smoothed(
     times: FloatArray, states: FloatArray, sigma: FloatArray, middle: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the orbit that fits measured positions best: states (n, 6), and covariance (6, 6) at `middle`.
+    """Return the states (n, 6) of the orbit that fits measured positions best.
 
-    `sigma` (n,) m is the standard deviation of each axis of each position. The velocities of `states` are
-    only the initial guess.
+    The covariance (6, 6) of the state at the instant `middle` is returned too. `sigma` (n,) m is the standard
+    deviation per axis of each position. The velocities of `states` are only the initial guess.
     """
     state = states[middle]
     covariance = np.eye(6)
@@ -79,9 +80,9 @@ def trajectories(start: FloatArray, times: FloatArray) -> FloatArray:
 
 
 def _derivative(state: FloatArray) -> FloatArray:
-    """Return velocity and acceleration (k, 6)."""
+    """Return the time derivatives (k, 6) of states (k, 6), which are velocities and accelerations."""
     position = state[:, :3]
-    # Bound the acceleration of hypotheses deep inside the Earth.
+    # The lower bound of the radius limits the acceleration of hypotheses deep inside the Earth.
     square = np.maximum(np.sum(position**2, axis=1, keepdims=True), (0.5 * EARTH_RADIUS) ** 2)
     flat = 1.5 * J2 * EARTH_RADIUS**2 / square
     tilt = 5.0 * position[:, 2:] ** 2 / square
@@ -91,25 +92,26 @@ def _derivative(state: FloatArray) -> FloatArray:
 
 MINIMUM_SIGHTINGS = 6
 RATIO = 1.5
-"""Largest ratio of the ends of the distance interval for which an orbit is returned."""
+"""Largest ratio of the longest to the shortest possible distance for which an orbit is returned."""
 GROUND_CLEARANCE = 80e3
-"""Smallest perigee height (m) of a lasting orbit."""
+"""Smallest perigee height (m) of an orbit that is clear of the Earth."""
 _NEAREST, _FARTHEST, _GRID = 1e3, 6e7, 90
-"""Nearest and farthest distance of the scan, m, and the number of its logarithmically spaced distances."""
+"""Nearest and farthest distance (m) of the scan, and the number of logarithmically spaced distances."""
 _DEGREES_95 = 3.841
 """95 % bound of chi-square with one degree of freedom."""
 _STEPS = np.array([1e-6, 1e-6, 1e-7, 1e-7, 1e-6, 1e-4])
-"""Steps of the central differences: rad, rad, 1/s, 1/s, 1/s, logarithm."""
+"""Steps of the six unknowns in central differences: direction (rad), velocity per distance (1/s), log
+distance."""
 _LONGEST_STEPS = np.array([0.05, 0.05, 0.02, 0.02, 0.02])
-"""Longest Gauss-Newton steps of the same unknowns, so that poor hypotheses do not diverge."""
+"""Longest Gauss-Newton steps of the six unknowns, which keep poor hypotheses from diverging."""
 _ROUNDS, _FINAL_ROUNDS = 6, 20
 _MISFIT = 1e-6
-"""Probability of the chi-square below which the sightings are rejected as no free fall, or as having larger
-errors than stated."""
+"""Smallest accepted probability of the chi-square of a fit. Below it, the object is not in free fall, or the
+sightings have larger errors than stated."""
 
 
 class ArcError(FlightError):
-    """Raised if sightings determine no orbit; the message gives the reason with numbers."""
+    """Error raised if the sightings do not determine an orbit; the message gives the reason with values."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,11 +119,12 @@ class Bearings:
     """Directions observed from a known orbit.
 
     Attributes:
-        times: (n,) s, increasing.
-        directions: (n, 3) unit vectors, ICRS.
-        sigma: (n,) rad, along each axis.
-        observer: (n, 6) m and m/s, ICRS about the Earth's centre.
-        earth: (3,) m/s of the Earth relative to the Sun.
+        times: increasing times (n,) of the sightings, s.
+        directions: unit vectors (n, 3) from the observer to the object, ICRS.
+        sigma: standard deviation (n,) of the directions along each axis, rad.
+        observer: position and velocity (n, 6) of the observer relative to the Earth's centre, ICRS, m and
+            m/s.
+        earth: velocity (3,) of the Earth relative to the Sun, ICRS, m/s.
     """
 
     times: FloatArray
@@ -137,14 +140,14 @@ class FirstOrbit:
 
     Attributes:
         time: s.
-        state: (6,) m and m/s, ICRS.
-        covariance: (6, 6), without the observer's own error.
-        distance: m from the observer at that time.
-        interval: m, ends of the 95 % interval of the distance.
-        lasts: whether the orbit is bound to the Earth and clear of it. If not, the interval contains other
-            orbits that are.
-        chi_square: of the sightings, with `degrees` of freedom.
-        degrees: degrees of freedom.
+        state: position and velocity (6,) of the object relative to the Earth's centre, ICRS, m and m/s.
+        covariance: covariance (6, 6) of the state, without the error of the observer's orbit.
+        distance: distance of the object from the observer at the time of the state, m.
+        interval: ends of the 95 % confidence interval of the distance, m.
+        lasts: whether the orbit is bound to the Earth and does not hit it. If the orbit is not, other orbits
+            in the distance interval are.
+        chi_square: chi-square of the sightings, with `degrees` degrees of freedom.
+        degrees: number of degrees of freedom of the chi-square.
     """
 
     time: float
@@ -158,7 +161,10 @@ class FirstOrbit:
 
 
 def first_orbit(seen: Bearings) -> FirstOrbit:
-    """Return the orbit of an object. Raises ArcError if the sightings determine none."""
+    """Return the orbit of a sighted object.
+
+    Raises ArcError if the sightings do not determine an orbit.
+    """
     count = len(seen.times)
     if count < MINIMUM_SIGHTINGS:
         raise ArcError(f"{count} sightings: an orbit needs {MINIMUM_SIGHTINGS} or more")
@@ -202,10 +208,10 @@ def first_orbit(seen: Bearings) -> FirstOrbit:
 def _within(
     logarithms: FloatArray, chi_square: FloatArray
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the interval in which chi-square is within `_DEGREES_95` of its minimum.
+    """Return the interval of distances in which chi-square is within `_DEGREES_95` of its minimum.
 
-    The first pair are the outermost scanned points inside the interval, the second pair its interpolated
-    ends.
+    The first pair holds the outermost scanned points inside the interval. The second pair holds the
+    interpolated ends of the interval.
     """
     excess = chi_square - chi_square.min() - _DEGREES_95
     first, last = (int(position) for position in np.flatnonzero(excess < 0.0)[[0, -1]])
@@ -220,9 +226,9 @@ def _within(
 
 
 def _too_short(arc: float, interval: tuple[float, float], lasting: FloatArray) -> str:
-    """Return the reason why an arc (s) does not suffice.
+    """Return the message for an arc (s) that is too short.
 
-    `lasting` holds the logarithms of the distances of lasting orbits.
+    `lasting` holds the logarithms of those distances whose orbits are bound and clear of the Earth.
     """
     low, high = (1e-3 * math.exp(end) for end in interval)
     text = f"the arc of {arc:.0f} s is too short: the distance is {low:.3g} to {high:.3g} km (95 %)"
@@ -233,7 +239,7 @@ def _too_short(arc: float, interval: tuple[float, float], lasting: FloatArray) -
 
 
 class _ArcFit:
-    """The least-squares fit of the sightings; unknowns (k, 6) of k hypotheses at once."""
+    """The least-squares fit of an orbit to the sightings, for several hypotheses at once."""
 
     def __init__(self, seen: Bearings) -> None:
         self._seen = seen
@@ -244,7 +250,7 @@ class _ArcFit:
         self._across = np.array([tangent_basis(direction) for direction in seen.directions])
 
     def states(self, unknowns: FloatArray) -> FloatArray:
-        """Return the states (k, 6) at the middle of the arc."""
+        """Return the states (k, 6) of k hypotheses at the middle of the arc."""
         position = self._axis + unknowns[:, :2] @ self._basis
         position = position / np.linalg.norm(position, axis=1, keepdims=True)
         moved = unknowns[:, 2:4] @ self._basis + unknowns[:, 4:5] * self._axis
@@ -254,7 +260,7 @@ class _ArcFit:
         )
 
     def residuals(self, unknowns: FloatArray) -> FloatArray:
-        """Return the residuals (k, 2 n) divided by their standard deviations."""
+        """Return the residuals (k, 2 n) of n sightings, divided by their standard deviations."""
         seen, middle = self._seen, self._middle
         start = self.states(unknowns)
         states = propagate_about(start, seen.times, middle)
@@ -263,7 +269,7 @@ class _ArcFit:
         way = way - distance * (states[..., 3:] + seen.earth) / SPEED_OF_LIGHT
         way /= np.linalg.norm(way, axis=2, keepdims=True)
         off = np.einsum("nij,nkj->kni", self._across, way)
-        # Bound the cosine, because the offset would be small again for directions behind the camera.
+        # Without a lower bound of the cosine, the offset would be small for directions behind the observer.
         facing = np.einsum("nj,nkj->kn", seen.directions, way)
         off = off / np.maximum(facing, 1e-3)[:, :, None]
         return np.asarray((off / seen.sigma[:, None]).reshape(len(unknowns), -1))
@@ -273,7 +279,7 @@ class _ArcFit:
         return np.asarray(np.sum(self.residuals(unknowns) ** 2, axis=1))
 
     def admissible(self, unknowns: FloatArray) -> BoolArray:
-        """Return which hypotheses (k,) are lasting orbits."""
+        """Return whether each hypothesis (k,) is an orbit that is bound to the Earth and does not hit it."""
         states = self.states(unknowns)
         position, motion = states[:, :3], states[:, 3:]
         radius = np.linalg.norm(position, axis=1)
@@ -289,7 +295,7 @@ class _ArcFit:
         unknowns = np.zeros((len(logarithms), 6))
         unknowns[:, 5] = logarithms
         times = self._seen.times - self.time
-        # Initial guess: the mean motion of the direction.
+        # The initial guess is the mean motion of the observed direction.
         weights = (times - times.mean()) / np.sum((times - times.mean()) ** 2)
         unknowns[:, 2:4] = (weights @ self._seen.directions) @ self._basis.T
         for _ in range(_ROUNDS):
@@ -311,13 +317,13 @@ class _ArcFit:
         return unknowns, covariance
 
     def state_jacobian(self, unknowns: FloatArray) -> FloatArray:
-        """Return the derivatives (6, 6) of the state by the unknowns (6,)."""
+        """Return the derivatives (6, 6) of the state with respect to the unknowns (6,)."""
         shifts = np.diag(_STEPS)
         ahead, behind = self.states(unknowns + shifts), self.states(unknowns - shifts)
         return np.asarray(((ahead - behind) / (2.0 * _STEPS[:, None])).T)
 
     def _linear(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals (k, m) and their derivatives (k, m, 6)."""
+        """Return the residuals (k, m) and their derivatives (k, m, 6) with respect to the unknowns."""
         shifts = np.concatenate([np.zeros((1, 6)), np.diag(_STEPS), -np.diag(_STEPS)])
         many = (unknowns[None] + shifts[:, None]).reshape(-1, 6)
         found = self.residuals(many).reshape(13, len(unknowns), -1)
@@ -326,7 +332,7 @@ class _ArcFit:
 
 
 def _solved(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Gauss-Newton steps (k, p) and covariances (k, p, p)."""
+    """Return Gauss-Newton steps (k, p) of p unknowns for k hypotheses, and covariances (k, p, p)."""
     normal = np.swapaxes(jacobian, 1, 2) @ jacobian
     size = np.sqrt(np.maximum(np.einsum("kii->ki", normal), 1e-300))
     scaled = normal / size[:, :, None] / size[:, None, :]

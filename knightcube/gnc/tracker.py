@@ -1,25 +1,26 @@
-"""Tracks of several objects over frames, and the filter of the line of sight to one object.
+"""Tracks of several objects over camera frames, and a filter of the line of sight to each object.
 
-The filter uses directions alone. Its state is the relative position and velocity divided by the present
-range: y, a unit vector, and z. Without forces z is constant and y moves on a straight line, so that a pass at
-any rate is linear except for the measurement. The range divides out and is reset to one after each step.
-These are the modified polar coordinates of Aidala and Hammel (IEEE Trans. Automatic Control 28, 1983) in
-vectors. The component of z across the line is the angular rate v, the component along it s = (range rate) /
-range, and the angular acceleration is -2 s v.
+The filter uses directions alone. The filter state is the relative position y (a unit vector) and the relative
+velocity z, both divided by the present range. Without forces z is constant and y moves on a straight line.
+The motion is therefore linear at any angular rate, and only the measurement is nonlinear. After each step the
+state is divided by the length of y, so that y is a unit vector again. This is the vector form of the modified
+polar coordinates of Aidala and Hammel (1983, IEEE Transactions on Automatic Control 28). The component of z
+across the line of sight is the angular rate v. The component of z along the line of sight is s = (range rate)
+/ range. The angular acceleration is -2 s v.
 
-Observer and object fall about the Earth. The gravity gradient at the observer's position, if known, gives
-their relative acceleration to first order in the distance over the orbit's radius.
+Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
+gradient gives their relative acceleration, to first order in the distance divided by the orbit radius.
 
-Process noise: the tides of two low orbits, which rotate with the line, are modelled as white accelerations of
-density `wander`, after subtraction of the gradient `residual_wander`. The range component also follows
-motions that are not straight lines, such as an object on a great circle at a constant rate, whose s would
-change by rate^2: a density of (`bend` rate^2)^2 / rate.
+The process noise models tidal accelerations as white noise of density `wander`, or `residual_wander` if the
+gravity gradient is known. More process noise along the line of sight lets the filter follow motions that are
+not straight lines. An object on a great circle at a constant rate is an example, for which s changes by
+rate^2 per second. The additional density is (`bend` rate^2)^2 / rate.
 
-Sightings are assigned to tracks in order of their chi-square, each to at most one track (greedy nearest
-neighbour; Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, 6.4). Unassigned
-sightings start tentative tracks. A track is confirmed after m sightings in n frames if its rate is not that
-of a star. Until then, two tracks may share a sighting for at most n frames. A confirmed track coasts while
-its object is not visible.
+Sightings are assigned to tracks in order of their chi-square, each to at most one track. This is the greedy
+nearest neighbour method (Blackman and Popoli 1999, Design and Analysis of Modern Tracking Systems, section
+6.4). Unassigned sightings start tentative tracks. A track is confirmed after m sightings in n frames if its
+rate differs from that of a star. During these n frames, two unconfirmed tracks may share a sighting. A
+confirmed track coasts while its object is not visible.
 """
 
 from __future__ import annotations
@@ -36,17 +37,18 @@ from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSightings:
-    """The n detected objects of a frame at one instant, false detections included.
+    """The n objects detected in a frame, including false detections.
 
     Attributes:
         time_ns: time of mid-exposure.
-        directions: (n, 3) unit vectors, ICRS, corrected for stellar aberration.
-        covariance: (n, 3, 3) rad^2, covariance of the directions due to the positions in the image, ICRS
-            axes, without the error of the attitude.
-        magnitudes: (n,) calibrated by the frame's stars; NaN if unknown.
-        attitude: (3, 3) rad^2, of the small rotation, ICRS axes, that is common to all directions of the
-            frame.
-        observer: (3,) m from the Earth's centre, ICRS; None on the ground or if unknown.
+        directions: unit vectors (n, 3) to the objects, ICRS, corrected for stellar aberration.
+        covariance: covariance (n, 3, 3) of the directions due to errors of the image positions, ICRS axes,
+            rad^2; the attitude error is not included.
+        magnitudes: magnitudes (n,) of the objects, calibrated by the stars in the frame; NaN if unknown.
+        attitude: covariance (3, 3) of the attitude error, which rotates all directions of the frame, ICRS
+            axes, rad^2.
+        observer: position (3,) of the observer from the Earth's centre, ICRS, m, or None on the ground or if
+            unknown.
     """
 
     time_ns: int
@@ -62,14 +64,13 @@ class MotionModel:
     """The prior and the process noise of the objects' motion.
 
     Attributes:
-        rate: rad/s, standard deviation of each component before the second sighting.
-        closing: 1/s, standard deviation of (range rate) / range before the second sighting.
-        wander: 1/s^3, density of scaled accelerations. Tides in low orbit reach 1.5 n^2 = 1.8e-6 1/s^2. With
-            this density the errors of position and rate agree with their covariance in passes of 0.05 to 0.6
-            deg/s at up to 5,000 km.
-        residual_wander: 1/s^3, the same density if the gravity gradient is known, from the same passes.
-        bend: change of the closing rate per time that a straight line does not explain, as a fraction of
-            rate^2.
+        rate: standard deviation of each component of the angular rate before the second sighting, rad/s.
+        closing: standard deviation of (range rate) / range before the second sighting, 1/s.
+        wander: density of the tidal acceleration divided by the range, 1/s^3. In low orbit this scaled
+            acceleration reaches 1.5 n^2 = 1.8e-6 1/s^2. With the default density, the errors of direction and
+            rate agree with the covariance in passes at 0.05 to 0.6 deg/s and up to 5,000 km.
+        residual_wander: density of the scaled residual acceleration if the gravity gradient is known, 1/s^3.
+        bend: unmodelled change of (range rate) / range per second by curved motion, as a fraction of rate^2.
     """
 
     rate: float = 0.01
@@ -81,14 +82,14 @@ class MotionModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineOfSightState:
-    """A line of sight and its motion at one time.
+    """The direction to an object and its motion at one time.
 
     Attributes:
         time_ns: time of the state.
-        direction: (3,) unit vector, ICRS.
-        velocity: (3,) 1/s, z: its component across the line is the angular rate, that along it the closing
-            rate.
-        covariance: (6, 6) of direction and velocity; zero along the direction.
+        direction: unit vector (3,) to the object, ICRS.
+        velocity: relative velocity (3,) divided by the range (z of the module's docstring), ICRS, 1/s.
+        covariance: covariance (6, 6) of direction and velocity; the variance of the direction along itself is
+            zero.
     """
 
     time_ns: int
@@ -98,18 +99,18 @@ class LineOfSightState:
 
     @property
     def rate(self) -> FloatArray:
-        """Derivative (3,) of the direction, rad/s, normal to it."""
+        """Time derivative (3,) of the direction, which is normal to the direction, rad/s."""
         return self.velocity - (self.velocity @ self.direction) * self.direction
 
     @property
     def acceleration(self) -> FloatArray:
-        """Derivative (3,) of the rate, rad/s^2, normal to the direction."""
+        """Component (3,) of the angular acceleration normal to the direction, rad/s^2."""
         return -2.0 * float(self.velocity @ self.direction) * self.rate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectionInnovation:
-    """A measured direction relative to the predicted one: residual (2,) rad, covariance and chi-square."""
+    """The residual (2,) rad of a measured direction from the prediction, its covariance and chi-square."""
 
     residual: FloatArray
     covariance: FloatArray
@@ -120,7 +121,7 @@ class DirectionInnovation:
 def begin(
     time_ns: int, direction: FloatArray, covariance: FloatArray, motion: MotionModel
 ) -> LineOfSightState:
-    """Return the line of sight after one sighting of `covariance` (3, 3) rad^2; its rate is unknown."""
+    """Return the line of sight after one sighting with covariance (3, 3) rad^2, whose rate is unknown."""
     along = np.outer(direction, direction)
     across = np.eye(3) - along
     start = np.zeros((6, 6))
@@ -132,8 +133,8 @@ def begin(
 def tides(observer: FloatArray) -> FloatArray:
     """Return the gravity gradient (3, 3) 1/s^2 at a position (3,) m from the Earth's centre, ICRS.
 
-    To first order, an object falling beside the observer has a relative acceleration of this matrix times its
-    relative position.
+    To first order, the relative acceleration of two objects in free fall is this matrix times their relative
+    position.
     """
     distance = float(np.linalg.norm(observer))
     up = observer / distance
@@ -143,7 +144,7 @@ def tides(observer: FloatArray) -> FloatArray:
 def predict(
     state: LineOfSightState, time_ns: int, motion: MotionModel, tide: FloatArray | None = None
 ) -> LineOfSightState:
-    """Return the line of sight at another time, not before its own. Raises ValueError for an earlier time.
+    """Return the line of sight propagated to a later time. Raises ValueError for an earlier time.
 
     `tide` (3, 3) 1/s^2 is the gravity gradient, None if unknown.
     """
@@ -163,7 +164,7 @@ def predict(
 
 
 def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> DirectionInnovation:
-    """Return a direction (3,) of `covariance` (3, 3) rad^2 relative to the state at the same time."""
+    """Return the residual of a direction (3,) with covariance (3, 3) rad^2 from the predicted direction."""
     basis = tangent_basis(state.direction)
     residual = basis @ direction / max(float(direction @ state.direction), 1e-3)
     observation = np.hstack([basis, np.zeros((2, 3))])
@@ -174,7 +175,7 @@ def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArr
 
 
 def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> LineOfSightState:
-    """Return the state updated with a sighting (3,) of `covariance` (3, 3) rad^2 at the same time."""
+    """Return the state corrected by a direction (3,) with covariance (3, 3) rad^2 at the same time."""
     seen = compare(state, direction, covariance)
     gain = np.linalg.solve(seen.covariance, seen.observation @ state.covariance).T
     change = gain @ seen.residual
@@ -189,7 +190,7 @@ def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArra
 def _at_unit_range(
     time_ns: int, position: FloatArray, velocity: FloatArray, covariance: FloatArray
 ) -> LineOfSightState:
-    """Return the state divided by its range, the length of `position`."""
+    """Return the state divided by its range, which is the length of `position`."""
     size = float(np.linalg.norm(position))
     direction, scaled = position / size, velocity / size
     jacobian = np.zeros((6, 6))
@@ -201,7 +202,7 @@ def _at_unit_range(
 
 
 def _noise(state: LineOfSightState, step: float, motion: MotionModel, known: bool) -> FloatArray:
-    """Return the covariance (6, 6) of white accelerations over `step` s.
+    """Return the covariance (6, 6) that white accelerations add to the state within `step` seconds.
 
     `known` is true if the gravity gradient is known.
     """
@@ -216,24 +217,26 @@ def _noise(state: LineOfSightState, step: float, motion: MotionModel, known: boo
 
 _UNSEEN = np.full(3, np.nan)
 _ALIKE = 2.0
-"""Largest brightness difference of a sighting from a tentative track, in standard deviations. The position of
-a confirmed track is known closely, so that a flashing object may differ by more there."""
+"""Largest brightness difference of a sighting from a tentative track, in standard deviations. A confirmed
+track has no such limit, because its position is known well and an object may flash."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackSettings:
-    """Settings of the start, the confirmation and the end of tracks.
+    """Settings for starting, confirming and ending tracks.
 
     Attributes:
-        motion: the model of the motion.
+        motion: prior and process noise of the objects' motion.
         needed: number of sightings, within `within` frames, that confirm a track.
         within: number of frames in which `needed` sightings confirm a track.
-        missed: probability that the gate rejects the object's own sighting.
-        moving: standard deviations of the rate by which a confirmed track must differ from the stars.
-        minimum_rate: rad/s, below which an object cannot be distinguished from an uncatalogued star.
-        coast: s that a confirmed track lasts without a sighting.
-        maximum_tracks: largest number of tracks, tentative ones included.
-        brightness: magnitudes, standard deviation between sightings of one object.
+        missed: probability that the gate rejects a true sighting of the object.
+        moving: minimum difference of the rate from that of the stars, in standard deviations, to confirm a
+            track.
+        minimum_rate: angular rate below which an object cannot be distinguished from an uncatalogued star,
+            rad/s.
+        coast: time that a confirmed track lasts without a sighting, s.
+        maximum_tracks: largest number of tracks, including tentative tracks.
+        brightness: standard deviation of the brightness between sightings of one object, magnitudes.
     """
 
     motion: MotionModel = field(default_factory=MotionModel)
@@ -252,17 +255,18 @@ class Track:
     """One track.
 
     Attributes:
-        number: counts from 1 once the track is confirmed; 0 before.
-        line: line of sight at the newest frame.
-        seen_ns: time of the last sighting.
-        sightings: number of sightings.
-        frames: number of frames since the start.
-        magnitude: mean of the last sightings, NaN if unknown.
-        magnitude_sigma: standard deviation of that mean by the scatter; NaN before the second sighting. It
-            excludes the common error of the frames' magnitudes by the colours of the stars.
-        history: one bit per frame, the newest lowest; set for a sighting.
-        measured: (3,) direction of the sighting in the newest frame, NaN without one.
-        measured_sigma: rad along each axis of that direction, including the attitude's share.
+        number: number of the confirmed track, counted from 1; 0 for a tentative track.
+        line: line of sight to the object at the time of the newest frame.
+        seen_ns: time of the last sighting of the object, ns.
+        sightings: number of sightings assigned to the track.
+        frames: number of frames since the start of the track.
+        magnitude: mean magnitude of the last sightings; NaN if unknown.
+        magnitude_sigma: standard deviation of the mean magnitude, computed from the scatter, or NaN before
+            the second sighting. The common error of all magnitudes due to the colours of the stars is not
+            included.
+        history: one bit per frame, set if the frame has a sighting; the newest frame is the lowest bit.
+        measured: direction (3,) of the sighting in the newest frame; NaN without a sighting.
+        measured_sigma: standard deviation of `measured` along each axis, including the attitude error, rad.
         chi_square: chi-square of the sightings relative to their predictions, with two degrees of freedom per
             sighting after the first.
     """
@@ -291,7 +295,7 @@ class Track:
 
 
 class ObjectTracker:
-    """Tracks the objects in successive frames."""
+    """A tracker of objects in successive frames."""
 
     def __init__(self, settings: TrackSettings) -> None:
         self._settings = settings
@@ -301,7 +305,7 @@ class ObjectTracker:
 
     @property
     def objects(self) -> tuple[Track, ...]:
-        """The confirmed tracks, the oldest first."""
+        """The confirmed tracks in order of their age, the oldest first."""
         return tuple(sorted((t for t in self._tracks if t.confirmed), key=lambda track: track.number))
 
     def predicted(self, number: int, time_ns: int) -> LineOfSightState | None:
@@ -316,9 +320,9 @@ class ObjectTracker:
         self._tracks = []
 
     def ingest(self, frame: FrameSightings) -> tuple[list[Track], list[Track]]:
-        """Process a frame; return the tracks that it confirmed, and the confirmed tracks that it ended.
+        """Process a frame, and return the newly confirmed tracks and the confirmed tracks that ended.
 
-        Raises ValueError for a frame older than the last.
+        Raises ValueError for a frame older than the previous frame.
         """
         motion = self._settings.motion
         tide = None if frame.observer is None else tides(frame.observer)
@@ -326,7 +330,7 @@ class ObjectTracker:
             replace(track, line=predict(track.line, frame.time_ns, motion, tide), frames=track.frames + 1)
             for track in self._tracks
         ]
-        # The covariance of the directions includes that of the attitude.
+        # From here on, the covariance of the directions includes the attitude error.
         crosses = cross_matrices(frame.directions)
         spread = np.asarray(
             frame.covariance + crosses @ frame.attitude @ crosses.transpose(0, 2, 1), dtype=float
@@ -355,7 +359,7 @@ class ObjectTracker:
         return confirmed, ended
 
     def _associated(self, tracks: list[Track], frame: FrameSightings, spread: FloatArray) -> dict[int, int]:
-        """Return the index of the sighting for each track that has one."""
+        """Return the index of the assigned sighting for each track that has a sighting."""
         pairs = []
         for index, track in enumerate(tracks):
             near = frame.directions @ track.line.direction > 0.5
@@ -366,7 +370,7 @@ class ObjectTracker:
                     continue
                 seen = compare(track.line, frame.directions[number], spread[number])
                 if seen.chi_square + unlike <= self._gate:
-                    # Compare normalised likelihoods, as a large covariance widens the gate.
+                    # Likelihoods are compared, because chi-square alone prefers large covariances.
                     cost = seen.chi_square + unlike + math.log(float(np.linalg.det(seen.covariance)))
                     pairs.append((not track.confirmed, cost, index, number))
         taken: dict[int, int] = {}
@@ -403,7 +407,7 @@ class ObjectTracker:
     def _is_object(self, track: Track) -> bool:
         if track.history.bit_count() < self._settings.needed:
             return False
-        # The first two sightings give position and rate, and the others test them.
+        # The first two sightings determine position and rate, and the later sightings test both.
         tested = 2 * (track.sightings - 1)
         if track.chi_square > bound(self._settings.missed, tested):
             return False
@@ -415,7 +419,7 @@ class ObjectTracker:
     def _new_tracks(
         self, frame: FrameSightings, spread: FloatArray, used: set[int], room: int
     ) -> list[Track]:
-        """Return a tentative track for each unassigned sighting, the brightest if room is short."""
+        """Return tentative tracks for up to `room` unassigned sightings, the brightest first."""
         free = [number for number in range(len(frame.directions)) if number not in used]
         free.sort(key=lambda number: float(np.nan_to_num(frame.magnitudes[number], nan=99.0)))
         return [
@@ -435,14 +439,14 @@ class ObjectTracker:
 
 
 def _brightness(track: Track, magnitude: float, count: int) -> tuple[float, float]:
-    """Return mean and standard deviation of the magnitude after a new sighting, the newest of `count`."""
+    """Return mean and standard deviation of the magnitude after the newest of `count` sightings."""
     if not math.isfinite(magnitude):
         return track.magnitude, track.magnitude_sigma
     if not math.isfinite(track.magnitude):
         return magnitude, math.nan
     before = 0.0 if math.isnan(track.magnitude_sigma) else track.magnitude_sigma
     change = magnitude - track.magnitude
-    # The variance of the mean of n is the scatter over n (n - 1); older sightings beyond n - 1 are ignored.
+    # The variance of the mean of n magnitudes is their sum of squared deviations divided by n (n - 1).
     scatter = before**2 * (count - 1) * max(count - 2, 0) + change**2 * (count - 1) / count
     return track.magnitude + change / count, math.sqrt(scatter / (count * (count - 1)))
 

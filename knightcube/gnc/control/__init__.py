@@ -1,1 +1,1 @@
-"""Control: coil currents from the estimated state and the path."""
+"""Control laws that compute coil currents from the estimated state and the planned path."""

@@ -1,10 +1,12 @@
-"""Allocates a torque to the available coils, preserving its direction.
+"""Allocation of a torque to the available coils, with the direction of the torque preserved.
 
-A dipole m makes the torque m x B, never one along the field B (Wertz 1978, 18.1). With three coils the least
-dipole for a reachable torque is B x T / B^2; with two, m + lambda B makes the same torque, and lambda can be
-chosen so that the failed axis needs no current, unless that axis is normal to the field. A torque that the
-available coils reach only in part is projected on the torques that they reach. When a current exceeds its
-limit the whole vector is scaled, which preserves its direction (the idea of CMU's Argus flight software).
+A dipole moment m causes the torque m x B, which has no component along the field B (Wertz 1978, section
+18.1). With three coils, the smallest dipole moment for a torque T normal to B is B x T / B^2. Any dipole
+moment m + lambda B causes the same torque. If one coil has failed, lambda is chosen so that the failed coil
+needs no current, which is possible unless its axis is normal to the field. A requested torque that the coils
+cannot produce is projected on the torques that they can produce. If a current exceeds its limit, all currents
+are scaled by one factor, which preserves the direction of the torque (the idea of CMU's Argus flight
+software).
 """
 
 from __future__ import annotations
@@ -17,18 +19,18 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.errors import FlightError
 
 WEAKEST = 0.15
-"""Relative strength below which a torque direction is discarded: it would take all the current, and scaling
-would remove the other directions."""
+"""Relative strength below which a torque direction is discarded. A weak direction would need all the current,
+and scaling would then reduce the torque in the other directions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Allocation:
-    """Currents and their torque.
+    """Currents of the coils and their torque.
 
     Attributes:
-        currents: (3,) A, zero on axes that are not available.
-        torque: (3,) N m, torque of the allocated currents.
-        share: fraction of the requested torque that is made in its direction, 0 .. 1.
+        currents: coil currents (3,), zero for coils that are not available, A.
+        torque: torque (3,) of the allocated currents, N m.
+        share: component of the torque along the requested torque, as a fraction of it, from 0 to 1.
     """
 
     currents: FloatArray
@@ -46,16 +48,16 @@ def allocate(
 ) -> Allocation:
     """Return currents for a torque (3,) N m in a magnetic field (3,) T, body axes.
 
-    `limits` (3,) A. `available` (3,) bool, the coils that may be used. `free` (3,) bool, the axes about which
-    the body can rotate; a thread carries torque about the others. Raises FlightError for an input that is not
-    finite.
+    `limits` (3,) are the current limits (A). `available` (3,) marks the coils that may be used. `free` (3,)
+    marks the axes about which the body can rotate; a thread carries the torque about the other axes. Raises
+    FlightError for an input that is not finite.
     """
     wanted = np.asarray(torque, dtype=np.float64)
     if not (np.isfinite(wanted).all() and np.isfinite(field).all()):
         raise FlightError(f"allocation: torque {wanted} or field {field} is not finite")
     turns = np.ones(3) if free is None else np.asarray(free, dtype=np.float64)
     usable = np.ones(3) if available is None else np.asarray(available, dtype=np.float64)
-    # Column a: the torque of one ampere in coil a, about the free axes.
+    # Column a of `effect` is the torque of one ampere in coil a about the free axes.
     effect = turns[:, None] * np.cross(np.eye(3), field).T * (dipole_per_ampere * usable)
     wanted = wanted * turns
     currents = np.linalg.pinv(effect, rcond=WEAKEST) @ wanted * usable

@@ -1,13 +1,15 @@
 """Detumbling by the magnetometer alone: B-dot, with the field measured while the coils are off.
 
-The coils' own field swamps the magnetometer, so time is divided into windows: the coils are off and settle,
-the field is averaged, then the coils act on the means of two windows in a row. In body axes a constant field
-changes by B' = -w x B, which gives the rate across the field, w_p = B' x B / B^2. The dipole moment
-m = (k / B^2) w_p x B reduces that rate: its torque m x B is -k w_p for any direction of the field, with no
-component along it (B-dot: Wertz 1978, 18.3; Avanzini and Giulietti 2012, J. Guid. Control Dyn. 35(4)). The
-gain follows from the window: while the coils act, k w_p removes `share` of J w_p, J the smallest moment of
-inertia. Between windows the field is propagated with the last rate, so that a fast body is not
-accelerated. The rate is unambiguous if the body rotates by less than half a revolution per window.
+The field of the coils disturbs the magnetometer, so time is divided into windows. In each window the coils
+are first off to let the field settle, then the field is measured and averaged, and then the coils are driven.
+The rate is computed from the mean fields of two consecutive windows. In body axes a constant field changes by
+B' = -w x B, which gives the rate across the field, w_p = B' x B / B^2. The dipole moment m = (k / B^2) w_p x
+B reduces the rate, because its torque m x B is -k w_p for any direction of the field (B-dot control: Wertz
+1978, section 18.3, and Avanzini and Giulietti 2012, J. Guid. Control Dyn. 35(4)). The gain k is chosen so
+that in one window the torque k w_p removes the fraction `share` of the momentum J w_p, where J is the
+smallest moment of inertia. While the coils are driven, the field is propagated with the last rate, so that a
+fast body is not accelerated. The rate is unambiguous if the body rotates by less than half a revolution per
+window.
 """
 
 from __future__ import annotations
@@ -25,32 +27,33 @@ from knightcube.gnc.estimation.field_rate import rate_across
 MAXIMUM_SHARE = 0.5
 _SECOND = 1e-9
 _REACHED_NS = 50_000_000
-"""Two control cycles, the largest delay (ns) of a command to the coils."""
+"""Largest delay (ns) of a command to the coils, equal to two control cycles."""
 _NO_CURRENT: FloatArray = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True)
 class WindowSchedule:
-    """The phases of one window: coils off to settle, off to measure, then on; all in ns."""
+    """Durations (ns) of the phases of a window: settle and measure with coils off, then act."""
 
     settle_ns: int
     measure_ns: int
     act_ns: int
 
     def __post_init__(self) -> None:
-        """Raise UsageError for a window without time to measure or to act."""
+        """Raise UsageError for a window without time to measure the field or to drive the coils."""
         if self.settle_ns < 0 or self.measure_ns <= 0 or self.act_ns <= 0:
             raise UsageError(f"detumble window {self}: measuring and acting need time")
 
     @property
     def period_ns(self) -> int:
-        """Time from window to window, ns."""
+        """Duration of a window, ns."""
         return self.settle_ns + self.measure_ns + self.act_ns
 
     def calm(self, begin_ns: int, length_ns: int) -> int:
         """Return the first time from `begin_ns` on at which the coils do not switch for `length_ns`.
 
-        Windows are counted from time zero. Returns `begin_ns` if neither pause nor action is long enough.
+        Windows are counted from time zero. If neither the pause nor the driven phase is long enough, the
+        result is `begin_ns`.
         """
         phase_ns, pause_ns = begin_ns % self.period_ns, self.settle_ns + self.measure_ns
         later_ns = self.period_ns + pause_ns
@@ -64,12 +67,12 @@ class WindowSchedule:
 
 @dataclass(frozen=True, slots=True)
 class DetumblerSettings:
-    """Settings of the detumbler.
+    """Settings of the B-dot detumbler.
 
     Attributes:
-        inertia: smallest principal moment, kg m^2.
-        dipole_per_ampere: n A of each coil, m^2.
-        current_limit: of each coil, A.
+        inertia: smallest principal moment of inertia, kg m^2.
+        dipole_per_ampere: dipole moment per current of each coil (turns times area), m^2.
+        current_limit: current limit of each coil, A.
         share: fraction of the rate across the field to remove in one window, below 1.
     """
 
@@ -93,9 +96,9 @@ class DetumblerSettings:
 def share_in_rotating_field(field_rate: float, schedule: WindowSchedule) -> float:
     """Return the best `share` for a body free in three axes in a field that rotates at `field_rate` rad/s.
 
-    The rate along the field can be removed only as the field rotates; with more gain than k = 2 Omega J the
-    spin aligns with the field and stays (Avanzini and Giulietti 2012). In an orbit the field rotates about
-    twice per revolution.
+    The rate along the field can be removed only as the field rotates. With a gain above k = 2 Omega J, where
+    Omega is the rotation rate of the field, the spin aligns with the field and remains (Avanzini and
+    Giulietti 2012). Along an orbit the field rotates about twice per revolution.
     """
     return min(2.0 * field_rate * schedule.period_ns * _SECOND, MAXIMUM_SHARE)
 
@@ -105,7 +108,8 @@ def braking_current(
 ) -> FloatArray:
     """Return currents (3,) A that reduce `rate` (3,) rad/s across `field` (3,) T, acting for `act_time` s.
 
-    All three are scaled by one factor if a coil would exceed its limit, to preserve the direction.
+    If a coil would exceed its current limit, all three currents are scaled by one factor to preserve the
+    direction.
     """
     square = float(field @ field)
     if square == 0.0:
@@ -117,7 +121,7 @@ def braking_current(
 
 
 class Detumbler:
-    """Runs the windows: takes each magnetometer sample and returns currents each cycle."""
+    """A B-dot detumbler that accepts magnetometer samples and returns the coil currents of each cycle."""
 
     def __init__(self, schedule: WindowSchedule, braking: DetumblerSettings) -> None:
         self._schedule = schedule
@@ -149,14 +153,14 @@ class Detumbler:
             return
         window = (time_ns - self._begun_ns) // self._schedule.period_ns
         if window <= self._closed:
-            return  # too late: its window is closed
+            return  # the window of this late sample is already closed
         if window != self._window:
             self._samples.clear()
             self._window = window
         self._samples.append((time_ns, field))
 
     def current(self, now_ns: int) -> FloatArray:
-        """Return the currents (3,) A now: zero while the field is measured or the rate is not known."""
+        """Return the present currents (3,) A, zero while the field is measured or the rate is unknown."""
         schedule = self._schedule
         phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
         if phase_ns < schedule.settle_ns + schedule.measure_ns:
@@ -165,11 +169,11 @@ class Detumbler:
         window = (now_ns - self._begun_ns) // schedule.period_ns
         field = self.field(now_ns)
         if self._rate is None or field is None or window != self._closed:
-            return _NO_CURRENT  # no field measured in this window, and an older one is out of date
+            return _NO_CURRENT  # without a field of this window, an older field is too old
         return braking_current(self._braking, self._rate, field, schedule.act_ns * _SECOND)
 
     def field(self, now_ns: int) -> FloatArray | None:
-        """Return the field (3,) T in body axes, propagated to `now_ns`; None before a rate is known."""
+        """Return the field (3,) T in body axes, propagated to `now_ns`, or None before a rate is known."""
         if self._rate is None or self._field is None:
             return None
         since = (now_ns - self._field[0]) * _SECOND
@@ -177,11 +181,11 @@ class Detumbler:
 
     @property
     def rate(self) -> FloatArray | None:
-        """The rate (3,) across the field from the last two windows, rad/s; None before."""
+        """The rate (3,) across the field from the last two windows, in body axes, rad/s; None before."""
         return self._rate
 
     def _close_window(self) -> None:
-        """Average the window's samples, and derive the rate from this and the previous window's field."""
+        """Average the samples of a window, and compute the rate from this mean field and the previous one."""
         if not self._samples:
             return
         time_ns = round(sum(time for time, _ in self._samples) / len(self._samples))

@@ -1,33 +1,34 @@
-"""Detumbling of a free satellite with its magnetometer, and with gyro and attitude if they are known.
+"""Detumbling of a free satellite with its magnetometer, and with gyro and attitude if available.
 
 The field of the coils disturbs the magnetometer. The coils are therefore switched off periodically, first to
-let the field settle, then to measure it. From the samples of the pauses a filter estimates the full body rate
-and the rotation of the field among the stars (`knightcube.gnc.estimation.field_rate`). A gyro gives the rate
-along the field at once. The momentum plan uses the field expected ahead: that of the orbit if the attitude is
-known, else the measured field, rotated at its present speed. In contrast to B-dot control, a spin along the
-field is removed too: the plan waits until the field has rotated. The coils stay off until `TRUSTED` samples
-in a row agree with the prediction of the filter and the standard deviation of the rate across the field is
-below `BOUNDED`; until then no pause is needed. The coils are switched off again if no sample was accepted for
-`SILENT_PERIODS` periods, because all fields of a restarted sensor may be unusable.
+let the field settle, then to measure it. From the samples of these pauses, the filter
+`knightcube.gnc.estimation.field_rate` estimates the full body rate and the inertial rotation of the field. A
+gyro sample gives the rate along the field at once. The momentum plan uses a predicted field. If the attitude
+is known, it is predicted along the orbit. Otherwise the measured field is assumed to rotate on at its present
+rate. In contrast to B-dot control, a spin along the field is also removed, as soon as the field has rotated.
+The coils stay off until `TRUSTED` consecutive samples agree with the prediction of the filter and the
+standard deviation of the rate across the field is below `BOUNDED`. Until then, samples outside the pauses are
+used as well. The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because
+a restarted sensor may give only unusable fields.
 
 The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
-momentum obeys h' = m x B, without the body's inertia and attitude. By Pontryagin's principle, the dipole of
-minimum time has the maximum strength L and the direction of -B x y, with one constant vector y. A time T
-suffices to reduce the momentum to at most r exactly if, for every y,
+momentum obeys h' = m x B, in which inertia and attitude do not appear. By Pontryagin's principle, the dipole
+moment of minimum time has the maximum strength L and the direction of -B x y, where the costate y is a
+constant vector. A time T suffices to reduce the momentum to at most r if and only if every y satisfies
 
     h . y <= L integral of |B x y| over T + r |y|,
 
-The minimum time is the smallest T at which the worst y satisfies this inequality, and this y is the plan. For
-the worst y, A(y) y is parallel to h, where A is the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. It
-is found by iteration of this equation (iteratively reweighted least squares). A field of constant direction
-cannot remove the momentum along itself. The plan then adds momentum across the field, which the later
-rotation of the field makes removable. The plan leaves a residual momentum r, because removing the last
+The minimum time is the smallest T at which even the worst y satisfies this inequality, and the plan is this
+y. For the worst y, A(y) y is parallel to h, where A is the integral of L (B^2 I - B B^T) / |B x y| plus r /
+|y|. The worst y is found by iterating this condition (iteratively reweighted least squares). Momentum along
+the field can be removed only after the field has rotated. Until then, the minimum-time plan may add momentum
+across the field, which is removed later. The plan leaves a residual momentum r, because removing the last
 momentum along a slowly rotating field would take most of the time.
 
-The minimum-time plan first accelerates a body that spins along the field, about an axis across the field.
-`gentle` and `spin_up` bound the rate: at the bound, no dipole is commanded that increases the rate. A bound
-at the initial rate takes more time, because such a spin is then stopped only after the field has rotated by a
-right angle.
+The minimum-time plan first accelerates a body that spins along the field, about an axis across the field. The
+settings `gentle` and `spin_up` therefore give an upper bound of the rate. At the bound, no dipole moment is
+commanded that increases the rate. If the bound equals the initial rate, detumbling takes longer, because a
+spin along the field is then stopped only after the field has rotated by a right angle.
 """
 
 from __future__ import annotations
@@ -46,25 +47,26 @@ from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSetti
 
 ITERATIONS = 12
 LIMIT_GAIN = 1.4
-"""Mean strength of the dipole of three coils in a rotating body, relative to the limit of one coil. If all
-coils were saturated, it would be 1.5."""
+"""Mean dipole moment of three coils in a rotating body, relative to the limit of one coil. With all coils
+saturated, this ratio would be 1.5."""
 STEEP = 12.0
-"""Ratio of |B x y| to its mean at which a coil reaches its limit. The minimum-time plan saturates all coils,
-but noise in B would then switch the coils back and forth if B x y is small."""
+"""Gain of the dipole: a coil reaches its limit where |B x y| exceeds its mean divided by this number. The
+minimum-time plan would always saturate all coils, but noise of B would then reverse the coils wherever B x y
+is small."""
 FLAT = 0.02
-"""Floor of |B x y| relative to its largest value, which keeps the weights finite."""
+"""Lower bound of |B x y|, relative to its largest value, that keeps the weights finite."""
 FINENESS = 60
-"""Number of steps in which the horizon of a plan is searched."""
+"""Resolution of the search for the minimum time, as the number of steps per minimum time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MomentumPlan:
-    """A momentum plan.
+    """A plan that removes the momentum in minimum time.
 
     Attributes:
-        costate: (3,) A m^2/T, inertial axes; zero for a body at rest. The dipole -B x costate reaches the
-            coils' limit at a small multiple of its mean over the plan.
-        horizon: s, the time at which the body is at rest.
+        costate: scaled costate y (3,), inertial axes, A m^2/T; zero for a body at rest. The commanded dipole
+            moment is -B x costate, clipped at the limit of each coil.
+        horizon: time from now until the body is at rest, s.
     """
 
     costate: FloatArray
@@ -74,12 +76,11 @@ class MomentumPlan:
 def momentum_plan(
     momentum: FloatArray, field: FloatArray, times: FloatArray, limit: float, rest: float
 ) -> MomentumPlan:
-    """Return the plan that removes `momentum` (3,) N m s except `rest` N m s in the least time.
+    """Return the plan that reduces `momentum` (3,) N m s to `rest` N m s in minimum time.
 
     `field` (n, 3) T is the predicted field at `times` (n,) s from now on, in the inertial axes of the
-    momentum, and `limit` is the limit of each coil in A m^2. If the span of the times does not suffice, the
-    plan removes as much momentum as possible, and its horizon is this span. Raises UsageError for a field of
-    fewer than three instants.
+    momentum, and `limit` is the limit of each coil in A m^2. If the predicted times are too short, the plan
+    removes as much momentum as possible within them. Raises UsageError for fewer than three times.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
@@ -104,9 +105,9 @@ def momentum_plan(
 
 
 def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
-    """Return the dipole (3,) A m^2 of a plan in a field (3,) T, body axes, each coil clipped at `limit`.
+    """Return the dipole moment (3,) A m^2 of a plan in a field (3,) T, body axes, clipped at `limit`.
 
-    Each coil is clipped separately, because each coil removes momentum independently of the others.
+    Each coil is clipped separately, because each coil contributes to the removal of momentum on its own.
     """
     return np.clip(-cross_product(field, costate), -limit, limit)
 
@@ -114,12 +115,12 @@ def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> Floa
 def without_speed_up(
     dipole: FloatArray, field: FloatArray, rate: FloatArray, inverse: FloatArray
 ) -> FloatArray:
-    """Return the dipole (3,) without the part whose torque makes a body faster.
+    """Return the dipole moment (3,) without the part whose torque increases the rate.
 
-    `rate` (3,) rad/s, `inverse` (3, 3) of the inertia, body axes. No component exceeds the largest component
-    of the given dipole.
+    `rate` (3,) is the body rate (rad/s) and `inverse` (3, 3) the inverse inertia tensor in body axes. The
+    result has no larger component than the given dipole moment.
     """
-    # The derivative of d(|rate|^2 / 2)/dt by the dipole.
+    # `grows` is the derivative of d(|rate|^2 / 2)/dt with respect to the dipole moment.
     grows = cross_product(field, inverse @ rate)
     gained, square = float(dipole @ grows), float(grows @ grows)
     if gained <= 0.0 or square == 0.0:
@@ -130,9 +131,10 @@ def without_speed_up(
 
 
 def rotating_field(field: FloatArray, change: FloatArray, times: FloatArray) -> FloatArray:
-    """Return the predicted field (n, 3) T at `times` (n,) s from now on, rotating at its present rate.
+    """Return the predicted field (n, 3) T at `times` (n,) s from now on, rotating at the present rate.
 
-    `field` (3,) T and its derivative `change` (3,) T/s are inertial; the strength is kept.
+    `field` (3,) T and its time derivative `change` (3,) T/s are in inertial axes. The field strength is
+    assumed to be constant.
     """
     strength = math.sqrt(float(field @ field))
     along = field / strength
@@ -145,17 +147,18 @@ def rotating_field(field: FloatArray, change: FloatArray, times: FloatArray) -> 
 
 
 def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
-    """Return `fields` (n, 3) rotated by the smallest rotation that aligns the first with `field` (3,).
+    """Return `fields` (n, 3), rotated so that the first predicted field has the direction of `field` (3,).
 
-    The measured field is more accurate than a field predicted with a coarse attitude.
+    The correction is useful because the measured field is more accurate than fields predicted with a coarse
+    attitude.
     """
     first = fields[0] / math.sqrt(float(fields[0] @ fields[0]))
     wanted = field / math.sqrt(float(field @ field))
     middle = first + wanted
     square = float(middle @ middle)
-    if square < 1.0:  # more than 120 deg: the prediction is not corrected
+    if square < 1.0:  # a prediction that is wrong by more than 120 deg is not corrected
         return fields
-    # The rotation is the product of two half turns, about the bisector and about the final direction.
+    # The rotation is the product of two rotations by 180 deg, about the bisector and the final direction.
     halves = 2.0 * np.outer(middle, middle) / square - np.eye(3)
     back = 2.0 * np.outer(wanted, wanted) - np.eye(3)
     return np.asarray(fields @ (back @ halves).T)
@@ -167,9 +170,9 @@ class _FieldPreview:
 
     Attributes:
         field: (n, 3) T.
-        effect: (n, 3, 3) weighted matrices B^2 I - B B^T, whose sum is the effect on the momentum.
-        reach: A m^2, strength of the dipole.
-        rest: N m s, residual momentum of the plan.
+        effect: matrices B^2 I - B B^T (n, 3, 3), each multiplied by the time step.
+        reach: maximum strength L of the dipole moment, A m^2.
+        rest: residual momentum r of the plan, N m s.
     """
 
     field: FloatArray
@@ -178,19 +181,19 @@ class _FieldPreview:
     rest: float
 
     def across(self, y: FloatArray, count: int) -> FloatArray:
-        """Return |B x y| at the first `count` instants, with a positive lower bound."""
+        """Return |B x y| at the first `count` instants, but at least a small positive value."""
         found = np.cross(self.field[:count], y)
         across = np.sqrt(np.einsum("ni,ni->n", found, found))
         strength = math.sqrt(float(self.field[0] @ self.field[0]))
         return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
 
     def matrix(self, y: FloatArray, count: int) -> FloatArray:
-        """Return A(y) (3, 3) of the module's docstring for `count` instants and a unit vector y."""
+        """Return the matrix A(y) (3, 3) of the module's docstring for the first `count` instants."""
         weight = self.reach / self.across(y, count)
         return np.asarray(np.tensordot(weight, self.effect[:count], 1) + self.rest * np.eye(3))
 
     def worst(self, momentum: FloatArray, count: int, guess: FloatArray) -> FloatArray:
-        """Return the unit vector y (3,) for which the first `count` instants remove least of the momentum."""
+        """Return the unit vector y (3,) along which the first `count` instants remove the least momentum."""
         y = guess
         for _ in range(ITERATIONS):
             found = np.linalg.solve(self.matrix(y, count), momentum)
@@ -199,23 +202,24 @@ class _FieldPreview:
 
 
 TRUSTED = 4
-"""Number of consecutive samples that must agree before the coils act."""
+"""Number of consecutive samples that must agree with the filter before the coils are driven."""
 BOUNDED = 0.02
-"""Largest standard deviation (rad/s) of the rate across the field at which the coils begin to act."""
+"""Largest standard deviation (rad/s) of the rate across the field at which the coils may be driven."""
 SILENT_PERIODS = 2
-"""Number of periods without an accepted sample after which the coils wait again."""
+"""Number of coil pauses without an accepted sample after which the coils are switched off again."""
 OLDEST_NS = 100_000_000
-"""Largest age (ns) of a sample relative to the last command; its field is propagated with the body's rate."""
+"""Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
 INSTANTS = 150
 DENSER = 1.5
-"""Exponent of the spacing of the instants. In a horizon of 1,500 s, the first step is 1 s and the last step
-15 s."""
+"""Exponent of the times of the field prediction, which are denser at the start. For a prediction over 1,500
+s, the first time step is 1 s and the last 15 s."""
 LEFT = 0.7
-"""Residual momentum of a plan, as a fraction of the momentum of a slow body."""
+"""Residual momentum of a plan, as a fraction of the momentum at which a body counts as detumbled."""
 FEW, SOON = 4.0, 5.0
-"""Momentum below FEW x LEFT, with at most LEFT along the field, is removed within SOON seconds."""
+"""Factor and time (s) of the last phase. A momentum below FEW times the residual momentum of a plan is
+removed within SOON seconds if its component along the field is small."""
 KNOWN = 2e-3
-"""Standard deviation (rad/s) of the least certain component of the rate, below which the bound of the rate is
+"""Standard deviation (rad/s) of the least certain rate component below which the upper bound of the rate is
 set."""
 _SECOND = 1e-9
 _NO_DIPOLE: FloatArray = np.zeros(3)
@@ -226,12 +230,12 @@ class FieldDetumblerSettings:
     """Settings of the field detumbler.
 
     Attributes:
-        limit: A m^2, dipole limit of each coil.
-        horizon: s, duration of the field prediction, a quarter of an orbit.
-        replan: s, time between plans.
-        gentle: rad/s, initial rate below which the detumbler never increases the rate above the initial rate.
-        spin_up: largest ratio of the rate to the initial rate, for initial rates above `gentle`.
-        slow: rad/s, rate below which a body counts as detumbled.
+        limit: dipole limit of each coil, A m^2.
+        horizon: duration of the field prediction, about a quarter of an orbit, s.
+        replan: time between momentum plans, s.
+        gentle: initial rate below which the upper bound of the rate is the initial rate, rad/s.
+        spin_up: ratio of the upper bound of the rate to the initial rate, for initial rates above `gentle`.
+        slow: rate below which a body counts as detumbled, rad/s.
     """
 
     limit: float
@@ -250,12 +254,12 @@ class FieldDetumblerSettings:
 
     @property
     def instants(self) -> FloatArray:
-        """Times (n,) s after a plan at which the field is needed; denser at the start."""
+        """Times (n,) after the start of a plan at which the field is predicted, denser at the start, s."""
         return np.asarray(self.horizon * (np.arange(INSTANTS) / INSTANTS) ** DENSER, dtype=float)
 
 
 class FieldDetumbler:
-    """The detumbler: accepts magnetometer samples from coil pauses and computes the dipole of each cycle."""
+    """A detumbler that accepts magnetometer samples and computes the dipole moment of each cycle."""
 
     def __init__(
         self,
@@ -264,15 +268,16 @@ class FieldDetumbler:
         settings: FieldRateSettings,
         expected: Callable[[int], FloatArray | None] = lambda _: None,
     ) -> None:
-        """Use the given settings; `expected` predicts the field (n, 3) T at `braking.instants` after a time.
+        """Create a detumbler whose rate filter has not started.
 
-        The prediction is in the body axes of that time, and None while attitude or orbit are unknown.
+        `expected` predicts the field (n, 3) T at the times `braking.instants` after a given time, in the body
+        axes of the given time. It returns None while attitude or orbit are unknown.
         """
         self._schedule = schedule
         self._braking = braking
         self._expected = expected
         self._filter = FieldRate(settings)
-        # The residual momentum may lie along any axis, so that a mean moment of inertia is used.
+        # A mean moment of inertia is used because the residual momentum may lie along any axis.
         moment = float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
         self._rest = LEFT * braking.slow * moment
         self.begin(0)
@@ -286,13 +291,13 @@ class FieldDetumbler:
         self._planned_rotation = _NO_DIPOLE
         self._agreed = 0
         self._bounded = False
-        self._driven_ns = now_ns  # another mode may have driven the coils before
+        self._driven_ns = now_ns  # another flight mode may have driven the coils before
         self._accepted_ns = now_ns
         self._fastest = math.inf
         self._filter.restart()
 
     def listens(self, time_ns: int) -> bool:
-        """Return whether a field of `time_ns` is usable: in a pause, or before the filter is trusted."""
+        """Return whether a field measured at `time_ns` is usable, with the coils off and settled."""
         schedule = self._schedule
         if not self.trusted and time_ns - self._driven_ns >= schedule.settle_ns:
             return True
@@ -303,7 +308,8 @@ class FieldDetumbler:
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
         """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled.
 
-        `rate` (3,) rad/s is measured by a gyro at the same time. A command may have been given since.
+        `rate` (3,) rad/s is measured by a gyro at the same time. The sample may be older than the last
+        command.
         """
         age_ns = self._time_ns - time_ns
         if not self.listens(time_ns) or age_ns > OLDEST_NS:
@@ -328,9 +334,9 @@ class FieldDetumbler:
             self._distrust()
 
     def dipole(self, now_ns: int) -> FloatArray:
-        """Return the dipole (3,) A m^2 now: zero while the field is measured or the rate is unknown."""
+        """Return the present dipole (3,) A m^2, zero while the field is measured or the rate is unknown."""
         schedule = self._schedule
-        if self._filter.started:  # before the start, only samples advance the filter
+        if self._filter.started:  # before the filter has started, only samples advance it
             self._advance(max(now_ns, self._time_ns))
         if self.trusted and now_ns - self._accepted_ns > SILENT_PERIODS * schedule.period_ns:
             self._distrust()
@@ -341,14 +347,14 @@ class FieldDetumbler:
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the dipole (3,), A m^2, that acts instead of the commanded dipole until the next command."""
+        """Set the dipole moment (3,) A m^2 that acts instead of the commanded one until the next command."""
         if self._dipole.any() or dipole.any():
             self._driven_ns = self._commanded_ns
         self._dipole = dipole
 
     @property
     def trusted(self) -> bool:
-        """Whether enough samples agreed and the uncertainty of the rate is bounded."""
+        """Whether enough samples agreed with the filter, and the rate is known well enough."""
         return self._bounded
 
     @property
@@ -358,19 +364,19 @@ class FieldDetumbler:
 
     @property
     def field(self) -> FloatArray | None:
-        """Field (3,) T in body axes at the last time; None before it is known."""
+        """Estimated present field (3,) in body axes, T; None before it is known."""
         return self._filter.field if self.trusted else None
 
     @property
     def rate_sigma(self) -> float:
-        """Standard deviation of the rate's worst axis, rad/s; infinite before it is known."""
+        """Standard deviation (rad/s) of the least certain rate component; infinite for an unknown rate."""
         if not self.trusted:
             return math.inf
         return math.sqrt(float(np.linalg.eigvalsh(self._filter.covariance[RATE, RATE])[-1]))
 
     @property
     def restarts(self) -> int:
-        """Number of filter restarts after contradicting samples, which a fast spin may cause."""
+        """Number of restarts of the rate filter after contradicting samples, which a fast spin may cause."""
         return self._filter.restarts
 
     def _distrust(self) -> None:
@@ -394,7 +400,7 @@ class FieldDetumbler:
         )
 
     def _costate(self, now_ns: int) -> FloatArray:
-        """Return the present costate (3,) A m^2/T, in body axes."""
+        """Return the costate (3,) A m^2/T of the plan in the present body axes."""
         found = self._filter
         field, momentum = found.field, found.momentum
         square, along = float(field @ field), float(momentum @ field)
@@ -407,7 +413,7 @@ class FieldDetumbler:
                 now_ns,
                 found.rotation,
             )
-        # The plan is inertially fixed: rotate it into the present body axes.
+        # The costate is constant in inertial axes, so it is rotated into the present body axes.
         since = attitude_matrix(multiply(found.rotation, conjugate(self._planned_rotation)))
         return np.asarray(since @ self._plan.costate)
 

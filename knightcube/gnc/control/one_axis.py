@@ -1,31 +1,33 @@
-"""Control about one axis: the LQ tracker, and an excitation from which the plant can be identified.
+"""Control about one axis: a linear-quadratic tracker, and an excitation for identifying the plant.
 
-The tracker applies feedback linearisation to the attitude error, then a linear-quadratic regulator (Sease
-2013, 5.16-5.32). With p the path and q the body, 5.17-5.20 give e = sin(theta_p - theta) exactly (5.21), and
-5.24-5.27 corrected are
+The tracker applies feedback linearisation to the attitude error and then a linear-quadratic regulator (Sease
+2013, eqs. (5.16) to (5.32)). The error is e = sin(theta_p - theta) (Sease, eq. (5.21)), where theta_p is the
+angle of the path and theta the angle of the body. The derivatives of the error (Sease, eqs. (5.24) to (5.27),
+corrected) are
 
     e'  = cos(d) (theta_p' - w)
     e'' = cos(d) (theta_p'' - w') - sin(d) (theta_p' - w)^2,     d = theta_p - theta.
 
-e'' = v is solved for w' and the plant model gives the current; v = -K (e', e) with K from the Riccati
-equation.
+The regulator demands e'' = v = -K (e', e), with K from the Riccati equation. This is solved for the angular
+acceleration w', from which the plant model gives the current.
 
-Two things go beyond the thesis; `as_in_thesis` restores its loop. First, the estimated disturbance is fed
-forward. The estimator integrates the acceleration that the model did not predict, so that a constant torque
-leaves no offset. It knows the current that was written, limits included, so that nothing winds up while
-the coil saturates. Second, an error is reduced no faster than the coil can decelerate: at the rate s e,
-s = K_e / K_e', up to a distance, and beyond it at sqrt(2 A |e| - (A / s)^2), from which a constant
-deceleration A leads to that distance (the proximate time-optimal servo, Workman 1987, here with a continuous
-slope too). A linear law overshoots there.
+The tracker has two additions to the thesis, which the option `as_in_thesis` switches off. First, the
+estimated disturbance is fed forward, so that a constant torque causes no offset. The estimator integrates the
+acceleration that the model did not predict. Integrator windup cannot occur, because the estimator uses the
+current after limiting. Second, an error is reduced only as fast as the coil can decelerate the body, where a
+linear law would overshoot. Small errors are reduced at the rate s e with s = K_e / K_e', and errors above A /
+s^2 at the rate sqrt(2 A |e| - (A / s)^2), where A is the available deceleration. This is the proximate
+time-optimal servo (Workman 1987), here also with a continuous slope.
 
-e is monotone in d only up to 90 degrees. Beyond `largest_error` d is clamped, its sign kept, so that the
-demand stays bounded and does not weaken as sin(d) falls again.
+The error e = sin(d) is monotonic in d only up to 90 degrees. Beyond `largest_error` the angle d is therefore
+clamped. The demanded acceleration then stays bounded and does not decrease for larger angles.
 
-The excitation follows no path. The tracker brings the body to rest. Long and short pulses then rotate the
-body out and back (torque constant, delay), and further pulses displace it and release it with the coils at
-zero (stiffness, damping: the current of a coil that is off is known exactly). The same follows with the other
-sign. Between manoeuvres, and whenever the body would leave the bound even if stopped at once, the tracker
-commands the coil. If the tracker cannot bring the body to rest, the current stays zero.
+The excitation does not follow a path. First the tracker brings the body to rest. Long and short pulses then
+rotate the body out and back, from which torque constant and delay are identified. Further pulses displace the
+body and release it with the coils off, from which stiffness and damping are identified. All pulses are
+repeated with the opposite sign. Between manoeuvres the tracker brings the body to rest again. It also takes
+over whenever the body could not be stopped within the allowed angle. If the tracker cannot bring the body to
+rest, the current stays zero.
 """
 
 from __future__ import annotations
@@ -44,12 +46,12 @@ class CurrentCommand:
     """A controller's command to the coil.
 
     Attributes:
-        current: A, within the limit.
-        demanded: A, before the limit; zero without authority.
-        saturated: the limit was applied.
-        authority: cos(theta) was large enough to make a torque; when False the current is zero.
-        error: theta_p - theta in rad, as measured, in [-pi, pi].
-        held: the error exceeded the largest allowed and was clamped to it.
+        current: commanded current within the limit, A.
+        demanded: demanded current before limiting, A; zero if the coil has no control authority.
+        saturated: whether the current was limited.
+        authority: whether |cos(theta)| was large enough for a useful torque; otherwise the current is zero.
+        error: angle of the path minus angle of the body, rad, in [-pi, pi], before clamping.
+        held: whether the error exceeded `largest_error` and was clamped.
     """
 
     current: float
@@ -61,33 +63,36 @@ class CurrentCommand:
 
     @classmethod
     def within(cls, limit: float, demanded: float, error: float, held: bool = False) -> CurrentCommand:
-        """Return the command for `demanded` A, limited to +-`limit` A."""
+        """Return the command for the demanded current (A), limited to +-`limit` (A)."""
         current = min(max(demanded, -limit), limit)
         return cls(current, demanded, current != demanded, True, error, held)
 
     @classmethod
     def without_authority(cls, error: float) -> CurrentCommand:
-        """Return the zero command for an angle at which no current turns the body."""
+        """Return the command of zero current for an angle at which the coil has no useful torque."""
         return cls(0.0, 0.0, False, False, error)
 
 
 class AngleController(Protocol):
-    """Computes a coil current from the commanded and the estimated motion, once per control cycle."""
+    """A controller that computes a coil current from commanded and estimated motion in each cycle."""
 
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
     ) -> CurrentCommand:
-        """Return the command at `angle` rad, `rate` rad/s under `disturbance` rad/s^2, all estimated.
+        """Return the command for an estimated angle (rad), rate (rad/s) and disturbance (rad/s^2).
 
-        Raises UsageError when an input is not finite.
+        Raises UsageError if an input is not finite.
         """
 
     def reset(self) -> None:
-        """Clear integrated state, after the coils were off or the state was lost."""
+        """Clear the controller's internal state after the coils were off or the estimate was lost."""
 
 
 def attitude_error(wanted: PathSample, angle: float, rate: float, disturbance: float) -> float:
-    """Return theta_p - theta in [-pi, pi], rad; raises UsageError when an input is not finite."""
+    """Return the angle of the path minus `angle`, in [-pi, pi].
+
+    Raises UsageError if an input is not finite.
+    """
     total = wanted.angle + wanted.rate + wanted.acceleration + angle + rate + disturbance
     if not math.isfinite(total):
         raise UsageError(
@@ -104,10 +109,10 @@ _MINIMUM_BRAKING = 0.05
 
 
 class LqTracker:
-    """Computes commands from gains and a plant model; has no state.
+    """The linear-quadratic tracker, which has no internal state.
 
     Attributes:
-        error_gain, rate_gain: K on e in 1/s^2 and on e' in 1/s.
+        error_gain, rate_gain: elements of the gain K for e (1/s^2) and for e' (1/s).
     """
 
     def __init__(
@@ -119,10 +124,13 @@ class LqTracker:
         minimum_authority: float = MINIMUM_AUTHORITY,
         as_in_thesis: bool = False,
     ) -> None:
-        """Solve the Riccati equation for Q = state_weight I and R = input_weight (5.28-5.32).
+        """Create a tracker with the weights Q = state_weight I and R = input_weight.
 
-        `largest_error` is in rad, below pi/2; `minimum_authority` bounds |cos(theta)|; `as_in_thesis` leaves
-        out disturbance and braking. Raises UsageError when a value is outside its range.
+        The gains follow from the Riccati equation (Sease, eqs. (5.28) to (5.32)).
+
+        `largest_error` (rad) is below pi/2. Below `minimum_authority`, |cos(theta)| is too small for control.
+        `as_in_thesis` switches off the disturbance feedforward and the limited deceleration. Raises
+        UsageError if a value is outside its range.
         """
         for name, value in (("Q", state_weight), ("R", input_weight)):
             if not (math.isfinite(value) and value > 0.0):
@@ -141,9 +149,9 @@ class LqTracker:
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
     ) -> CurrentCommand:
-        """Return the command at `angle` rad, `rate` rad/s under `disturbance` rad/s^2, all estimated.
+        """Return the command for an estimated angle (rad), rate (rad/s) and disturbance (rad/s^2).
 
-        Raises UsageError when an input is not finite.
+        Raises UsageError if an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
         if abs(math.cos(angle)) < self._minimum_authority:
@@ -156,7 +164,7 @@ class LqTracker:
             v = -(self.rate_gain * cosine * lag + self.error_gain * sine)
             acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine
         else:
-            # The deceleration available between here and the path, rad/s^2.
+            # Below, `braking` is the deceleration (rad/s^2) available between the present angle and the path.
             authority = max(min(math.cos(angle), math.cos(wanted.angle)), 0.0)
             taken = abs(disturbance - self._plant.stiffness * angle / self._plant.inertia)
             braking = max(
@@ -169,7 +177,7 @@ class LqTracker:
         return CurrentCommand.within(self._plant.current_limit, demanded, error, held)
 
     def _approach(self, error: float, braking: float) -> float:
-        """Return the rate at which to reduce `error`, 1/s, with its sign."""
+        """Return the signed rate (1/s) at which `error` is reduced, given the available deceleration."""
         slope = self.error_gain / self.rate_gain
         reach = braking / slope
         if abs(error) * slope <= reach:
@@ -177,14 +185,15 @@ class LqTracker:
         return math.copysign(math.sqrt(2.0 * braking * abs(error) - reach * reach), error)
 
     def reset(self) -> None:
-        """Do nothing: the tracker has no state."""
+        """Do nothing, because the tracker has no internal state."""
 
 
 def lq_gains(state_weight: float, input_weight: float) -> tuple[float, float]:
-    """Return K, on e' in 1/s and on e in 1/s^2, for Q = state_weight I and R = input_weight (5.28-5.32).
+    """Return the gains K_e' (1/s) and K_e (1/s^2) for Q = state_weight I and R = input_weight.
 
-    The plant e'' = v is a double integrator, whose Riccati equation has the solution, with w = Q / R,
-    K_e = sqrt(w) and K_e' = sqrt(w + 2 K_e). A general solver would take 0.2 s at start.
+    The plant e'' = v is a double integrator. Its Riccati equation (Sease, eqs. (5.28) to (5.32)) has the
+    solution K_e = sqrt(w) and K_e' = sqrt(w + 2 K_e) with w = Q / R. A general solver would take 0.2 s at the
+    start.
     """
     weight = state_weight / input_weight
     error_gain = math.sqrt(weight)
@@ -195,14 +204,14 @@ _REST_ANGLE = 0.03
 _REST_RATE = 4.0e-3
 _REST_TIME = 1.0
 _TIMEOUT = 60.0
-_REACH = 0.45  # of the bound: a body with 1.4 times the modelled response stays within it
-_WEAK = 0.7  # of the modelled torque is assumed available for braking
+_REACH = 0.45  # fraction of the angle bound; allows 1.4 times the modelled response
+_WEAK = 0.7  # fraction of the modelled torque that is assumed to be available for braking
 _SHORT_PULSE = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """A share of the excitation's current, in [-1, 1], for `duration` s."""
+    """A current pulse with a fraction (-1 to 1) of the excitation's current, for `duration` seconds."""
 
     share: float
     duration: float
@@ -222,10 +231,10 @@ class ExcitationSettings:
     """Amplitudes of the excitation.
 
     Attributes:
-        current_share: fraction of the coil's limit, for pulses and tracker; at the limit itself the true
-            current differs from the commanded one.
-        largest_q2: the excitation never moves the body beyond.
-        swing: duration of each free swing, s.
+        current_share: current of pulses and tracker, as a fraction of the coil's limit. At the limit itself,
+            the true current would differ from the commanded current.
+        largest_q2: largest quaternion component q2 to which the excitation may rotate the body.
+        swing: duration of each free oscillation, s.
     """
 
     current_share: float
@@ -234,12 +243,12 @@ class ExcitationSettings:
 
 
 class ExcitationController:
-    """Runs the manoeuvres in turn for as long as commands are requested."""
+    """A controller that repeats the excitation manoeuvres for as long as commands are requested."""
 
     def __init__(self, plant: SingleAxisPlant, period: float, settings: ExcitationSettings) -> None:
-        """Build the manoeuvres for the plant model `plant`, commanded every `period` s.
+        """Create the manoeuvres for a plant model that is commanded every `period` seconds.
 
-        Raises UsageError when a value is outside its range.
+        Raises UsageError if a value is outside its range.
         """
         if not (math.isfinite(period) and period > 0.0):
             raise UsageError(f"excitation period is {period}: it must be finite and positive")
@@ -270,16 +279,17 @@ class ExcitationController:
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
     ) -> CurrentCommand:
-        """Return the command at `angle` rad, `rate` rad/s under `disturbance` rad/s^2, all estimated.
+        """Return the command for an estimated angle (rad), rate (rad/s) and disturbance (rad/s^2).
 
-        `wanted` is the rest position between manoeuvres. Raises UsageError when an input is not finite.
+        `wanted` is the angle at which the body rests between manoeuvres. Raises UsageError if an input is not
+        finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
         if self._phase is _Phase.GIVEN_UP:
             return CurrentCommand.without_authority(error)
         if self._phase is _Phase.MOVING:
             pulse = self._pulse()
-            # The body can be stopped within the bound, or moves inwards.
+            # With enough room, the body can still be stopped within the angle bound or moves inwards.
             outward = rate if angle >= 0.0 else -rate
             braking = _WEAK * self._strength * math.cos(min(abs(angle), self._bound))
             has_room = abs(angle) + 0.5 * max(outward, 0.0) ** 2 / braking < self._bound
@@ -297,13 +307,13 @@ class ExcitationController:
         return self._tracker.command(wanted, angle, rate, disturbance)
 
     def reset(self) -> None:
-        """Bring the body to rest again; a manoeuvre that was under way is skipped."""
+        """Bring the body to rest again and skip a manoeuvre that has begun."""
         if self._phase is _Phase.MOVING:
             self._come_to_rest()
         self._resting = 0.0
 
     def _pulse(self) -> Pulse | None:
-        """Return the current pulse; None when the manoeuvre is over."""
+        """Return the current pulse; None if the manoeuvre has ended."""
         begin = 0.0
         for pulse in self._manoeuvres[self._next % len(self._manoeuvres)]:
             begin += pulse.duration
@@ -318,9 +328,9 @@ class ExcitationController:
 
 
 def manoeuvres(strength: float, reach: float, swing: float) -> tuple[Manoeuvre, ...]:
-    """Return the manoeuvres with pulses of `strength` rad/s^2 that turn the body by up to `reach` rad.
+    """Return manoeuvres with pulses of `strength` rad/s^2 that rotate the body by up to `reach` rad.
 
-    From rest a pulse and its opposite, T s each, turn the body by strength T^2.
+    A pulse of T seconds and its opposite rotate a body that was at rest by strength T^2.
     """
     out = math.sqrt(reach / strength)
     made = []
