@@ -306,9 +306,10 @@ class KeptFrames:
 
 
 def keep_frame(kept: KeptFrames, pixels: Image, facts: dict[str, Any]) -> None:
-    """Write a frame (rows, columns) with its metadata (`facts`), and delete the oldest surplus frames.
+    """Write a frame (rows, columns) with its metadata (`facts`) to disk.
 
-    If the disk fails, the frame is lost and no exception is raised.
+    If the number of kept frames then exceeds the maximum, the oldest frames are deleted. If the disk fails,
+    the frame is lost and no exception is raised.
     """
     with suppress(OSError):
         kept.folder.mkdir(exist_ok=True)

@@ -44,7 +44,7 @@ class Pinhole:
 
     @property
     def ideal(self) -> Pinhole:
-        """The pinhole camera itself, because it has no distortion."""
+        """The same pinhole camera, which already has no distortion."""
         return self
 
     def rescaled(self, factor: float) -> Pinhole:
@@ -84,7 +84,7 @@ class Pinhole:
 _MOST_STEPS, _LAST_STEP = 60, 1e-8
 """Maximum number of Newton steps, and the step (in tangent) below which the iteration ends."""
 _NO_FOLD = 1e-12
-"""Minimum denominator in the formula of the fold, so that folds beyond a tangent of a million are ignored."""
+"""Minimum denominator in the formula of the distortion's fold; folds at tangents above 1e6 are ignored."""
 
 
 class LensError(FlightError):
@@ -233,7 +233,7 @@ class Lens:
         return np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
 
     def _limit(self) -> float:
-        """Return the distorted tangent at which the undistorted tangent is `reach`."""
+        """Return the distorted tangent that corresponds to the undistorted tangent `reach`."""
         square = self.reach**2
         return self.reach * (1.0 + square * (self.k1 + square * self.k2)) if square < np.inf else np.inf
 

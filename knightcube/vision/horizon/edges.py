@@ -39,11 +39,11 @@ def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
 _SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Standard deviations (px) of the Gaussians that smooth the brightness."""
 _REACH = 3.0
-"""Largest distance of the steepest point from the binary change, in standard deviations of the Gaussian."""
+"""Largest distance of the steepest point from a binary line's change, in Gaussian standard deviations."""
 _TAIL = 3.5
 """Distance at which the Gaussian is truncated, in standard deviations."""
 _OUTGROWN = 1.4
-"""Ratio of step heights at successive scales above which the edge is wider than the smaller scale."""
+"""Ratio of an edge's step heights at two successive scales above which the larger scale is used."""
 _MARGIN = 4.0
 """Distance from the image border (px) within which edges are ignored; some detectors have a black frame."""
 _FLOOR, _SHARE = 0.1, 0.05
@@ -228,7 +228,7 @@ def _line_edges(
 
     Args:
         light: brightness of the columns and of the rows, each (n, m).
-        bright: binary columns and rows, each (n, m).
+        bright: which pixels of the columns and of the rows are bright, each (n, m).
         places: indices of the columns and of the rows, each (n,).
         contrast: minimum height of an edge.
     """
@@ -262,10 +262,11 @@ def _line_edges(
 
 
 def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the steepest point near each of k changes: offset, px, Gaussian scale, px, and step height.
+    """Return the steepest point near each of k changes between dark and bright.
 
-    The offset is the distance from the start of the change. The step height is the height of a sharp step
-    with the same slope. An edge has at least the step height `weak`.
+    The result is the distance of each point from the start of the change, px, the standard deviation of the
+    Gaussian that found the point, px, and the step height, each (k,). The step height is the height of a
+    sharp step with the same slope. A point with a step height below `weak` is not an edge.
     """
     count = len(changes.start)
     offset, height, scale = np.zeros(count), np.zeros(count), np.ones(count)

@@ -1,9 +1,9 @@
 """A horizon hypothesis: a limb fitted to edges of the image, and the evidence for and against it.
 
-The significance of a horizon is an upper bound of the expected number of cones in the image that chance edges
-fit as well as the horizon. The density of chance edges is estimated from the edges beside the limb. Chance
-edges lie on curves. A coast or the rim of a cloud with radius R that touches the limb stays within a distance
-g of the limb over a length of 2 sqrt(2 g R). Scan lines that cross the same segment of such a curve are not
+The significance of a horizon is an upper bound of the expected number of equally good horizons among chance
+edges, such as coasts and the rims of clouds. The density of chance edges is estimated from the edges beside
+the limb. A coast or the rim of a cloud with radius R that touches the limb stays within a distance g of the
+limb over a length of 2 sqrt(2 g R). Scan lines that cross the same segment of a coast or cloud are not
 independent, so the test counts segments of this length instead of scan lines.
 """
 
@@ -174,7 +174,7 @@ def limb_in_view(
 def log10_chance(
     limb: LimbInView, residuals: FloatArray, others: FloatArray, camera: CameraModel, unknowns: int
 ) -> float:
-    """Return log10 of an upper bound of the expected number of cones that chance edges fit as well as a limb.
+    """Return log10 of the significance of a limb: the bound of the number of equally good chance limbs.
 
     Args:
         limb: length of the limb in the image, and its crossings with scan lines.
@@ -231,7 +231,7 @@ class Hypothesis:
             sunlit limb.
         night: fraction of the horizon's edges at which the Sun is well below the horizon.
         allowance: standard deviation per axis of the nadir due to unmodelled effects, rad.
-        chance: log10 of the expected number of cones that chance edges fit as well, from `log10_chance`.
+        chance: log10 of the significance of the horizon, from `log10_chance`.
         breadth: median width of the horizon's edges, relative to the width expected from the air.
         altitude_off: distance of a fitted altitude from `HorizonSettings.altitudes`, in standard deviations
             of the altitude; 0 if the altitude is known.

@@ -150,7 +150,7 @@ class CoarseNadir:
 
     @property
     def sigma(self) -> float:
-        """The rms standard deviation per axis of the direction, rad."""
+        """The standard deviation of the direction, as the rms over two axes, rad."""
         return float(np.sqrt(0.5 * np.trace(self.covariance)))
 
 
@@ -265,7 +265,7 @@ _STRAY_LIGHT = math.radians(25.0)
 _LEAST = 8
 """Minimum number of samples, out of 64, from which an image can be judged false."""
 _MOST = 0.6
-"""Fraction of contradicting samples above which an image is false; clouds and lens ghosts cause fewer."""
+"""Fraction of samples that contradict the attitude above which an image is false (clouds cause less)."""
 
 
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:

@@ -11,7 +11,7 @@ its own. The search is sample consensus (Fischler & Bolles 1981) without random 
 A horizon does not determine the rotation about nadir. The rotation about nadir is needed because the Earth's
 flattening depends on the direction of the pole, and the illumination depends on the direction of the Sun. A
 rough attitude, the coarse direction of the Sun or the magnetic field gives this rotation. The angle between
-nadir and each such direction is also known, so a nadir at a different angle is rejected.
+nadir and each of these directions is also known, so a nadir at a different angle is rejected.
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ neglected. Refraction lowers the apparent limb by 1 to 2 km, which is within
 
 Fit of the profile: the brightness profile across an edge is background + a air(h) + b ground(h), where the
 tangent height h falls by a known number of metres per pixel. The position of unit optical depth is fitted
-together with the background and the factors a and b. In contrast to the steepest point, this position is not
-shifted inwards by bright ground behind the limb or outwards by haze.
+together with the brightness of background, air and ground. In contrast to the steepest point, this position
+is not shifted inwards by bright ground behind the limb or outwards by haze.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     cosine = stretched @ towards / lengths
     sine = np.sqrt(1.0 - cosine * cosine)
     # The derivative with respect to the scaled ray is transformed into camera axes.
-    # The same product also gives the permuted components that a cross product needs.
+    # The same matrix product also gives the permuted components that a cross product needs.
     slope = (stretched * (cosine / lengths)[:, None] - towards) / (lengths * sine)[:, None]
     back = to_stretched.T
     by_ray = slope @ np.concatenate(
@@ -185,7 +185,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     gradients = np.empty((len(rays), PARAMETERS))
     # A rotation d of the camera displaces a fixed direction u by -d x u.
     gradients[:, :3] = by_ray[:, :3] * rays[:, _BEFORE] - by_ray[:, 3:6] * rays[:, _AFTER]
-    # This is minus the derivative of the half-angle arcsin(1 / size) with respect to the centre's distance.
+    # `by_size` is minus the derivative of the cone's half-angle arcsin(1 / size) with respect to `size`.
     by_size = 1.0 / (size * math.sqrt(size * size - 1.0))
     step = -(by_height @ view.position)
     along = float(towards @ step)
@@ -200,7 +200,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
 
 _MOST_STEPS = 10
 _LAST_STEP = 3e-5
-"""Largest rotation (rad) in the last step of the iteration, about an eightieth of a pixel."""
+"""Rotation step (rad) below which the iteration ends, about an eightieth of a pixel."""
 _SAME_GRADIENTS = 3e-3
 """Rotation step (rad) below which the gradients change by less than 1 % and are not computed again."""
 _HUBER, _BEYOND = 1.5, 5.0
@@ -346,7 +346,7 @@ def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray)
         return 1.0
     aside = rays @ tangent_basis(nadir).T
     azimuth = np.arctan2(aside[:, 1], aside[:, 0])
-    # The order starts after the widest gap, because points on opposite sides of a gap are not neighbours.
+    # The points are ordered around the limb from the widest gap, across which points are not neighbours.
     order = np.argsort(azimuth)
     gaps = np.diff(azimuth[order], append=azimuth[order[0]] + 2.0 * np.pi)
     along = scaled[np.roll(order, -1 - int(np.argmax(gaps)))]
@@ -492,7 +492,7 @@ def fit_profiles(
         columns = np.stack([np.ones_like(air), air, ground, shift], axis=2)
         weighted = (columns * weights[:, :, None]).transpose(0, 2, 1)
         right = weighted @ (light - model)[:, :, None]
-        # The second right-hand side gives the last column of the inverse: the variance of the position.
+        # The second right-hand side gives the last column of the inverse, with the variance of the position.
         answer = np.linalg.solve(weighted @ columns + prior, np.concatenate([right, of_place], axis=2))
         amounts = amounts + answer[:, :3, 0]
         place = place + np.minimum(np.maximum(answer[:, 3, 0], -1.0), 1.0)

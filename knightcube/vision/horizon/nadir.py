@@ -7,8 +7,8 @@
 `find_nadir` finds edges on scan lines and cones with which many edges agree, and fits the ellipsoid's limb to
 the edges of each cone. Each fitted limb is tested against chance edges, the width of the atmosphere's
 brightness profile, the brightness of the whole image, the coarse sensors and the rough attitude. If a single
-limb passes all tests, it gives the nadir. If several limbs pass, the image is ambiguous. If no limb passes,
-the image is refused and the reason is stated.
+limb passes all tests, it gives the nadir. If several limbs pass all tests, the image is ambiguous. If no limb
+passes all tests, the image is refused and the reason is stated.
 
 `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four cameras). The
 nadirs of different cameras must agree. An image that gave no nadir, or several, is searched again with the
@@ -104,7 +104,7 @@ class NadirMeasurement:
 
     @property
     def sigma(self) -> float:
-        """The rms standard deviation per axis of the nadir direction, rad."""
+        """The standard deviation of the nadir direction, as the rms over two axes, rad."""
         return float(np.sqrt(0.5 * np.trace(self.covariance)))
 
 
@@ -382,12 +382,12 @@ def _measurement(fit: FittedLimb, covariance: FloatArray, located: bool, residua
 
 
 _IMPROBABLE = 1e-6
-"""Probability of the difference between two cameras' nadirs below which the nadirs disagree."""
+"""Probability below which the difference between the nadirs of two cameras is significant."""
 _COMMON = 2.0
-"""Largest ratio of the variance of the difference of two nadirs to the sum of the variances of the nadirs.
+"""Factor by which the variance of the difference of two nadirs may exceed the sum of their variances.
 
-The ratio exceeds 1, because an unknown height of the air displaces the nadirs from opposite limbs in opposite
-directions.
+The factor is above 1, because an unknown height of the air displaces the nadirs from opposite limbs in
+opposite directions.
 """
 _UNKNOWN_TURN = 1.0
 """Prior standard deviation of an unknown rotation about nadir (rad)."""

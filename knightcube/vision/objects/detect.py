@@ -125,8 +125,8 @@ def olae_residuals(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     """Return the first and last directions (n, 2, 3) of stars with the same chord midpoints as `vectors`.
 
-    A star moves on a circle about the axis, and the midpoint of its chord is nearer to the axis than the
-    circle by the cosine of half the rotation angle.
+    A star moves on a circle about the rotation axis. The midpoint of the star's chord is nearer to the axis
+    than the star, by a factor of the cosine of half the rotation angle.
     """
     angle = float(np.linalg.norm(rotation))
     middle = vectors.mean(axis=1)
@@ -140,7 +140,7 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 # Distance of the rotation centre from the boresight, in focal lengths, beyond which the centre is not used.
-# The rotation axis decides, because errors make a least-squares centre appear nearer than it is.
+# The rotation axis gives this distance, because errors make a least-squares centre appear too near.
 _FARTHEST_CENTRE = 3.0
 
 
@@ -300,7 +300,7 @@ class ObjectReport:
 
 # Distance (px) below which two corners count as the same corner, found twice.
 _LEAST_CROSSING_PX = 10.0
-# Largest distance (px) between fitted ends and the predicted ends of a star for which they count as a star.
+# Distance (px) of fitted ends from the predicted ends of a star below which they count as a star.
 _FITTED_PX = 1.0
 # Minimum distance (px) of a region from the border of the image for its ends to be inside the image.
 _BORDER_PX = 2

@@ -32,7 +32,7 @@ from knightcube.vision.startracker.solve import FrameSolution
 from knightcube.vision.streaks.streak_result import MotionResult
 
 _REACH = 5.0
-"""Half-width of an object's patch beyond the object, in standard deviations of the PSF."""
+"""Margin of a patch beyond the ends of the object, in standard deviations of the PSF."""
 _STEP_PX = 0.7
 """Distance (px) between the points that model a trail."""
 _ROUNDS, _CONVERGED = 12, 1e-4
@@ -104,7 +104,7 @@ class FittedObject:
 
 
 def _trail(middle: FloatArray, half: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points (m, 2), px, along a trail, and their distances (m,) from the middle in half extents."""
+    """Return points (m, 2), px, along a trail, and their positions (m,) from -1 (start) to 1 (end)."""
     count = max(4, int(np.ceil(2.0 * float(np.linalg.norm(half)) / _STEP_PX)))
     share = (np.arange(count) + 0.5) * 2.0 / count - 1.0
     return middle + share[:, None] * half, share
@@ -124,7 +124,7 @@ def _fit_object(
     """
     images = [patch.image(star, extent) for star, extent in zip(stars.middle, stars.half, strict=True)]
     given = np.maximum(stars.flux, 1e-9)
-    # The priors are (index, value, standard deviation) of the extent and of the flux of each star.
+    # Each prior is the index of an unknown, its prior value and its standard deviation.
     prior = [(2 + k, float(half[k]), _EXTENT) for k in range(2)]
     prior += [(6 + k, float(light), STAR_SIGMA * float(light)) for k, light in enumerate(given)]
     unknowns = np.concatenate([middle, half, [flux, 0.0], given])

@@ -154,7 +154,7 @@ def _pixel_weights(signal: FloatArray, background: Background, gain: float, satu
 
 
 def _brightnesses(images: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
-    """Return the non-negative coefficients (k,) of `images` (p, k) that best sum to `target`, and chi-square.
+    """Return the non-negative least-squares coefficients (k,) of `images` (p, k), and chi-square.
 
     Raises FlightError if the solver does not converge.
     """

@@ -131,7 +131,7 @@ def refit_motion(
     done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
-    # `hidden` is cleared, so that the fit is not repeated with fewer streaks; the catalogue gives all stars.
+    # `hidden` is cleared, so that the fit is not repeated with fewer streaks.
     done = replace(done, hidden=None)
     refit = with_rate(with_stars(motion, camera, done), camera, done, StreakVerdict.CONFIRMED)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
@@ -265,7 +265,7 @@ def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known
 
 
 def _without(camera: FitProblem, hidden: StreakScene) -> ReducedFrame:
-    """Return the frame without the light of `hidden` stars, and with their flux uncertainty as noise."""
+    """Return the frame without the light of `hidden` stars, and with its uncertainty added to the noise."""
     frame = camera.frame
     if not len(hidden.light):
         return frame

@@ -2,20 +2,20 @@
 
 The position of a streaked star is accurate across its path and inaccurate along its path. Each residual,
 which is the difference between observed and predicted unit vector, is resolved in two directions normal to
-the star and whitened by the covariance of the position. A Gauss-Newton iteration minimises the sum of
-squares, which is the maximum likelihood estimate for Gaussian errors. A streak that overlaps another star has
-a wrong position. Streaks with wrong positions are found with Huber's weights, which bound the influence of
-any star, and are excluded.
+the star and whitened by the covariance of the position. The minimum of the sum of squares, found by a
+Gauss-Newton iteration, is the maximum likelihood estimate for Gaussian errors. A streak that overlaps another
+star has a wrong position. Streaks with wrong positions are found with Huber's weights, which bound the
+influence of any star, and are excluded.
 
 Tilt, decentring and distortion of an inexact lens (the bend, see `sky_map`) are also fitted, with a prior
 from the calibration or from typical lenses. The covariance of the attitude includes the remaining uncertainty
 of the lens. An error of the line time of a rolling shutter, which displaces each star along its motion in
 proportion to its row, is also fitted.
 
-The positions of streaks that do not fit the streak model have errors of pixels, whatever their brightness. If
-the residuals of streaks exceed the noise, a common variance is added to the noise, so that the sum of squares
-equals the degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without this variance, the
-brightest stars would dominate the fit, and the covariance would be too small.
+The positions of streaks that do not fit the streak model have errors of some pixels, regardless of their
+brightness. If the residuals of streaks exceed the noise, a common variance is added to the noise, so that the
+sum of squares equals the degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without this
+variance, the brightest stars would dominate the fit, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ class _Seen:
         return 3 + int(self.unknowns.scale) + np.arange(len(self.before))
 
     def parameters(self, pose: _FittedPose) -> float:
-        """Return the effective number of parameters that the stars determine, not the prior."""
+        """Return the effective number of parameters that the stars, and not the prior, determine."""
         before = self.before * np.diagonal(pose.covariance)[self.camera]
         return len(pose.covariance) - float(before.sum())
 

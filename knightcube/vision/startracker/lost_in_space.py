@@ -61,7 +61,7 @@ class BatchSizes:
     Attributes:
         bright: numbers of triangles of the brightest stars, for each step of scale; they identify most
             frames.
-        spread: numbers of triangles of many stars, for frames whose brightest points are false.
+        spread: numbers of triangles of many stars, for frames whose brightest points are not stars.
     """
 
     bright: tuple[int, ...] = (60, 250)
@@ -69,7 +69,7 @@ class BatchSizes:
 
 
 def batches_of(field: StarField, sizes: BatchSizes, steps: int) -> Iterator[tuple[IntArray, bool]]:
-    """Yield batches of triangles (t, 3), and whether a batch has triangles of many stars.
+    """Yield batches of triangles (t, 3), and whether each batch includes faint stars.
 
     The size of a batch of the brightest stars is divided by the square root of the number of `steps` of
     scale. The last batch includes triangles of neighbouring stars, for points that are not sorted by

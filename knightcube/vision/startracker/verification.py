@@ -68,8 +68,8 @@ class Chance:
     def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
         """Return log10 of the bound of the number of chance matches that are as good as a given match.
 
-        The matching also selects the faintest star that counts. For this reason, the bound is multiplied by
-        j^2 pi^2/6, where j - 1 is the number of brighter expected stars without a match.
+        The matching also selects the faintest star that is compared. For this reason, the bound is multiplied
+        by j^2 pi^2/6, where j - 1 is the number of brighter expected stars without a match.
 
         Args:
             gate: half-width within which a star matches, in standard deviations.
@@ -96,7 +96,8 @@ class Chance:
         first star. The ring's radius is the distance of the two stars, and its width follows from the range
         of the scale and from the gate. Each other matched star lies within the gate of an expected star. The
         probability is multiplied by the number of selections of the matched stars from the observed stars.
-        Because the fit moves towards its own stars, the distance of each star is increased by the factor 1/(1
+        Because the fit reduces the distances of the matched stars, the distance of each star is increased by
+        the factor 1/(1
         - leverage).
         """
         leverage = 2.0 / matched if matched > 2 else 0.5

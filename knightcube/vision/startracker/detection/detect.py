@@ -186,7 +186,10 @@ def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], m
 
 
 def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return the indices of the first `most` peaks, at most a quarter of them in a sixteenth of the frame."""
+    """Return the indices of the first `most` peaks, with a limit in each sixteenth of the frame.
+
+    Each sixteenth of the frame contributes at most a quarter of `most` peaks.
+    """
     row, column = (peaks.place[:, k] * _CELLS // shape[1 - k] for k in (1, 0))
     cell = row * _CELLS + column
     order = np.argsort(cell, kind="stable")
@@ -469,9 +472,9 @@ def _peaks_near(
 def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return background (n,), noise of single pixels (n,), noise of smoothed pixels (n,), and correlation.
 
-    These values are measured in the rims of the windows. The noise of smoothed pixels includes faint stars,
-    because the detection threshold depends on it. The correlation is the ratio of the noise of a sum of
-    pixels to that of a sum of independent pixels.
+    Background and noise are measured in the rims of the windows. The noise of smoothed pixels includes faint
+    stars, because the detection threshold depends on it. The correlation is the ratio of the noise of a sum
+    of pixels to that of a sum of independent pixels.
     """
     step = np.abs(np.arange(-windows.half, windows.half + 1))
     rim = np.maximum(step[:, None], step) > radius + 1.0

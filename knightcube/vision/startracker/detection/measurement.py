@@ -2,9 +2,9 @@
 
 `first_look` fits each star alone with a free width, and `frame_spread` derives the PSF and the noise of the
 frame from these fits. `measure` then fits each star with the PSF of the frame, or computes a centroid in a
-window whose border is subtracted (Michalski, eq. (12) to (21)). The window of a x a pixels ends at column
-x_start + a - 1. In Michalski, eq. (14) and (15), the window ends one pixel later, which contradicts eq.
-(16e), where the border has 4 (a - 1) pixels. Michalski, eq. (20), repeats x_CM instead of y_CM, and is
+window whose border is subtracted (Michalski, eq. (12) to (21)). A window with sides of a pixels ends at
+column x_start + a - 1. In Michalski, eq. (14) and (15), the window ends one pixel later, which contradicts
+eq. (16e), where the border has 4 (a - 1) pixels. Michalski, eq. (20), repeats x_CM instead of y_CM, and is
 corrected here (errata).
 
 Three other centroid methods start from the centre of mass and weight the pixels. `weighted` weights each
@@ -52,7 +52,7 @@ _NEXT_MISMATCH = 0.02
 # Mismatch between PSF and Gaussian that is assumed if no star determines it.
 _UNKNOWN_MISMATCH = 0.02
 _MOST_OF_CELL = 4
-# Number of stars from which the measured width of the PSF replaces a given width.
+# Minimum number of stars for which the measured width of the PSF replaces a given width.
 _MANY = 8
 _LEAST_LONE = 3
 # Minimum height of a hot pixel, in standard deviations of a pixel's noise.

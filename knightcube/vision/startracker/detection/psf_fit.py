@@ -298,7 +298,7 @@ NARROWEST, WIDEST = 0.25, 6.0
 # Maximum steps of position and of width (px), which keep fits from diverging if the start is 1 px off.
 _LONGEST_STEP = 0.7
 _WIDEST_STEP = 0.35
-# Residual (standard deviations) above which a pixel is excluded, and number of final steps that do so.
+# Residual (standard deviations) above which a pixel is excluded in the final steps, and their number.
 _CLIP = 6.0
 _CLIP_FROM_END = 1
 # Regularisation of the scaled normal matrix, so that a star without information keeps its position.

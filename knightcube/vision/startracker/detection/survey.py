@@ -39,11 +39,11 @@ _BAND = 32
 _SKY_BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
 TAIL_PART = 0.97725
 """Fraction of a normal distribution that lies below the mean plus two standard deviations."""
-# Noise ratio below which a correlation of pixels is attributed to chance and to the faintest stars.
+# Ratio of the noise of pixel sums to uncorrelated noise below which pixels count as uncorrelated.
 _CORRELATED = 1.05
 # Ratio of the noise's lower tail to two standard deviations below which the noise counts as clipped at zero.
 _CUT_OFF = 0.8
-# Noise (counts) that is too small to be measured because of quantisation.
+# Noise (counts) below which quantisation prevents a measurement of the noise.
 _HIDDEN = 0.5
 _ROUNDING = 12.0**-0.5
 

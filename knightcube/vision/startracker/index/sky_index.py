@@ -20,9 +20,9 @@ add triangles. Near a cluster of bright stars, no star has a long reach. To cove
 contains the triangles of the `few` brightest stars of circles of several radii that cover the sky.
 
 The sides of a triangle are chords of the unit sphere. The key of a triangle consists of three parts. The
-first part of a key is whether the corners opposite the shortest, the middle and the longest side run left or
-right. The second part of a key is the ratios of the shortest and of the middle side to the longest side, in
-cells of `CELL`. The third part of a key is the longest side. In the sorted keys, the triangles of one cell
+first part of a key is the orientation of the corners in the order of the lengths of the opposite sides (left
+or right). The second part of a key is the ratios of the shortest and of the middle side to the longest side,
+in cells of `CELL`. The third part of a key is the longest side. In the sorted keys, the triangles of one cell
 within limits of size are contiguous.
 
 `python -m knightcube.vision.startracker.index.build` builds the index. The same stars and settings give a
@@ -192,7 +192,7 @@ def choose_guide_stars(
 
 
 def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return the lowest index in the connected group of each star (count,), for `pairs` of stars (p, 2)."""
+    """Return the lowest index in each star's connected group (count,); `pairs` (p, 2) are the connections."""
     group = np.arange(count)
     while True:
         lowest = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
@@ -211,16 +211,16 @@ SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
 """Resolution of the longest side in a key; the side is a chord below 1."""
 RUN_BITS = 12
-"""Binary logarithm of the step of size in which keys are counted, in `SIZE_UNIT`; about one key per step."""
+"""Binary logarithm of the number of size units in a run of keys; a run contains about one key."""
 TIE = 1e-9
-"""Relative tolerance of a side against a limit, because rounding affects sides that equal the limit."""
+"""Relative tolerance of the comparison of a side with a limit, because a side may equal the limit."""
 LEAST_RATIO = 0.1
 """Minimum ratio of the shortest to the longest side; a flatter triangle is hardly better than a pair."""
 
 
 # Distance between the centres of neighbouring circles that cover the sky, relative to their radius.
 _CIRCLES_APART = 0.7
-# Number of stars searched first, relative to the number needed in a sky of uniform density.
+# Mean number of stars per circle in the first search, relative to the number of stars needed.
 _ENOUGH = 4.0
 
 
