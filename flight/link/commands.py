@@ -45,8 +45,8 @@ from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, Po
 
 _MODES = tuple((int(mode), mode.label) for mode in COMMANDABLE if mode is not Mode.SLEW)
 _NUMBERS = (
-    "inertial: quaternion, ICRS into body; ground: latitude, longitude, rad; object: right ascension, "
-    "declination, rad, of the search; NaN searches along the camera's boresight"
+    "for inertial: quaternion, ICRS into body; for ground: latitude and longitude, rad; for object: right "
+    "ascension and declination of the search, rad, or NaN to search along the camera's boresight"
 )
 _GOALS = tuple((int(goal), goal.label) for goal in Goal)
 
