@@ -42,8 +42,8 @@ class LikelihoodSettings:
         least_significance: minimum ratio of the rate to its standard deviation.
         worst_misfit: chi-square per degree of freedom above which a motion is rejected if the residuals also
             exceed `worst_displacement`.
-        worst_displacement: displacement across the streaks, equivalent to the residuals, above which a motion
-            with a large misfit is rejected, px.
+        worst_displacement: largest accepted rms displacement across the streaks for a motion with a large
+            misfit, px.
         worst_shaking: largest accepted motion common to all streaks: displacement across them (px), or
             relative change of brightness.
         worst_uncertainty: largest accepted relative uncertainty (one standard deviation) of the rate from

@@ -2,7 +2,7 @@
 
 The control process reads results that worker processes compute. The module imports no estimator, because the
 control process needs only the results. A single frame does not distinguish the rate omega from -omega. A
-prior rate, from a gyro or the previous estimate, determines the sign.
+prior rate, from a gyro or the previous estimate, determines the sign of the rate.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Photon noise gives a lower limit of the covariance. The covariance is increased by the scatter of the stars
 beyond their noise, and by calibration errors of the camera that the stars do not determine. Two errors affect
 all stars equally and cause no scatter: a point spread with an unexpected width or shape, which moves the ends
-of all streaks, and vibration of the body. The residuals at the ends and along the streaks give upper limits
-for both errors.
+of all streaks, and vibration of the body. The residuals at the ends and along the streaks limit the errors
+from point spread and vibration.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ def correct(
         information: (n, k, k) information of each star after elimination of the star's own parameters.
         score: (n, k) gradient of each star's log-likelihood.
         apparent: (n, k, m) apparent change of the shared parameters by each of m calibration errors of one
-            standard deviation. Calibration errors of specified size come first.
+            standard deviation. The errors of specified size are the first of the m errors.
         spread: variance of the scatter of the stars, relative to their noise.
         described: number of calibration errors whose size is specified.
         counted: (m,) errors already corrected in the fit. The result is relative to the errors in `counted`.
