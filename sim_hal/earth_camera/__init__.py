@@ -1,12 +1,13 @@
-"""The image model of a wide-angle camera that views Earth and Sun from a low orbit.
+"""Image model of a wide-angle camera that views Earth and Sun from a low orbit.
 
     model = EarthCameraModel.fuga15d(seed=1)
     scene = EarthScene(position, attitude, sun_position(julian_date))
     frame = render(model, scene, generator)
 
-`scene` has the positions of camera, Earth and Sun, the atmosphere, and the radiance along lines of sight.
-`image` has the camera's parameters and adds optics, the Sun's disc and the detector. Radiance is in units of
-that of a white matt surface with the Sun at the zenith; the radiance of the Sun's disc is 46,000.
+The module `scene` holds the positions of camera, Earth and Sun, the atmosphere, and the radiance along lines
+of sight. The module `image` holds the camera's parameters and models the optics, the Sun's disc and the
+detector. The unit of radiance is that of a white Lambertian surface with the Sun at the zenith. In this unit
+the Sun's disc has a radiance of 46,000.
 """
 
 from sim_hal.earth_camera.image import EarthCameraModel, expected_radiance, render

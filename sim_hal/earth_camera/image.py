@@ -1,8 +1,8 @@
-"""The camera that views Earth and Sun: its parameters, optics and detector.
+"""Parameters, optics and detector of the camera that views Earth and Sun.
 
 The optics blur the Earth's image by a narrow Gaussian and scatter a little light over the whole frame. The
-Sun's disc is darker at the rim, hidden by the Earth, and dimmed by the air; its glare arises in the optics.
-The detector has a response, noise and a fixed pattern of its pixels, and gives counts.
+Sun's disc has limb darkening, can be hidden by the Earth, and is dimmed by the air. Scattering in the optics
+causes the Sun's glare. The detector has a response curve, noise and fixed-pattern noise, and outputs counts.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from sim_hal.earth_camera.scene import (
 
 DEVICE = "Earth camera model"
 
-# Minimum, maximum and unit of each parameter.
+# Minimum, maximum and unit of each camera parameter.
 _LIMITS: dict[str, tuple[float, float, str]] = {
     "rows": (1, 16_384, "px"),
     "columns": (1, 16_384, "px"),
@@ -57,33 +57,34 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EarthCameraModel:
-    """A wide-angle CMOS camera; radiance is in units of a white matt surface's with the Sun overhead.
+    """A wide-angle CMOS camera; the radiance of a white Lambertian surface with the Sun at the zenith is 1.
 
     Attributes:
-        lens: geometry of the pixels: a `Pinhole`, or a `Lens` with distortion.
-        rows: pixels down, as in the lens.
-        columns: pixels across, as in the lens.
-        bits: resolution of the converter.
-        response: "logarithmic" (counts proportional to the logarithm of light plus `darkest`) or "linear".
-        decades: decades of radiance between `darkest` and the highest count; logarithmic only.
-        darkest: radiance equivalent to the dark current; logarithmic only.
-        sensitivity: e- per frame at a radiance of one; linear only.
-        full_well: e-, capacity of a pixel; linear only.
-        gain: e- per count; linear only.
-        read_noise: e-, standard deviation; linear only.
-        blooming: whether charge beyond the full well spills along its column; linear only.
-        pedestal: counts without light.
-        noise: counts, standard deviation, independent in each pixel and frame; logarithmic only.
-        fixed_pattern: counts, standard deviation of the pixels' constant offsets after calibration.
-        response_spread: relative standard deviation of the pixels' sensitivities; linear only.
+        lens: camera geometry, a `Pinhole` or a `Lens` with distortion.
+        rows: number of pixel rows, equal to that of the lens.
+        columns: number of pixel columns, equal to that of the lens.
+        bits: resolution of the analogue-to-digital converter, bits.
+        response: "logarithmic" (counts follow the logarithm of radiance plus `darkest`) or "linear".
+        decades: decades of radiance from `darkest` to the highest count, for the logarithmic response.
+        darkest: radiance equivalent to the dark current, for the logarithmic response.
+        sensitivity: charge per frame at a radiance of 1, e-, for the linear response.
+        full_well: charge capacity of a pixel, e-, for the linear response.
+        gain: charge per count, e-, for the linear response.
+        read_noise: standard deviation of the read noise, e-, for the linear response.
+        blooming: whether charge beyond the full well spills along the column, for the linear response.
+        pedestal: counts of a pixel without light.
+        noise: standard deviation of the temporal noise, counts, for the logarithmic response.
+        fixed_pattern: standard deviation of the pixels' constant offsets after calibration, counts.
+        response_spread: relative standard deviation of the pixels' sensitivities, for the linear response.
         dead_pixels: number of pixels that always read zero.
         hot_pixels: number of pixels that always read a bright value.
-        seed: seed of the fixed pattern and of the dead and hot pixels.
-        blur: px, standard deviation of the optics' Gaussian.
-        scatter: fraction of the light that the optics scatter widely.
-        scatter_angle: rad, angle at which scattered light has half its central radiance.
+        seed: random seed of the fixed pattern and of the dead and hot pixels.
+        blur: standard deviation of the optics' Gaussian blur, px.
+        scatter: fraction of the light that the optics scatter over wide angles.
+        scatter_angle: angle at which the scattered light has half its central radiance, rad.
 
-    Raises OutOfRange for values out of range, ValueError for a lens of another size.
+    Raises OutOfRange for values out of range, and ValueError for a lens with other numbers of rows and
+    columns.
     """
 
     lens: CameraModel
@@ -131,10 +132,11 @@ class EarthCameraModel:
         k2: float = 0.0,
         **numbers: Any,
     ) -> Self:
-        """Return the camera of Meller et al.: 512 x 512, 8 bits, logarithmic over six decades, 67 deg.
+        """Return the camera of Meller et al. with 512 x 512 px, 8 bits, six decades and a field of 67 deg.
 
-        `field_of_view` (rad) is without distortion, edge to edge. `k1` and `k2` are those of
-        `knightcube.vision.camera.lens.Lens`. `numbers` are other attributes, such as `response="linear"`.
+        `field_of_view` (rad) is the undistorted field from edge to edge. `k1` and `k2` are the distortion
+        coefficients of `knightcube.vision.camera.lens.Lens`. `numbers` are other attributes, such as
+        `response="linear"`.
         """
         rows, columns = int(numbers.get("rows", 512)), int(numbers.get("columns", 512))
         ideal = Pinhole.from_field_of_view(columns, rows, field_of_view)
@@ -143,22 +145,22 @@ class EarthCameraModel:
 
     @property
     def highest_count(self) -> int:
-        """The count at which the converter saturates."""
+        """Count at which the analogue-to-digital converter saturates."""
         return int((1 << self.bits) - 1)
 
     @property
     def count_type(self) -> type[np.uint8] | type[np.uint16]:
-        """The smallest unsigned integer that holds a count."""
+        """Smallest unsigned integer type that holds a count."""
         return np.uint8 if self.bits <= 8 else np.uint16
 
     @property
     def counts_per_decade(self) -> float:
-        """Increase of the counts for ten times the light in the logarithmic camera."""
+        """Increase of the counts of the logarithmic camera if the radiance is multiplied by ten."""
         return (self.highest_count - self.pedestal) / self.decades
 
 
 def pixel_rays(lens: CameraModel) -> FloatArray:
-    """Return the read-only unit vectors (rows x columns, 3), camera axes, of the pixels."""
+    """Return the unit vectors (rows x columns, 3) of the pixels, camera axes, as a read-only array."""
     return _pixel_rays(Lens.of(lens))
 
 
@@ -171,11 +173,11 @@ def _pixel_rays(lens: Lens) -> FloatArray:
 
 
 _SUBPIXELS = 6
-"""Sampling points of the Sun's disc per pixel and axis."""
+"""Number of sampling points of the Sun's disc per pixel along each axis."""
 
 
 def add_disc(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -> None:
-    """Add the disc's radiance, blurred, to `image` (rows, columns)."""
+    """Add the blurred radiance of the Sun's disc to `image` (rows, columns)."""
     axis, radius = towards_sun(scene)
     window = _window(model.lens, axis, radius, math.ceil(4.0 * model.blur) + 1)
     if window is None:
@@ -184,10 +186,10 @@ def add_disc(scene: EarthScene, model: EarthCameraModel, image: Float32Array) ->
     grid = (np.arange(max(width, height) * _SUBPIXELS) + 0.5) / _SUBPIXELS - 0.5
     x, y = np.meshgrid(left + grid[: width * _SUBPIXELS], top + grid[: height * _SUBPIXELS])
     rays = model.lens.unit_vectors(np.stack([x.ravel(), y.ravel()], axis=1))
-    # Squares of chords are more accurate than cosines of such small angles.
+    # Squared chords are more accurate than cosines for angles as small as the Sun's radius.
     share = np.sum((rays - axis) ** 2, axis=1) / (2.0 * math.sin(0.5 * radius)) ** 2
     fine = np.zeros(len(rays))
-    # Rays outside the field of the lens are NaN, for which the comparison is false.
+    # Rays outside the lens's field are NaN, for which this comparison is false.
     inside = np.flatnonzero(share < 1.0)
     fine[inside] = darkening(share[inside]) * transmission(scene, rays[inside])
     fine *= (1.0 - model.scatter) / math.sin(radius) ** 2
@@ -204,9 +206,10 @@ def add_disc(scene: EarthScene, model: EarthCameraModel, image: Float32Array) ->
 def add_glare(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -> None:
     """Add the sunlight that the optics scatter to `image` (rows, columns).
 
-    The scattered radiance falls from its centre as 1/(1 + (s/s0)^2) with the chord s: the shape of Harvey and
-    Shack for polished optics, with a slope of two. Over the hemisphere it has the fraction `scatter` of the
-    light. The lens has no hood: sunlight reaches it from the whole half space in front of it.
+    The scattered radiance decreases from its centre as 1/(1 + (s/s0)^2) with the chord s, which is the
+    Harvey-Shack model for polished optics with a slope of two. The fraction `scatter` of the light is
+    scattered over the hemisphere. The lens has no hood, so sunlight reaches it from the whole half space in
+    front of the camera.
     """
     axis, _ = towards_sun(scene)
     if axis[2] <= 0.0 or model.scatter == 0.0:
@@ -219,8 +222,8 @@ def add_glare(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -
 def scatter_centre(model: EarthCameraModel) -> float:
     """Return the radiance at the centre of the scattered sunlight.
 
-    The integral of 1/(1 + (s/s0)^2) over the hemisphere is pi s0^2 ln(1 + 2/s0^2), and the irradiance of the
-    Sun is pi in these units.
+    The integral of 1/(1 + (s/s0)^2) over the hemisphere is pi s0^2 ln(1 + 2/s0^2). The solar irradiance is pi
+    in the model's units.
     """
     square = model.scatter_angle**2
     return model.scatter / (square * math.log(1.0 + 2.0 / square))
@@ -229,15 +232,15 @@ def scatter_centre(model: EarthCameraModel) -> float:
 def _window(
     lens: CameraModel, axis: FloatArray, radius: float, margin: int
 ) -> tuple[int, int, int, int] | None:
-    """Return left, top, width and height of the pixels in reach of disc and blur, or None."""
+    """Return left, top, width and height of the window that contains the blurred Sun's disc, or None."""
     angle = np.arange(16) * (np.pi / 8.0)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ tangent_basis(axis)
-    # A polygon of 16 sides contains the disc if it is wider by 1/cos(pi/16).
+    # A 16-sided polygon contains the disc if its corners are 1/cos(pi/16) times as far from the centre.
     rim = lens.project(axis + math.tan(radius) / math.cos(np.pi / 16.0) * ring)
     rim = rim[~np.isnan(rim[:, 0])]
     if not len(rim):
         return None
-    # Clipped before the cast, because near 90 deg from the axis the rim exceeds any integer.
+    # The rim is clipped before the cast to int, because it overflows near 90 deg from the optical axis.
     outer = np.array([lens.columns, lens.rows]) - 1 + margin
     low = np.maximum(np.floor(rim.min(axis=0)) - margin, -margin)
     high = np.minimum(np.ceil(rim.max(axis=0)) + margin, outer)
@@ -248,11 +251,14 @@ def _window(
 
 
 _BIN = 8
-"""Edge (px) of the bins in which the smooth scattered light is computed."""
+"""Edge length (px) of the pixel bins in which scattered light is computed."""
 
 
 def blurred(model: EarthCameraModel, image: Float32Array) -> Float32Array:
-    """Return `image` (rows, columns) through the optics; its edge values continue outside."""
+    """Return `image` (rows, columns) after blur and scattering by the optics.
+
+    The image is continued beyond its edges with the values of its edge pixels.
+    """
     narrow = gaussian_filter(image, model.blur, mode="nearest", truncate=4.0) if model.blur > 0.0 else image
     if model.scatter == 0.0:
         return np.asarray(narrow)
@@ -274,13 +280,13 @@ def _scattered(model: EarthCameraModel, image: Float32Array) -> Float32Array:
 def _kernel(
     down: int, across: int, scatter: float, angle: float, focal_length: float
 ) -> tuple[npt.NDArray[np.complex64], tuple[int, int]]:
-    """Return the transform of the scattering between bins, and its shape.
+    """Return the Fourier transform of the scattering kernel between bins, and the shape of the transform.
 
-    The law is that of `add_glare`, with image distances over the focal length as angles.
+    The kernel has the profile of `add_glare`, with image distances divided by the focal length as angles.
     """
     shape = (next_fast_len(2 * down), next_fast_len(2 * across))
     y, x = (np.minimum(np.arange(n), n - np.arange(n)) * (_BIN / focal_length) for n in shape)
-    # Two points of one bin have a mean squared distance of a third of its squared width.
+    # The mean squared distance of two random points in one bin is a third of the squared bin width.
     squares = y[:, None] ** 2 + x**2 + (_BIN / focal_length) ** 2 / 3.0
     share = scatter / (math.pi * angle**2 * math.log(1.0 + 2.0 / angle**2))
     kernel = share * (_BIN / focal_length) ** 2 / (1.0 + squares / angle**2)
@@ -288,7 +294,7 @@ def _kernel(
 
 
 def counts(model: EarthCameraModel, radiance: Float32Array, generator: np.random.Generator) -> Image:
-    """Return the frame (rows, columns) of counts for `radiance` (rows, columns)."""
+    """Return the frame (rows, columns), counts, for `radiance` (rows, columns)."""
     offsets, spread, dead, hot, hot_counts = _pattern(model)
     if model.response == "logarithmic":
         signal = np.log10(1.0 + radiance * np.float32(1.0 / model.darkest))
@@ -307,15 +313,16 @@ def counts(model: EarthCameraModel, radiance: Float32Array, generator: np.random
     flat = signal.reshape(-1)
     flat[dead] = 0.0
     flat[hot] = hot_counts
-    signal += np.float32(0.5)  # truncation below then rounds to the nearest count
+    signal += np.float32(0.5)  # with 0.5, truncation rounds to the nearest count
     np.clip(signal, 0.0, model.highest_count, out=signal)
     return np.asarray(signal.astype(model.count_type))
 
 
 def spill(charge: Float32Array, full_well: float) -> None:
-    """Spread charge beyond the full well along each column of `charge` (rows, columns), half up, half down.
+    """Spread charge beyond the full well along the columns of `charge` (rows, columns).
 
-    Each pixel fills up before the next one receives charge; charge that reaches an edge is lost.
+    Half of the excess moves up and half moves down. Each pixel fills up before the next one receives charge,
+    and charge that reaches an edge of the detector is lost.
     """
     for column in np.flatnonzero(np.any(charge > full_well, axis=0)):
         line = charge[:, column]
@@ -339,7 +346,7 @@ def _normal(model: EarthCameraModel, sigma: float, generator: np.random.Generato
 def _pattern(
     model: EarthCameraModel,
 ) -> tuple[Float32Array, Float32Array, IntArray, IntArray, Float32Array]:
-    """Return offsets (counts), sensitivity errors, dead pixels, hot pixels, and counts of hot pixels."""
+    """Return the pixels' offsets (counts), sensitivity errors, dead pixels, hot pixels and hot counts."""
     rng = np.random.default_rng(model.seed)
     size = model.rows * model.columns
     offsets = _normal(model, model.fixed_pattern, rng)
@@ -351,11 +358,11 @@ def _pattern(
 
 
 _FINE = np.sqrt(1.0 / 12.0) * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
-"""Offsets (4, 2), px, from a pixel's centre: two Gauss-Legendre points along each axis."""
+"""Offsets (4, 2), px, of two Gauss-Legendre points along each axis from a pixel's centre."""
 
 
 def render(model: EarthCameraModel, scene: EarthScene, generator: np.random.Generator) -> Image:
-    """Return the camera's frame (rows, columns): uint8 for up to 8 bits, else uint16.
+    """Return the camera's frame (rows, columns) as uint8 for up to 8 bits, else as uint16.
 
     The noise of the frame is drawn from `generator`.
     """
@@ -363,7 +370,7 @@ def render(model: EarthCameraModel, scene: EarthScene, generator: np.random.Gene
 
 
 def expected_radiance(model: EarthCameraModel, scene: EarthScene) -> FloatArray:
-    """Return the radiance (rows, columns) on the detector, blur and glare included, without noise."""
+    """Return the noise-free radiance (rows, columns) on the detector, including blur and glare."""
     return _light(model, scene).astype(np.float64)
 
 
@@ -380,7 +387,7 @@ def _earth(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
     sight = look(scene, rays)
     light = radiance(scene, rays, sight)
     limb = (~sight.hits & (light > 0.0)).reshape(model.rows, model.columns)
-    # Pixels of the ground next to the limb may extend beyond it.
+    # Pixels whose centre is on the ground next to the limb may extend beyond the limb.
     at_limb = np.flatnonzero(binary_dilation(limb, np.ones((3, 3), dtype=bool)))
     if len(at_limb):
         pixels = np.stack([at_limb % model.columns, at_limb // model.columns], axis=1)

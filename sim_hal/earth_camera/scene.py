@@ -1,19 +1,20 @@
-"""The scene of a camera that views Earth and Sun from a low orbit, and the radiance along lines of sight.
+"""Scene of a camera that views Earth and Sun from a low orbit, and the radiance along lines of sight.
 
-Radiance is in units of that of a white matt surface with the Sun at the zenith.
+The unit of radiance is that of a white Lambertian surface with the Sun at the zenith.
 
-The air thins exponentially and scatters sunlight once, which gives the soft limb, twilight, and haze over the
-ground. The optical depth along an oblique path is the vertical one times Chapman's function, here the limit
-for a scale height far below the Earth's radius, sqrt(pi X/2) exp(X mu^2/2) erfc(mu sqrt(X/2)) with X their
-ratio and mu the cosine from the zenith (Huestis 2001, J. Quant. Spectrosc. Radiat. Transfer 69, 709). The
-formula is also valid for a Sun below the horizon. Not modelled: refraction (which would raise the apparent
-limb by 0.2 km, 0.004 deg), ozone, and clouds above the limb.
+The air density decreases exponentially with height. The air scatters sunlight once, which gives the soft
+limb, twilight, and haze over the ground. The optical depth along an oblique path is the vertical optical
+depth times Chapman's function. For a scale height far below the Earth's radius this function is sqrt(pi X/2)
+exp(X mu^2/2) erfc(mu sqrt(X/2)), where X is the ratio of Earth radius to scale height and mu the cosine of
+the zenith angle (Huestis 2001, J. Quant. Spectrosc. Radiat. Transfer 69, 709). The formula is also valid for
+a Sun below the horizon. The model omits refraction (which raises the apparent limb by 0.2 km, or 0.004 deg),
+ozone, and clouds above the limb.
 
-Lines of sight are intersected with the WGS 84 ellipsoid exactly, in axes scaled so that it is the unit
-sphere. The ground is matt (Lambert); direct sunlight reaches it through the air, and its light passes the
-air again. Land, sea and cloud are noise with a power-law spectrum, sampled on a sphere in a periodic volume
-at two scales: continents and weather, and coasts and single clouds. The map is not the real Earth, but has
-the bright edges inside the limb that disturb a horizon detector.
+Lines of sight are intersected exactly with the WGS 84 ellipsoid, in axes that are scaled so that the
+ellipsoid is the unit sphere. The ground is Lambertian. Direct sunlight is attenuated by the air on the way to
+the ground and again on the way to the camera. Land, sea and cloud are noise with a power-law spectrum,
+sampled on a sphere in a periodic volume at two scales: continents and weather, and coasts and single clouds.
+The map is not the real Earth, but has the bright edges inside the limb that disturb a horizon detector.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 
 ATMOSPHERE = "atmosphere"
 _DEEPEST = -9.0
-"""Smallest argument of erfcx, at which the optical depth is 1e35."""
+"""Smallest argument of erfcx that is used; the optical depth there is 1e35."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +44,9 @@ class Atmosphere:
 
     Attributes:
         scale_height: m.
-        optical_depth: vertical; that of Rayleigh scattering at 550 nm (Bucholtz 1995, Appl. Opt. 34).
-        multiple: brightness of all scattered light relative to that of light scattered once.
+        optical_depth: vertical optical depth, by default of Rayleigh scattering at 550 nm (Bucholtz 1995,
+            Appl. Opt. 34).
+        multiple: ratio of all scattered light to light that is scattered once.
     """
 
     scale_height: float = 8000.0
@@ -65,23 +67,23 @@ class Atmosphere:
 
     @property
     def limb_depth(self) -> float:
-        """Optical depth of a line that touches the ground, about 70 times the vertical one."""
+        """Optical depth of a line of sight that touches the ground, about 70 times `optical_depth`."""
         return self.optical_depth * math.sqrt(2.0 * math.pi * self._ratio)
 
     @property
     def apparent_limb_height(self) -> float:
         """Tangent height (m) at which a sunlit limb has half its full brightness.
 
-        There 1 - exp(-depth) is 1/2, and the depth is `limb_depth` exp(-height/scale height).
+        At this height 1 - exp(-depth) is 1/2, with the depth `limb_depth` * exp(-height / scale height).
         """
         return self.scale_height * math.log(self.limb_depth / math.log(2.0))
 
     def tangent_depth(self, heights: Float32Array) -> Float32Array:
-        """Return the optical depth of whole lines of sight with tangent heights (...) m."""
+        """Return the optical depth of complete lines of sight with tangent heights (...), m."""
         return np.asarray(self.limb_depth * np.exp(-heights / self.scale_height))
 
     def slant_depth(self, cosines: Float32Array) -> Float32Array:
-        """Return the optical depth to space at cosines (...) from the zenith, of either sign."""
+        """Return the optical depth from the ground to space at zenith-angle cosines (...) of either sign."""
         root = math.sqrt(0.5 * self._ratio)
         argument = np.maximum(cosines * root, _DEEPEST)
         return np.asarray(self.optical_depth * math.sqrt(math.pi) * root * erfcx(argument))
@@ -89,18 +91,19 @@ class Atmosphere:
     def scattered(self, depth: Float32Array, bottom: Float32Array, sunward: Float32Array) -> Float32Array:
         """Return the fraction of sunlight scattered along lines of sight, before the phase function.
 
-        `depth` (...) is the optical depth along the line; `bottom` (...) the density at its lowest point
-        relative to the ground; `sunward` (...) the optical depth from the ground below that point towards the
-        Sun. The scattered light comes from the air above the point where the line's depth reaches one. The
-        attenuation of sunlight is averaged over that air; its mean is (1 - exp(-x))/x.
+        `depth` (...) is the optical depth along the line of sight. `bottom` (...) is the air density at the
+        line's lowest point, relative to the ground. `sunward` (...) is the optical depth from the ground
+        below that point towards the Sun. The scattered light comes from the air above the point where the
+        optical depth along the line reaches one. The attenuation of sunlight, averaged over this air, is (1 -
+        exp(-x))/x.
         """
         x = np.maximum(sunward * bottom / (1.0 + depth), 1e-6)
         return np.asarray(np.expm1(-depth) * np.expm1(-x) / x)
 
     def phase(self, cosines: Float32Array) -> Float32Array:
-        """Return the radiance of thick sunlit air at cosines (...) of the angle from the Sun's rays.
+        """Return the radiance of optically thick sunlit air at cosines (...) of the scattering angle.
 
-        This is a quarter of Rayleigh's phase function times `multiple`.
+        The radiance is a quarter of the Rayleigh phase function times `multiple`.
         """
         return np.asarray(self.multiple * 0.1875 * (1.0 + cosines * cosines))
 
@@ -114,18 +117,20 @@ def _icrs_pole() -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EarthScene:
-    """Camera, Earth and Sun at one time.
+    """Positions and attitudes of camera, Earth and Sun at one time.
 
     Attributes:
-        position: of the camera, (3,) m, geocentric, ICRS.
-        attitude: quaternion (4,), ICRS into camera.
-        sun: the Sun's position, (3,) m, geocentric, ICRS.
-        pole: the Earth's pole, (3,) unit, ICRS; in 2026 the true pole is 0.15 deg from the default.
-        rotation: rad, rotation of the Earth about its pole.
-        texture: seed of land, sea and cloud.
+        position: geocentric position (3,) of the camera, m, ICRS.
+        attitude: quaternion (4,) of the camera, ICRS into camera axes.
+        sun: geocentric position (3,) of the Sun, m, ICRS.
+        pole: unit vector (3,) to the Earth's pole, ICRS, whose default is 0.15 deg from the true pole in
+            2026.
+        rotation: rotation angle of the Earth about its pole, rad.
+        texture: random seed of the map of land, sea and cloud.
         atmosphere: the air.
 
-    Raises OutOfRange for a camera inside the Earth, ValueError for arrays of wrong shape or not finite.
+    Raises OutOfRange for a camera inside the Earth, and ValueError for arrays that are not finite or have the
+    wrong shape.
     """
 
     position: FloatArray
@@ -154,13 +159,13 @@ class EarthScene:
 
     @property
     def camera_matrix(self) -> FloatArray:
-        """The matrix (3, 3) from ICRS into camera axes."""
+        """Rotation matrix (3, 3) from ICRS into camera axes."""
         return quaternion.attitude_matrix(self.attitude)
 
     @property
     def earth_matrix(self) -> FloatArray:
-        """The matrix (3, 3) from ICRS into axes fixed to the Earth, its pole last."""
-        # The axis farthest from the pole gives the most accurate cross product.
+        """Rotation matrix (3, 3) from ICRS into Earth-fixed axes with the pole as third axis."""
+        # The coordinate axis farthest from the pole gives the most accurate cross product.
         aside = np.cross(self.pole, np.eye(3)[int(np.argmin(np.abs(self.pole)))])
         first = np.cross(aside / np.linalg.norm(aside), self.pole)
         second = np.cross(self.pole, first)
@@ -168,25 +173,25 @@ class EarthScene:
         return np.stack([cosine * first + sine * second, cosine * second - sine * first, self.pole])
 
     def in_earth(self, vectors: FloatArray) -> FloatArray:
-        """Return vectors (..., 3), ICRS, in axes fixed to the Earth."""
+        """Rotate vectors (..., 3) from ICRS into Earth-fixed axes."""
         return np.asarray(vectors @ self.earth_matrix.T)
 
 
 OCEAN, LAND, CLOUD = 0.06, 0.22, 0.65
-"""Albedo; sea reflects 0.05 to 0.1 of visible light, soil and plants 0.1 to 0.3, cloud up to 0.8."""
+"""Albedo of sea (0.05 to 0.1 in visible light), land (0.1 to 0.3) and cloud (up to 0.8)."""
 LAND_SHARE, CLOUD_SHARE = 0.29, 0.55
 """Fractions of the Earth covered by land and by cloud."""
 
 _CELLS = 96
-"""Edge of the noise volume (cells)."""
+"""Edge length (cells) of the periodic noise volume."""
 _SLOPE = -2.3
-"""Exponent of the noise amplitude by wave number, near the spectrum of clouds."""
+"""Exponent of the noise amplitude as a power of the wave number, as for the spectrum of clouds."""
 _RADIUS = 0.42 * _CELLS
-"""Radius of the Earth (cells); the sphere fits in the volume."""
+"""Radius (cells) of the Earth's sphere in the noise volume."""
 _MAGNIFICATION, _FINE = 11.0, 0.5
-"""Scale and amplitude of the fine noise relative to the coarse noise."""
+"""Spatial scale and amplitude of the fine noise relative to the coarse noise."""
 _SOFT = 0.1
-"""Width of a coast or a cloud's edge (standard deviations of the noise)."""
+"""Width of the transition at a coast or a cloud edge, in standard deviations of the noise."""
 
 
 def albedo(directions: FloatArray, seed: int) -> Float32Array:
@@ -203,7 +208,7 @@ def albedo(directions: FloatArray, seed: int) -> Float32Array:
 
 
 def _covered(volume: Float32Array, places: Float32Array, share: float) -> Float32Array:
-    """Return the cover (n,), 0 .. 1, at `places` (3, n); `share` is its mean over the Earth."""
+    """Return the cover (n,), from 0 to 1, at `places` (3, n); the mean over the Earth is `share`."""
     coarse = _read(volume, places)
     fine = _read(volume, places * np.float32(_MAGNIFICATION))
     height = (coarse + _FINE * fine) / np.hypot(1.0, _FINE)
@@ -230,20 +235,21 @@ def _volumes(seed: int) -> tuple[Float32Array, Float32Array]:
 
 
 TOP = 120e3
-"""Height (m) above which air is invisible (a millionth of the limb's brightness)."""
+"""Height (m) above which the air has less than a millionth of the limb's brightness."""
 _DARKEST = -0.2
-"""Cosine of the Sun's zenith angle, 11.5 deg below the horizon, at which only air above `TOP` is lit."""
+"""Cosine of the Sun's zenith angle below which only air above `TOP` is lit (11.5 deg below the horizon)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EarthIntersection:
-    """The first intersections of n lines of sight with the ellipsoid, or their nearest points to it.
+    """First intersections of n lines of sight with the Earth's ellipsoid, or the points nearest to it.
 
     Attributes:
-        hits: which lines (n,) meet the ground.
-        heights: m (n,), height of the nearest point above the ellipsoid; 0 for lines that meet the ground,
-            infinite if the Earth is behind the camera.
-        places: points (n, 3) in Earth-fixed axes scaled to the unit sphere.
+        hits: whether (n,) each line of sight meets the ground.
+        heights: heights (n,) of the nearest points above the ellipsoid, m; 0 for lines that meet the ground,
+            infinite for lines that point away from the Earth.
+        places: intersections or nearest points (n, 3), in Earth-fixed axes that are scaled to the unit
+            sphere.
     """
 
     hits: BoolArray
@@ -252,14 +258,14 @@ class EarthIntersection:
 
 
 def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
-    """Return the intersections of `rays` (n, 3), of any length, in camera axes, with the Earth."""
+    """Return the intersections of `rays` (n, 3), camera axes and any length, with the Earth."""
     axes = semi_axes()
     origin = scene.in_earth(scene.position) / axes
     into_earth = (scene.camera_matrix @ scene.earth_matrix.T) / axes
     scaled = rays @ into_earth
     squares = np.einsum("ij,ij->i", scaled, scaled)
     along = scaled @ origin
-    # Distance of the nearest point from the centre, without the cancellation of b^2 - ac.
+    # This form of the nearest point's distance from the centre avoids the cancellation in b^2 - ac.
     step = -along / squares
     nearest = origin + step[:, None] * scaled
     distance = np.einsum("ij,ij->i", nearest, nearest)
@@ -274,9 +280,9 @@ def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
 
 
 def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> Float32Array:
-    """Return the radiance (n,), without the Sun's disc, along unit `rays` (n, 3) in camera axes.
+    """Return the radiance (n,) along unit `rays` (n, 3) in camera axes, without the Sun's disc.
 
-    `sight` gives the intersections of the rays.
+    `sight` holds the intersections of the rays with the Earth.
     """
     result = np.zeros(len(rays), dtype=np.float32)
     seen = np.flatnonzero(sight.heights < TOP)
@@ -290,7 +296,7 @@ def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> F
     solar = sunward[lit].astype(np.float32)
     directions = rays[seen]
     upward = np.maximum(-np.einsum("ij,ij->i", directions, normals @ to_earth), 0.0).astype(np.float32)
-    # Cosine of the scattering angle: 1, forward, for a line of sight towards the Sun.
+    # The cosine of the scattering angle is 1 (forward scattering) for a line of sight towards the Sun.
     turned = (directions @ (to_earth.T @ sun)).astype(np.float32)
     air, hits = scene.atmosphere, sight.hits[seen]
     bottom = np.exp(-sight.heights[seen] / air.scale_height)
@@ -311,23 +317,23 @@ def _unit(vectors: FloatArray) -> FloatArray:
 RIM_DARKENING = 0.6
 """Linear coefficient of limb darkening near 550 nm (Cox 2000, Allen's Astrophysical Quantities)."""
 _RINGS, _SPOKES = 24, 48
-"""Sampling points of the Sun's disc."""
+"""Numbers of sampling points of the Sun's disc."""
 
 
 def nadir(scene: EarthScene) -> FloatArray:
-    """Return the unit vector (3,) in camera axes to the Earth's centre."""
+    """Return the unit vector (3,) from the camera to the Earth's centre, camera axes."""
     return np.asarray(scene.camera_matrix @ (-scene.position / np.linalg.norm(scene.position)))
 
 
 def towards_sun(scene: EarthScene) -> tuple[FloatArray, float]:
-    """Return the unit vector (3,) in camera axes from the camera to the Sun, and its disc's radius in rad."""
+    """Return the unit vector (3,) to the Sun, camera axes, and the Sun's angular radius (rad)."""
     offset = scene.sun - scene.position
     distance = float(np.linalg.norm(offset))
     return scene.camera_matrix @ offset / distance, math.asin(SUN_RADIUS / distance)
 
 
 def visible_share(scene: EarthScene) -> float:
-    """Return the fraction of the Sun's light that passes Earth and air to the camera, 0 .. 1."""
+    """Return the fraction of the Sun's light that reaches the camera past the Earth and through the air."""
     axis, radius = towards_sun(scene)
     share = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
@@ -338,13 +344,13 @@ def visible_share(scene: EarthScene) -> float:
 
 
 def darkening(share: FloatArray) -> FloatArray:
-    """Return the brightness of the disc, relative to its mean, at squared radii (...), 0 .. 1."""
+    """Return the brightness of the Sun's disc, relative to its mean, at squared radii (...) from 0 to 1."""
     rim = 1.0 - RIM_DARKENING * (1.0 - np.sqrt(np.maximum(1.0 - share, 0.0)))
     return np.asarray(rim / (1.0 - RIM_DARKENING / 3.0))
 
 
 def transmission(scene: EarthScene, rays: FloatArray) -> FloatArray:
-    """Return the fraction (n,) of sunlight that passes Earth and air along `rays` (n, 3), camera axes."""
+    """Return the fraction (n,) of sunlight that reaches the camera along `rays` (n, 3), camera axes."""
     sight = look(scene, rays)
     through = np.exp(-scene.atmosphere.tangent_depth(sight.heights))
     return np.where(sight.hits, 0.0, through)

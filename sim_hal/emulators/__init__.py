@@ -1,1 +1,1 @@
-"""Emulated devices with the registers and packets of the real parts."""
+"""Emulated devices with the registers and packets of the real devices."""

@@ -1,7 +1,7 @@
-"""A camera that exposes along the body's true motion and delivers its frame after the read-out.
+"""A camera that exposes along the body's true motion and delivers the frame after the read-out.
 
-During an exposure the attitude is sampled every 10 ms; the renderer then integrates the light along it. The
-renderer returns a future, so that in real time another process can render while the devices keep time.
+The attitude is sampled every 10 ms during an exposure, and the renderer integrates the light along the
+sampled attitude. The renderer returns a future, so that another process can render in real time.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 SAMPLE_NS = 10_000_000
 
 Expose = Callable[[int, FloatArray, FloatArray, "Sequence[SourceTrack]"], "Future[Image]"]
-"""Renders a frame from its number, times (k,) s, camera attitudes (k, 4), and the tracks of objects."""
+"""Function that renders a frame from its number, times (k,), s, camera attitudes (k, 4) and object tracks."""
 Moving = Callable[[int, FloatArray], "Sequence[SourceTrack]"]
-"""Returns the tracks of objects over an exposure from its start (ns) and times (k,) s since then."""
+"""Function from the start (ns) of an exposure and times (k,), s, since the start to object tracks."""
 
 
 def no_objects(_: int, __: FloatArray) -> Sequence[SourceTrack]:
@@ -52,12 +52,13 @@ class _Exposure:
 
 
 class EmulatedCamera:
-    """A FrameSource and an emulated device.
+    """An emulated camera, which is a FrameSource and an emulated device.
 
     Attributes:
-        fault: "off", "frozen", "torn" or a key of `SPOILT`; empty for a sound camera.
-        late_ns: additional delay of frames.
-        one_of: number of triggers of which the camera obeys only the last.
+        fault: present fault, "off", "frozen", "torn" or a key of `SPOILT`; empty for a camera without a
+            fault.
+        late_ns: additional delay of the frames, ns.
+        one_of: number n of a fault in which the camera obeys only every n-th trigger.
     """
 
     def __init__(
@@ -70,7 +71,7 @@ class EmulatedCamera:
         scan_ns: int = 0,
         moving: Moving = no_objects,
     ) -> None:
-        """Connect the camera; `scan_ns` is the delay of the last row of a rolling shutter."""
+        """Connect the camera; `scan_ns` is the delay of a rolling shutter's last row."""
         self._motion = motion
         self._expose = expose
         self._now_ns = now_ns
@@ -87,7 +88,7 @@ class EmulatedCamera:
         self._unanswered = 0
 
     def trigger(self, exposure_ns: int) -> None:
-        """Start an exposure and abandon any that is under way, as a camera's reset does."""
+        """Start an exposure and abandon an exposure in progress, as the reset of a camera does."""
         if self.fault == "off":
             raise NotResponding("camera", "does not answer the trigger")
         self._unanswered += 1
@@ -99,7 +100,7 @@ class EmulatedCamera:
         self.advance(self._now_ns())
 
     def poll(self) -> Frame | None:
-        """Return the frame after its read-out, once."""
+        """Return the newest frame once, after its read-out, or None."""
         exposure, now_ns = self._exposure, self._now_ns()
         if exposure is None or exposure.image is None or not exposure.image.done():
             return None
@@ -125,7 +126,7 @@ class EmulatedCamera:
         return min(exposure.times[-1] + SAMPLE_NS, exposure.end_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Sample the attitude; at the end of the exposure start the rendering."""
+        """Sample the attitude, and start the rendering at the end of the exposure."""
         while (event_ns := self.next_event_ns()) <= now_ns:
             exposure = self._exposure
             assert exposure is not None
@@ -138,11 +139,11 @@ class EmulatedCamera:
                 exposure.image = self._expose(exposure.sequence, times, attitudes, tracks)
 
     def close(self) -> None:
-        """Abandon the exposure under way."""
+        """Abandon the exposure in progress."""
         self._exposure = None
 
     def _alter(self, frame: Frame) -> Frame:
-        """Apply the fault that is set."""
+        """Return the frame after the present fault has changed it."""
         if self.fault == "frozen" and self._last is not None:
             return replace(frame, sequence=self._last.sequence, pixels=self._last.pixels)
         if self.fault == "torn" and self._last is not None:
@@ -177,4 +178,4 @@ SPOILT: dict[str, Callable[[Image, int], Image]] = {
     "garbage": _garbage,
     "wrong": lambda pixels, _: np.ascontiguousarray(pixels[::-1]),
 }
-"""The faulty pixels (rows, columns) of each fault, from those of a frame and its number."""
+"""Functions that return each fault's pixels (rows, columns) from a frame's pixels and number."""

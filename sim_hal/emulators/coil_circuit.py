@@ -1,17 +1,17 @@
 """Coil currents from the PWM chip's outputs through SN754410 bridges, and the INA219 that measures them.
 
-The circuit is that of Sease 2013 ch. 5, Table 5.2.
+The circuit is that of Sease 2013, chapter 5, Table 5.2.
 
-The mean current over a PWM period moves the body: coil L/R is 0.1 ms, the period 20 ms (SN754410 and PCA9685
-data sheets). While the two inputs of a bridge differ, V/R drives the coil in one direction. Equal inputs
-brake the coil.
+Only the mean current over a PWM period is modelled, because the coil's time constant L/R is 0.1 ms and the
+PWM period 20 ms (SN754410 and PCA9685 data sheets). While the two inputs of a bridge differ, the coil carries
+the current V/R. Equal inputs brake the coil.
 
-The supply's current is chopped: a bridge draws its coil's current only while its inputs differ.
-`ChoppedSupply` integrates the current of three bridges exactly over any window.
+A bridge draws the coil current from the supply only while the bridge's inputs differ, so the supply current
+is chopped. `ChoppedSupply` integrates the supply current of three bridges exactly over any time window.
 
-The emulated INA219 has registers and converts at its own pace (TI SBOS448G). Each conversion is the mean of
-the supply over the conversion window, computed when the bus reads its result. Noise, gain error and the input
-filter are not modelled.
+The emulated INA219 has the registers and the conversion times of the real chip (TI SBOS448G). A conversion
+result is the mean supply current over the conversion window, computed when the bus reads the result. Noise,
+gain error and the input filter are not modelled.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 
 Pulse = tuple[int, int]
-"""The high time of an output in a period: (first count, number of counts)."""
+"""High time of an output in a PWM period, as first count and number of counts."""
 
 _HISTORY_NS = 500_000_000
-"""Time over which the supply's current is recorded."""
+"""Time (ns) over which the supply current is recorded."""
 
 
 class Bridge(NamedTuple):
-    """The pulses on inputs A and B of a bridge, whose enable input is tied high."""
+    """Pulses on the inputs A and B of an H-bridge that is always enabled."""
 
     a: Pulse
     b: Pulse
 
     def net_counts(self) -> int:
-        """Return the signed number of counts of a period in which the coil is driven."""
+        """Return the signed number of PWM counts in which the coil is driven."""
         return self.a[1] - self.b[1]
 
     def driven(self) -> list[tuple[int, int]]:
-        """Return the spans of counts [begin, end) in which the coil is driven."""
+        """Return the spans [begin, end) of PWM counts in which the coil is driven."""
         if self.a == self.b:
             return []
         edges = {0, COUNTS}
@@ -63,13 +63,13 @@ class Bridge(NamedTuple):
 
 
 class Chopping(NamedTuple):
-    """The supply's current from `since_ns` on.
+    """Chopped current drawn from the supply after `since_ns`.
 
     Attributes:
-        since_ns: time of the change of the outputs.
-        origin_ns: a time at which the PWM counter was zero.
+        since_ns: time at which the PWM outputs changed, ns.
+        origin_ns: a time at which the PWM counter was zero, ns.
         period_ns: PWM period.
-        drawn: pulses of each bridge, and its current (A) while driven.
+        drawn: pulses of each bridge, and the current (A) that the bridge draws while it drives the coil.
     """
 
     since_ns: int
@@ -78,7 +78,7 @@ class Chopping(NamedTuple):
     drawn: tuple[tuple[Bridge, float], ...]
 
     def charge(self, start_ns: int, end_ns: int) -> float:
-        """Return the charge drawn between two times, in A ns."""
+        """Return the charge (A ns) drawn from the supply between two times."""
         periods = [divmod((time_ns - self.origin_ns) / self.period_ns, 1.0) for time_ns in (start_ns, end_ns)]
         (whole_0, part_0), (whole_1, part_1) = periods
         total = 0.0
@@ -90,19 +90,19 @@ class Chopping(NamedTuple):
 
 
 class ChoppedSupply:
-    """The supply's current over the last half second."""
+    """Record of the supply current over the last half second."""
 
     def __init__(self) -> None:
         self._history: deque[Chopping] = deque()
 
     def note(self, chopping: Chopping) -> None:
-        """Record a change of the outputs."""
+        """Record a change of the PWM outputs."""
         self._history.append(chopping)
         while len(self._history) > 1 and self._history[1].since_ns < chopping.since_ns - _HISTORY_NS:
             self._history.popleft()
 
     def charge(self, start_ns: int, end_ns: int) -> float:
-        """Return the charge drawn between two times, in A ns; none before the history begins."""
+        """Return the charge (A ns) drawn between two times; the charge before the first record is zero."""
         total, until_ns = 0.0, end_ns
         for chopping in reversed(self._history):
             begin_ns = max(chopping.since_ns, start_ns)
@@ -115,14 +115,14 @@ class ChoppedSupply:
 
 
 CURRENT_UNCERTAINTY = 3.5e-3
-"""Bound of the error of a coil's current (A) in the thesis."""
+"""Bound (A) of the error of a coil current in the thesis."""
 
 _LOW, _HIGH = (0, 0), (0, COUNTS)
 _OFF = Bridge(_LOW, _LOW)
 
 
 class CoilCondition(Enum):
-    """The condition of a coil or its bridge; beside a stuck leg the other leg still follows its input."""
+    """Condition of a coil or its bridge; if one leg is stuck, the other leg follows its input."""
 
     SOUND = "sound"
     OPEN = "open"
@@ -141,11 +141,11 @@ _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
     CoilCondition.B_HIGH: (None, _HIGH),
     CoilCondition.B_LOW: (None, _LOW),
 }
-"""Constant pulses of the legs A and B of each condition; None for a leg that follows its input."""
+"""Constant output of legs A and B in each condition; None for a leg that follows its input."""
 
 
 class CoilCircuit:
-    """Three coils on one PWM chip, updated at every I2C STOP that may have changed outputs."""
+    """Three coils on one PWM chip, updated at every I2C STOP that may have changed an output."""
 
     def __init__(
         self,
@@ -158,8 +158,9 @@ class CoilCircuit:
     ) -> None:
         """Connect the coils with their true properties.
 
-        `uncertainty` (A) bounds a uniform error that is drawn at each write of a coil's channels.
-        `bus_voltage` (V) is the voltage at a monitor in the supply, by default the coils' supply voltage.
+        `uncertainty` (A) bounds the uniform random error of a coil current, which is drawn at each write of
+        the coil's channels. `bus_voltage` (V) is the voltage that a current monitor measures, by default the
+        coils' supply voltage.
         """
         self._chip = chip
         self._coils = tuple(
@@ -181,14 +182,14 @@ class CoilCircuit:
         self._short_ohm = [1.0, 1.0, 1.0]
         self._bridges = [_OFF] * 3
         self._values = [0.0, 0.0, 0.0]
-        self._drawn = [0.0, 0.0, 0.0]  # from the supply while driven, by each bridge
+        self._drawn = [0.0, 0.0, 0.0]  # current (A) of each bridge while it drives its coil
         self._currents: FloatArray = np.zeros(3)
         self._supply = ChoppedSupply()
         chip.on_stop = self.update
         self.update(0)
 
     def currents(self) -> FloatArray:
-        """Return the mean currents (3,) in A of the present PWM setting."""
+        """Return the mean coil currents (3,), A, at the present PWM outputs."""
         return self._currents
 
     def become(self, axis: int, condition: CoilCondition, short_ohm: float = 5.0) -> None:
@@ -199,7 +200,7 @@ class CoilCircuit:
         self.update(self._coils[axis][1])
 
     def update(self, written: int) -> None:
-        """Update the currents after a STOP; `written` is the mask of the channels that were written."""
+        """Update the currents after a STOP; `written` is the bit mask of the written PWM channels."""
         draws = self._generator.random(3).tolist() if written else (0.5, 0.5, 0.5)
         for axis, (coil, channels, step, limit) in enumerate(self._coils):
             stuck_a, stuck_b = self._stuck[axis]
@@ -224,15 +225,16 @@ class CoilCircuit:
             self._drawn[axis] = drawn
             self._values[axis] = current
         self._currents = np.array(self._values)
-        # Without a clock the outputs are constant, and any period is right.
+        # Without an oscillator the outputs are constant, and any period gives the same currents.
         period_ns = 1e9 / (self._chip.frequency or 1.0)
         pulses: tuple[tuple[Bridge, float], ...] = tuple(zip(self._bridges, self._drawn, strict=True))
         self._supply.note(Chopping(self._now_ns(), self._chip.counter_start_ns, period_ns, pulses))
 
     def mean_supply(self, start_ns: int, end_ns: int) -> tuple[float, float]:
-        """Return the mean bus voltage (V) and mean current of all coils together (A) over a recent window.
+        """Return the mean bus voltage (V) and the mean supply current (A) of all coils over a time window.
 
-        A bridge draws |I| from the supply while its coil is driven. The window must be within the last 0.5 s.
+        A bridge draws |I| from the supply while its coil is driven. The time window must be within the last
+        0.5 s.
         """
         return self._bus_voltage, self._supply.charge(start_ns, end_ns) / (end_ns - start_ns)
 
@@ -251,23 +253,23 @@ _RESERVED = 0x4000  # of Config; reads zero
 _CALIBRATION_BITS = 0xFFFE
 _REMEMBERED_NS = 60_000_000_000
 
-# Nanoseconds by ADC code: 9 to 12 bits, then 12 bits averaged 2 to 128 times.
+# Conversion times (ns) by ADC code, for 9 to 12 bits and for averages of 2 to 128 samples of 12 bits.
 _SINGLE_NS = (84_000, 148_000, 276_000, 532_000)
 _AVERAGED_NS = (532_000, 1_060_000, 2_130_000, 4_260_000, 8_510_000, 17_020_000, 34_050_000, 68_100_000)
 
 
 def conversion_ns(code: int) -> int:
-    """Return the time of one conversion with a 4-bit ADC code."""
+    """Return the duration (ns) of one conversion with a 4-bit ADC code."""
     return _AVERAGED_NS[code & 7] if code & 8 else _SINGLE_NS[code & 3]
 
 
 class EmulatedIna219:
-    """One monitor; `measure(start_ns, end_ns)` returns mean bus voltage (V) and current (A) of a window.
+    """An emulated INA219; `measure(start_ns, end_ns)` returns mean bus voltage (V) and mean current (A).
 
     Attributes:
-        gain: gain error of its current measurement, for faults; 1 is sound.
-        frozen: constant content of registers, for faults.
-        lag_ns: age of the conversions that it reports, up to a minute, for faults.
+        gain: gain of the current measurement, which a fault sets to a value other than 1.
+        frozen: register contents that a fault holds constant.
+        lag_ns: age of the reported conversions, ns, which a fault sets to at most a minute.
     """
 
     def __init__(
@@ -289,7 +291,7 @@ class EmulatedIna219:
         self.brown_out()
 
     def brown_out(self) -> None:
-        """Interrupt the supply: every register returns to its power-on value."""
+        """Interrupt the supply, which resets every register to its power-on value."""
         self._pointer = 0
         self._calibration = 0
         self._shunt = 0
@@ -322,7 +324,7 @@ class EmulatedIna219:
         return address == self.address
 
     def write(self, address: int, data: bytes) -> None:
-        """Accept a register pointer, and a word (big-endian) for Config or Calibration."""
+        """Store a register pointer, and a big-endian word for the register Config or Calibration."""
         self._pointer = data[0]
         if len(data) < 3:
             return
@@ -334,7 +336,7 @@ class EmulatedIna219:
             self._calibration = word & _CALIBRATION_BITS
 
     def read(self, count: int) -> bytes:
-        """Return the word at the register pointer, big-endian; bytes beyond it read 0xFF."""
+        """Return the big-endian word at the register pointer; bytes after the word read 0xFF."""
         word = self.register(self._pointer)
         if self._pointer == POWER:
             self._ready = False
@@ -352,12 +354,12 @@ class EmulatedIna219:
         self._bus_ns = conversion_ns(word >> 7 & 0xF) if bus_wanted else 0
         self._begin_ns = self._now_ns()
         self._done = 0
-        # Power-down and "ADC off" leave the flag as it is.
+        # The modes power-down and "ADC off" do not change the conversion-ready flag.
         if shunt_wanted or bus_wanted:
             self._ready = False
 
     def _convert(self) -> None:
-        """Take the newest finished conversion: first the shunt, then the bus."""
+        """Compute the newest finished conversion, which measures first the shunt and then the bus voltage."""
         cycle_ns = self._shunt_ns + self._bus_ns
         if cycle_ns == 0:
             return
@@ -387,7 +389,7 @@ class EmulatedIna219:
             self._past.popleft()
 
     def _shown(self) -> tuple[int, int]:
-        """Return the reported conversions of shunt and bus: the newest, or with `lag_ns` older ones."""
+        """Return the reported conversions of shunt and bus, which are `lag_ns` old."""
         if not self.lag_ns or not self._past:
             return self._shunt, self._bus
         until_ns = self._now_ns() - self.lag_ns
@@ -395,7 +397,7 @@ class EmulatedIna219:
         return old[1:]
 
     def _products(self) -> tuple[int, int, bool]:
-        """Return Current, Power, and whether either exceeds its register."""
+        """Return the registers Current and Power, and whether a value exceeds its register."""
         shunt, volts = self._shown()
         current = abs(shunt) * self._calibration // 4096
         power = current * volts // 5000
@@ -404,6 +406,6 @@ class EmulatedIna219:
 
 
 def _digitised(steps: float, code: int, low: int, high: int) -> int:
-    """Return the register value of a voltage in 12-bit steps, at the resolution of the ADC code, clipped."""
+    """Return the clipped register value of a voltage (12-bit steps) at the resolution of the ADC code."""
     coarse = 1 if code & 8 else 1 << (3 - (code & 3))
     return min(high, max(low, round(steps / coarse) * coarse))

@@ -1,8 +1,9 @@
-"""A u-blox GPS receiver: UBX in and out on a serial line, with the errors of a receiver in orbit.
+"""Emulated u-blox GPS receiver with UBX messages on a serial line and the errors of a receiver in orbit.
 
-It starts without its set-up and sends sentences of NMEA until a message enables NAV-PVT. Fixes are taken at
-whole periods of UTC, and their frames are sent `latency` later. The errors are a random walk of the position
-(ionosphere, ephemerides) and white noise of position and velocity.
+The receiver starts without a configuration and sends NMEA sentences until a message enables NAV-PVT. Fixes
+are computed at UTC times that are multiples of the period, and their frames are sent `latency` s later. The
+position error is a random walk (ionosphere, ephemerides) plus white noise, and the velocity error is white
+noise.
 """
 
 from __future__ import annotations
@@ -46,15 +47,15 @@ _UNKNOWN = 0xFFFF_FFFF
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GpsErrors:
-    """The receiver's errors and delays.
+    """Errors and delays of an emulated GPS receiver.
 
     Attributes:
-        walk: m, standard deviation of the random walk of each axis.
-        walk_time: s, correlation time of the random walk.
-        noise: m, standard deviation of each axis.
-        velocity_noise: m/s, standard deviation of each axis.
-        latency: s, from the epoch to the frame.
-        start: s, from power-on to the first fix.
+        walk: standard deviation of the position's random walk on each axis, m.
+        walk_time: correlation time of the position's random walk, s.
+        noise: standard deviation of the position's white noise on each axis, m.
+        velocity_noise: standard deviation of the velocity's white noise on each axis, m/s.
+        latency: delay from the time of a fix to its frame, s.
+        start: time from power-on to the first fix, s.
     """
 
     walk: float = 2.0
@@ -66,13 +67,13 @@ class GpsErrors:
 
 
 class EmulatedGps:
-    """The receiver; an emulated device.
+    """An emulated GPS receiver.
 
     Attributes:
-        shift: (3,) m, ITRS, error of the reported position, for faults.
-        clock_ns: error of the reported time, for faults.
-        blind: whether no satellite is received.
-        frozen: whether the last fix is repeated.
+        shift: position error (3,) that a fault adds, m, ITRS.
+        clock_ns: error of the reported time that a fault adds, ns.
+        blind: whether a fault blocks the signals of all satellites.
+        frozen: whether a fault makes the receiver repeat its last fix.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class EmulatedGps:
         errors: GpsErrors,
         now_ns: int = 0,
     ) -> None:
-        """Connect a receiver that has been switched on long ago."""
+        """Connect a receiver that has had power for a long time."""
         self.shift: FloatArray = np.zeros(3)
         self.clock_ns = 0
         self.blind = False
@@ -101,16 +102,16 @@ class EmulatedGps:
         self._sending.clear()
 
     def switch_on(self, now_ns: int) -> None:
-        """Apply power: the set-up is lost, and the search for satellites starts."""
+        """Apply power; the receiver has lost its configuration and starts to search for satellites."""
         self._power(now_ns, self._errors.start)
 
     def next_event_ns(self) -> int:
-        """Return when the receiver next measures, sends, or receives."""
+        """Return the time at which the receiver next measures, sends or receives."""
         sends_ns = self._sending[0][0] if self._sending else NEVER
         return min(self._epoch_ns, sends_ns, self._line.next_arrival_ns())
 
     def advance(self, now_ns: int) -> None:
-        """Receive, measure and send all that is due at or before `now_ns`."""
+        """Receive, measure and send everything that is due by `now_ns`."""
         if self._line.next_arrival_ns() <= now_ns:
             data = self._line.read(now_ns)
             for kind, payload, _ in self._parser.feed(data) if self._epoch_ns != NEVER else ():

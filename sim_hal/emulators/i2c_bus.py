@@ -1,11 +1,12 @@
-"""An I2C bus in memory, with emulated parts, the faults of its wires, and SMBus transfers.
+"""Emulated I2C bus in memory, with emulated chips, bus faults and SMBus transfers.
 
-A transaction is one message, or several joined by repeated STARTs, as in Linux's ioctl I2C_RDWR. The
-duration on the wire (0.6 ms for 24 bytes at 400 kHz) is not modelled; a hang lasts the bus's timeout.
+A transaction is one message or several messages joined by repeated STARTs, as in Linux's ioctl I2C_RDWR. The
+duration of a transaction (0.6 ms for 24 bytes at 400 kHz) is not modelled, except that a hang lasts until the
+timeout of the bus.
 
-SMBus transfers are made of messages, as a Linux adapter without SMBus hardware makes them. Their numbers and
-the layout of their data are those of linux/i2c.h (the union i2c_smbus_data); words are little endian. Block
-reads whose length the part sends, packet error checking and ten-bit addresses are not supported.
+SMBus transfers are emulated by I2C messages, as in a Linux adapter without SMBus hardware. The transfer codes
+and the data layout are those of linux/i2c.h (union i2c_smbus_data), with little-endian words. Block reads
+whose length is sent by the chip, packet error checking and ten-bit addresses are not supported.
 """
 
 from __future__ import annotations
@@ -20,25 +21,25 @@ from typing import Protocol
 
 _TIMEOUT_NS = 20_000_000
 _BLOCK_LIMIT = 32
-"""Maximum number of bytes of a block."""
+"""Maximum number of bytes in an SMBus block."""
 
 
 class I2cPart(Protocol):
-    """A part on the bus."""
+    """An emulated chip on the I2C bus."""
 
     def answers(self, address: int) -> bool:
-        """Return whether the part acknowledges this address (0 is the general call)."""
+        """Return whether the chip acknowledges this address (0 is the general call)."""
 
     def write(self, address: int, data: bytes) -> None:
-        """Accept the bytes of a write, from the address to the STOP or repeated START."""
+        """Process the bytes of a write between the address and the STOP or repeated START."""
 
     def read(self, count: int) -> bytes:
-        """Return bytes from the register pointer on."""
+        """Return `count` bytes, beginning at the register pointer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One message: a write of `data`, or with `count` a read of that many bytes; either may be empty."""
+    """One I2C message, which writes `data`, or reads `count` bytes if `count` is given."""
 
     address: int
     data: bytes = b""
@@ -47,7 +48,7 @@ class Message:
 
 @dataclass(slots=True)
 class _Fault:
-    """A fault that is due `left` times (None: until it is removed); `code` 0 is a bit flip."""
+    """A bus fault that acts `left` times, or until removed if `left` is None; `code` 0 is a bit flip."""
 
     code: int
     text: str
@@ -60,34 +61,34 @@ class _Fault:
 
 
 class EmulatedI2cBus:
-    """The drivers' bus (hal.interfaces.wires.I2cBus) over emulated parts. Safe for several threads."""
+    """An I2C bus (`hal.interfaces.wires.I2cBus`) with emulated chips, which is safe for several threads."""
 
     def __init__(
         self,
         parts: Sequence[I2cPart] = (),
         wait: Callable[[int], None] | None = None,
     ) -> None:
-        """Connect the parts; `wait` advances time by a time-out (ns); without `wait` no time passes."""
+        """Connect the chips; `wait` advances time by a timeout (ns), and without `wait` no time passes."""
         self._parts = list(parts)
         self._wait = wait
         self._faults: list[_Fault] = []
         self._closed = False
-        # Re-entrant: while a hang lasts, simulated time may run other jobs of the same thread.
+        # The lock is re-entrant because other jobs of the same thread may run while a hang lasts.
         self._lock = threading.RLock()
         self.transactions = 0
 
     def attach(self, part: I2cPart) -> None:
-        """Add a part to the bus."""
+        """Add a chip to the bus."""
         with self._lock:
             self._parts.append(part)
 
     def detach(self, part: I2cPart) -> None:
-        """Remove a part from the bus; its address is no longer acknowledged."""
+        """Remove a chip from the bus, so that the chip's address is not acknowledged any more."""
         with self._lock:
             self._parts.remove(part)
 
     def put_before(self, part: I2cPart, cover: I2cPart) -> Callable[[], None]:
-        """Replace a part on the bus by `cover`; return the function that restores the part."""
+        """Replace a chip on the bus by `cover`, and return the function that restores the chip."""
         with self._lock:
             self._parts[self._parts.index(part)] = cover
 
@@ -98,24 +99,24 @@ class EmulatedI2cBus:
         return uncover
 
     def write_byte(self, address: int, value: int) -> None:
-        """Write one byte without a register."""
+        """Write one byte without a register address."""
         self.send(address, bytes((value,)))
 
     def read_byte_data(self, address: int, register: int) -> int:
-        """Read one byte."""
+        """Read one byte of a register."""
         return self._read(address, register, 1)[0]
 
     def write_byte_data(self, address: int, register: int, value: int) -> None:
-        """Write one byte."""
+        """Write one byte to a register."""
         self.send(address, bytes((register, value)))
 
     def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
-        """Read `length` <= 32 bytes."""
+        """Read `length` bytes, at most 32, beginning at a register."""
         _check_length(length)
         return list(self._read(address, register, length))
 
     def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
-        """Write up to 32 bytes."""
+        """Write up to 32 bytes, beginning at a register."""
         _check_length(len(values))
         self.send(address, bytes((register, *values)))
 
@@ -124,14 +125,14 @@ class EmulatedI2cBus:
         self._closed = True
 
     def send(self, address: int, data: bytes) -> None:
-        """Write bytes as they are: 0x06 alone to address 0 is the software reset."""
+        """Write raw bytes to an address; the single byte 0x06 to address 0 is the software reset."""
         self.transfer((Message(address, data),))
 
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
-        """Send messages joined by repeated STARTs; return what each read gives.
+        """Send messages joined by repeated STARTs, and return the data of each read.
 
-        At most one fault acts on a part in a transaction. It flips bits of the data read, or in a transaction
-        without reads of the data written after the register byte.
+        At most one fault acts on a chip in a transaction. A bit flip changes the data that are read. In a
+        transaction without reads it changes the data that are written after the register byte.
         """
         reads = any(message.count is not None for message in messages)
         given: list[bytes] = []
@@ -150,7 +151,7 @@ class EmulatedI2cBus:
                     written = message.data if reads else _flipped(message.data, fault, 1)
                     self._deliver(parts, address, written)
                 else:
-                    # Outputs are open drain: if several parts answer, zeros dominate.
+                    # The bus is open drain, so zero bits dominate if several chips answer.
                     answers = zip(*(part.read(message.count) for part in parts), strict=True)
                     wired = bytes(reduce(operator.and_, column) for column in answers)
                     given.append(_flipped(wired, fault, 0))
@@ -163,31 +164,32 @@ class EmulatedI2cBus:
         after: int = 0,
         chance: Callable[[], bool] | None = None,
     ) -> Callable[[], None]:
-        """Let a part (None: all parts) refuse `times` transactions (None: until removed or cleared).
+        """Make a chip, or all chips if `address` is None, refuse transactions.
 
-        A write is refused after `after` bytes, of which the register byte is the first. With `chance` the
-        fault acts only if it returns True. Returns the removal of the fault, as the other faults do.
+        The fault acts `times` times, or until it is removed if `times` is None. A write is refused after
+        `after` bytes, of which the register byte is the first. If the function `chance` is given, the fault
+        acts only when `chance` returns True. Returns the function that removes the fault.
         """
         return self._add(
             _Fault(errno.EREMOTEIO, "no acknowledge", address, times, after=after, chance=chance)
         )
 
     def hang(self, times: int | None = None) -> Callable[[], None]:
-        """Hold the clock line low: each transaction lasts the time-out and fails."""
+        """Hold the clock line low, so that each transaction fails after the timeout."""
         return self._add(_Fault(errno.ETIMEDOUT, "time-out, the clock line is held low", None, times))
 
     def time_out(self, address: int, chance: Callable[[], bool]) -> Callable[[], None]:
-        """Let a part stretch the clock beyond the time-out if `chance` returns True."""
+        """Make a chip stretch the clock beyond the timeout whenever `chance` returns True."""
         return self._add(
             _Fault(errno.ETIMEDOUT, "time-out, the clock is stretched", address, None, chance=chance)
         )
 
     def lose_arbitration(self, times: int | None = 1) -> Callable[[], None]:
-        """Lose the arbitration to another master."""
+        """Make transactions lose the arbitration to another master."""
         return self._add(_Fault(errno.EAGAIN, "arbitration lost", None, times))
 
     def flip_bits(self, address: int, index: int, mask: int, times: int | None = 1) -> Callable[[], None]:
-        """Invert the bits of `mask` in byte `index` of the data written or read, silently."""
+        """Invert the bits of `mask` in byte `index` of the data written or read, without an error."""
         return self._add(_Fault(0, "bits flipped", address, times, index=index, mask=mask))
 
     def clear_faults(self) -> None:
@@ -200,7 +202,7 @@ class EmulatedI2cBus:
             self._faults.append(fault)
 
         def remove() -> None:
-            with self._lock:  # by identity, because equal faults are distinct
+            with self._lock:  # compared by identity, because equal faults are distinct
                 self._faults = [other for other in self._faults if other is not fault]
 
         return remove
@@ -235,7 +237,7 @@ class EmulatedI2cBus:
 
     @staticmethod
     def _deliver(parts: list[I2cPart], address: int, data: bytes) -> None:
-        if data:  # An empty write only asks for the acknowledge of the address.
+        if data:  # An empty write only tests whether the address is acknowledged.
             for part in parts:
                 part.write(address, data)
 
@@ -262,9 +264,9 @@ FUNCTIONS = 0x00000001 | 0x00FF0000 | 0x02000000 | 0x0C000000
 def smbus(
     bus: EmulatedI2cBus, address: int, reading: bool, command: int, size: int, data: bytes = b""
 ) -> bytes:
-    """Execute one transfer of ioctl I2C_SMBUS; return the new content of the union, empty for a write.
+    """Execute one transfer of ioctl I2C_SMBUS, and return the new content of the union, empty for a write.
 
-    Raises OSError of the bus, or with EOPNOTSUPP or EINVAL as an adapter does.
+    Raises OSError for bus errors, and with EOPNOTSUPP or EINVAL as a Linux adapter does.
     """
     head = bytes((command,))
     match size:
@@ -286,8 +288,8 @@ def smbus(
 
 
 def _block(bus: EmulatedI2cBus, address: int, reading: bool, head: bytes, size: int, data: bytes) -> bytes:
-    """Execute a block transfer; on the wire an SMBus block includes its length, an I2C block does not."""
-    # With the old number of the transfer a program reads a block of full length.
+    """Execute a block transfer; an SMBus block on the bus begins with its length, an I2C block does not."""
+    # The old code of this transfer reads a block of the maximum length.
     length = _BLOCK_LIMIT if size == _OLD_I2C_BLOCK and reading else data[0]
     if not 1 <= length <= _BLOCK_LIMIT:
         raise OSError(errno.EINVAL, f"a block of {length} bytes")

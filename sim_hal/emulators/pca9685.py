@@ -1,7 +1,8 @@
-"""An emulated PCA9685: its registers alone determine its outputs (NXP data sheet).
+"""An emulated PCA9685 PWM chip, whose registers determine the outputs as in the NXP data sheet.
 
-Accesses that the data sheet forbids or leaves undefined have the least effect, and are noted in `violations`.
-Not modelled: oscillator tolerance and the phase of the counter. A change takes effect at the STOP.
+Accesses that the data sheet forbids or leaves undefined have the smallest possible effect and are recorded in
+`violations`. The oscillator's tolerance and the phase of the counter are not modelled. A register change
+takes effect at the STOP of the I2C transaction.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _ALL_CALL = 0x01
 _INVERT = 0x10
 _UPDATE_ON_ACK = 0x08
 _ALL_CHANNELS = (1 << CHANNELS) - 1
-# Registers SUBADR1..3 and ALLCALLADR, and the MODE1 bit that enables each address.
+# Registers SUBADR1 to 3 and ALLCALLADR, and the MODE1 bits that enable their addresses.
 _EXTRA_ADDRESSES = ((0x02, 0x08), (0x03, 0x04), (0x04, 0x02), (0x05, _ALL_CALL))
 
 
@@ -59,10 +60,10 @@ class EmulatedPca9685:
     """One chip.
 
     Attributes:
-        on_stop: called after each write that may have changed outputs, with the mask of the channels written
-            (0 when only the modes changed).
-        output_enable: the OE pin held active; inactive, every output is low (OUTNE 00).
-        violations: accesses of the bus master that the data sheet forbids.
+        on_stop: function that is called after each write that may have changed outputs, with the bit mask of
+            the written channels (0 if only the modes changed).
+        output_enable: whether the OE pin is active; if it is inactive, every output is low (OUTNE = 00).
+        violations: accesses by the bus master that the data sheet forbids.
     """
 
     def __init__(self, address: int, now_ns: Callable[[], int]) -> None:
@@ -73,33 +74,33 @@ class EmulatedPca9685:
         self._now_ns = now_ns
         self._registers = bytearray()
         self._addresses: set[int] = set()
-        self._halted = 0  # channels stopped by sleep until RESTART or a new write
+        self._halted = 0  # channels that sleep has stopped until RESTART or a new write
         self._power_on()
 
     def brown_out(self) -> None:
-        """Interrupt the supply: every register returns to its power-on value."""
+        """Interrupt the supply, which resets every register to its power-on value."""
         self._power_on()
         self._stop(_ALL_CHANNELS)
 
     def upset(self, register: int, value: int) -> None:
-        """Overwrite a register, awake or asleep, as radiation does."""
+        """Overwrite a register in any mode of the chip, as radiation can do."""
         self._registers[register] = value
         self._find_addresses()
         self._stop(_ALL_CHANNELS)
 
     def flip(self, register: int, bit: int) -> None:
-        """Flip a bit of a register, as radiation does; unused bits stay zero."""
+        """Flip a bit of a register, as radiation can do; unused bits stay zero."""
         self.upset(register, self._registers[register] ^ 1 << bit & _WRITABLE[register])
 
     def register(self, register: int) -> int:
-        """Return a register's content as a bus read returns it."""
+        """Return the content of a register as a bus read does."""
         restart = RESTART if register == MODE1 and self._restart else 0
         return self._registers[register] | restart
 
     @property
     def frequency(self) -> float:
-        """The PWM frequency in Hz, 0 while the oscillator is off."""
-        # No clock is wired to the EXTCLK pin.
+        """PWM frequency (Hz), 0 while the oscillator is off."""
+        # No external clock is wired to the EXTCLK pin.
         if self._registers[MODE1] & (SLEEP | EXTERNAL_CLOCK):
             return 0.0
         return OSCILLATOR_HZ / (COUNTS * (self._registers[PRE_SCALE] + 1))
@@ -110,7 +111,7 @@ class EmulatedPca9685:
         return self._awake_ns
 
     def high(self, channel: int) -> tuple[int, int]:
-        """Return the high time of an output in a period: (first count, number of counts 0 .. 4096)."""
+        """Return the high time of an output in a PWM period, as first count and number of counts."""
         if not self.output_enable:
             return 0, 0
         start, length = self._pulse(channel)
@@ -119,15 +120,15 @@ class EmulatedPca9685:
         return start, length
 
     def duty(self, channel: int) -> float:
-        """Return the duty cycle of an output, 0 .. 1."""
+        """Return the duty cycle of an output, from 0 to 1."""
         return self.high(channel)[1] / COUNTS
 
     def answers(self, address: int) -> bool:
-        """Return whether the chip acknowledges: its own, the general call, enabled ALLCALL and SUBADRs."""
+        """Return whether the chip acknowledges an address: its own, the general call or an enabled group."""
         return address in self._addresses
 
     def write(self, address: int, data: bytes) -> None:
-        """Accept the bytes of one write."""
+        """Process the bytes of one write."""
         if address == GENERAL_CALL:
             if data == bytes((SOFTWARE_RESET,)):
                 self._power_on()
@@ -144,14 +145,14 @@ class EmulatedPca9685:
             for value in data[1:]:
                 written |= self._store(self._pointer, value)
                 self._advance()
-        # A write to a channel acts like RESTART; with OCH set, only a write of all its four registers does.
+        # A write to a channel acts like RESTART, but if OCH is set, only a write of all four registers does.
         if written and (count >= 4 or not self._registers[MODE2] & _UPDATE_ON_ACK):
             self._halted &= ~written
             self._restart = False
         self._stop(written)
 
     def read(self, count: int) -> bytes:
-        """Return bytes from the register pointer on."""
+        """Return `count` bytes, beginning at the register pointer."""
         given = bytearray()
         for _ in range(count):
             given.append(self.register(self._pointer))
@@ -189,7 +190,7 @@ class EmulatedPca9685:
         return (1 << last + 1) - (1 << first)
 
     def _store(self, register: int, value: int) -> int:
-        """Write one register; return the mask of the affected channels."""
+        """Write one register and return the bit mask of the affected channels."""
         if LED0_ON_L <= register < _LED_END:
             self._registers[register] = value & _WRITABLE[register]
             return 1 << ((register - LED0_ON_L) >> 2)
@@ -213,7 +214,7 @@ class EmulatedPca9685:
 
     def _store_mode1(self, value: int) -> None:
         before = self._registers[MODE1]
-        # EXTCLK can be set only while asleep, and only a reset clears it.
+        # EXTCLK can be set only while the chip sleeps, and only a reset clears EXTCLK.
         external = before & EXTERNAL_CLOCK or value & before << 2 & EXTERNAL_CLOCK
         self._registers[MODE1] = value & ~(RESTART | EXTERNAL_CLOCK) | external
         if value & SLEEP and not before & SLEEP:

@@ -1,9 +1,9 @@
-"""A serial line with transmission times and wire faults, in memory or on a pseudo-terminal.
+"""Emulated serial lines with transmission times and wire faults, in memory or on a pseudo-terminal.
 
-Each direction is a `Wire`. In memory, the host's end is a `hal.interfaces.wires.SerialPort` and the device's
-end a `sim_hal.clock.SerialEnd`; the line is deterministic for a given generator. A `PtyLine` serves any
-client on a pseudo-terminal, paced in real time at the line's speed. The client's speed is read from the
-terminal, so a wrong speed garbles the bytes as on a cable.
+Each direction of a line is a `Wire`. In memory, the host's end is a `hal.interfaces.wires.SerialPort` and the
+device's end is a `sim_hal.clock.SerialEnd`. A line in memory is deterministic for a given random generator. A
+`PtyLine` serves any client on a pseudo-terminal in real time at the line's baud rate. The client's baud rate
+is read from the terminal, so a wrong baud rate garbles the bytes as on a cable.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ import numpy as np
 from hal.interfaces.errors import NotResponding
 from sim_hal.clock import NEVER
 
-_BITS = 10  # start, eight, stop
+_BITS = 10  # start bit, eight data bits, stop bit
 _SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class LineFaults:
-    """The faults of a wire, from the next byte on.
+    """Faults of a wire, which act on the bytes sent after they are set.
 
     Attributes:
-        silent: whether no byte arrives.
+        silent: whether all bytes are lost.
         garbage: whether every byte is replaced by a random byte.
         cut_probability: probability that a message loses a random run of its bytes.
         flip_probability: probability that a bit arrives inverted.
         delay_ns: additional delay of each byte.
-        thinned: number of messages of which only one arrives.
+        thinned: number n of a fault in which only every n-th message arrives.
     """
 
     silent: bool = False
@@ -53,7 +53,7 @@ SOUND = LineFaults()
 
 @dataclass(slots=True)
 class _Message:
-    """Bytes in transmission: byte i has arrived at start + (i + 1) * 10 / baud."""
+    """Bytes in transmission; byte i arrives at start + (i + 1) * 10 / baud."""
 
     start_ns: int
     data: bytes
@@ -61,26 +61,26 @@ class _Message:
     taken: int = 0
 
     def crossed_ns(self, count: int) -> int:
-        """Return when the first `count` bytes have arrived, rounded up."""
+        """Return the time (ns, rounded up) at which the first `count` bytes have arrived."""
         return self.start_ns - (-count * _BITS * _SECOND_NS // self.baud_rate)
 
     def crossed(self, now_ns: int) -> int:
-        """Return the number of bytes that have arrived by `now_ns`."""
+        """Return the number of bytes of this message that have arrived by `now_ns`."""
         if now_ns <= self.start_ns:
             return 0
         return min(len(self.data), (now_ns - self.start_ns) * self.baud_rate // (_BITS * _SECOND_NS))
 
 
 class Wire:
-    """One direction of a line.
+    """One direction of a serial line.
 
     Attributes:
-        faults: its faults; may be replaced at any time.
+        faults: faults of the wire, which may be replaced at any time.
         lost_bytes: number of bytes lost because the buffers were full.
     """
 
     def __init__(self, rng: np.random.Generator, capacity: int = 6144) -> None:
-        """Take the generator of the faults and the capacity (bytes) of the buffers of both ends together."""
+        """Create the wire with a random generator for faults; `capacity` is the buffer size (bytes)."""
         self.faults = SOUND
         self.lost_bytes = 0
         self._rng = rng
@@ -92,7 +92,7 @@ class Wire:
         self._messages_sent = 0
 
     def push(self, data: bytes, now_ns: int, sender_baud: int, receiver_baud: int) -> None:
-        """Send bytes as soon as the wire is free; with unequal speeds they arrive as noise."""
+        """Send bytes as soon as the wire is free; with unequal baud rates, random bytes arrive."""
         faults = self.faults
         start_ns = max(now_ns, self._free_ns)
         self._free_ns = start_ns + len(data) * _BITS * _SECOND_NS // sender_baud
@@ -102,7 +102,7 @@ class Wire:
         # Bytes keep their order after a delay is removed.
         start_ns = max(start_ns, self._last_ns)
         if data and sender_baud != receiver_baud:
-            # A slower receiver reads fewer characters, and none of them is correct.
+            # A receiver with a lower baud rate reads fewer characters, all of them random.
             data = self._rng.bytes(max(1, len(data) * min(receiver_baud, sender_baud) // sender_baud))
         room = self._capacity - self._waiting
         self.lost_bytes += max(0, len(data) - room)
@@ -114,11 +114,11 @@ class Wire:
             self._last_ns = message.crossed_ns(len(data))
 
     def noise(self, count: int, now_ns: int, baud_rate: int) -> None:
-        """Insert `count` random bytes."""
+        """Insert `count` random bytes into the wire."""
         self.push(self._rng.bytes(count), now_ns, baud_rate, baud_rate)
 
     def pull(self, now_ns: int) -> list[tuple[int, bytes]]:
-        """Return the bytes that have arrived by `now_ns`, oldest first: (time of the last byte, bytes)."""
+        """Return the chunks that have arrived by `now_ns` as (time of the last byte, bytes), oldest first."""
         chunks: list[tuple[int, bytes]] = []
         while self._messages:
             message = self._messages[0]
@@ -133,7 +133,7 @@ class Wire:
         return chunks
 
     def next_arrival_ns(self) -> int:
-        """Return when the message in transmission will have arrived; NEVER if there is none."""
+        """Return the time at which the message in transmission will have arrived, or NEVER."""
         if not self._messages:
             return NEVER
         message = self._messages[0]
@@ -156,16 +156,16 @@ class Wire:
 
 
 class EmulatedSerialLine:
-    """A line in memory with both its ends.
+    """A serial line in memory with its two ends.
 
     Attributes:
-        to_host, to_device: the two wires, each with its faults.
-        host: a SerialPort.
-        device: a SerialEnd.
+        to_host, to_device: the wires of the two directions, each with its own faults.
+        host: host's end of the line, a SerialPort.
+        device: device's end of the line, a SerialEnd.
     """
 
     def __init__(self, now_ns: Callable[[], int], baud_rate: int, rng: np.random.Generator) -> None:
-        """Take the clock of the host's end, the speed of both ends, and the generator of the faults."""
+        """Store the host's clock, the baud rate of both ends, and the random generator of the faults."""
         to_host_rng, to_device_rng = rng.spawn(2)
         self.to_host = Wire(to_host_rng)
         self.to_device = Wire(to_device_rng)
@@ -174,7 +174,7 @@ class EmulatedSerialLine:
 
 
 class HostEnd:
-    """The host's end; implements `hal.interfaces.wires.SerialPort`."""
+    """The host's end of a line, which implements `hal.interfaces.wires.SerialPort`."""
 
     def __init__(self, line: EmulatedSerialLine, now_ns: Callable[[], int], baud_rate: int) -> None:
         self.baud_rate = baud_rate
@@ -183,7 +183,7 @@ class HostEnd:
         self._now_ns = now_ns
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """Return the bytes that have arrived since the last call. Raises NotResponding if unplugged."""
+        """Return the bytes that have arrived since the last call. Raises NotResponding."""
         self._check()
         return self._line.to_host.pull(self._now_ns())
 
@@ -193,11 +193,11 @@ class HostEnd:
         self._line.to_device.push(data, self._now_ns(), self.baud_rate, self._line.device.baud_rate)
 
     def set_baud_rate(self, baud_rate: int) -> None:
-        """Change this end's speed."""
+        """Change the baud rate of this end."""
         self.baud_rate = baud_rate
 
     def close(self) -> None:
-        """Close the port, as unplugging does."""
+        """Close the port, with the same effect as unplugging the cable."""
         self.unplugged = True
 
     def _check(self) -> None:
@@ -206,14 +206,14 @@ class HostEnd:
 
 
 class DeviceEnd:
-    """The device's end; implements `sim_hal.clock.SerialEnd`."""
+    """The device's end of a line, which implements `sim_hal.clock.SerialEnd`."""
 
     def __init__(self, line: EmulatedSerialLine, baud_rate: int) -> None:
         self.baud_rate = baud_rate
         self._line = line
 
     def write(self, data: bytes, now_ns: int) -> None:
-        """Start to send bytes at `now_ns`."""
+        """Send bytes to the host, beginning at `now_ns`."""
         self._line.to_host.push(data, now_ns, self.baud_rate, self._line.host.baud_rate)
 
     def read(self, now_ns: int) -> bytes:
@@ -221,7 +221,7 @@ class DeviceEnd:
         return b"".join(data for _, data in self._line.to_device.pull(now_ns))
 
     def next_arrival_ns(self) -> int:
-        """Return when bytes of the host next arrive."""
+        """Return the time at which the next bytes from the host arrive, or NEVER."""
         return self._line.to_device.next_arrival_ns()
 
 
@@ -234,22 +234,21 @@ _CODES = {rate: code for code, rate in _SPEEDS.items()}
 
 
 class PtyLine:
-    """The device's end of a line whose host end is a pseudo-terminal; a `SerialEnd`.
+    """The device's end (a `SerialEnd`) of a line whose host end is a pseudo-terminal.
 
     Attributes:
-        name: the device file that a host opens.
-        baud_rate: the device's own speed.
-        to_host, to_device: the two wires, each with its faults.
+        name: device file that the host opens.
+        baud_rate: baud rate of the device.
+        to_host, to_device: the wires of the two directions, each with its own faults.
     """
 
     def __init__(self, baud_rate: int, rng: np.random.Generator, link: Path | None = None) -> None:
-        """Open the terminal, and make `link` a symbolic link to it. Raises OSError if either fails."""
+        """Open the pseudo-terminal, and make `link` a symbolic link to its device. Raises OSError."""
         self.baud_rate = baud_rate
         to_host_rng, to_device_rng = rng.spawn(2)
         self.to_host = Wire(to_host_rng)
         self.to_device = Wire(to_device_rng)
-        # The far side stays open, because a terminal that nobody has open reports errors. Raw mode has no
-        # echo.
+        # The client's side stays open, because a pseudo-terminal without a client reports errors.
         self._near, self._far = os.openpty()
         tty.setraw(self._far)
         self._set_speed(baud_rate)
@@ -267,7 +266,7 @@ class PtyLine:
                 raise
 
     def write(self, data: bytes, now_ns: int) -> None:
-        """Start to send bytes at `now_ns`."""
+        """Send bytes to the host, beginning at `now_ns`."""
         self.to_host.push(data, now_ns, self.baud_rate, self._host_speed())
 
     def read(self, now_ns: int) -> bytes:
@@ -275,11 +274,11 @@ class PtyLine:
         return b"".join(data for _, data in self.to_device.pull(now_ns))
 
     def next_arrival_ns(self) -> int:
-        """Return when bytes of the host next arrive."""
+        """Return the time at which the next bytes from the host arrive, or NEVER."""
         return self.to_device.next_arrival_ns()
 
     def exchange(self, now_ns: int) -> None:
-        """Accept the host's bytes, and deliver the device's bytes that have arrived by `now_ns`."""
+        """Read the host's bytes, and deliver the device's bytes that have arrived by `now_ns`."""
         try:
             data = os.read(self._near, 4096)
         except BlockingIOError:
@@ -291,21 +290,21 @@ class PtyLine:
             try:
                 os.write(self._near, crossed)
             except OSError as error:
-                # Without a reader the bytes are lost, as on an unconnected cable.
+                # If no client reads, the bytes are lost as on an unconnected cable.
                 if error.errno != errno.EAGAIN:
                     raise
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable when the host writes, for select."""
+        """Return the file descriptor that becomes readable when the host writes, for `select`."""
         return self._near
 
     def wait(self, now_ns: int, until_ns: int) -> None:
-        """Wait until the host writes, a message for it has arrived, or `until_ns`."""
+        """Wait until the host writes, a message for the host is complete, or `until_ns` has come."""
         due_ns = min(until_ns, self.to_host.next_arrival_ns())
         select.select([self._near], [], [], max(0, due_ns - now_ns) * 1e-9)
 
     def close(self) -> None:
-        """Close the terminal and remove the link. Safe to call twice."""
+        """Close the pseudo-terminal and remove the symbolic link. Calling it twice is safe."""
         if self._near < 0:
             return
         if self._link is not None:
@@ -315,7 +314,7 @@ class PtyLine:
         self._near = self._far = -1
 
     def _host_speed(self) -> int:
-        # A speed without a termios name (128000) cannot be read back; it is assumed to be right.
+        # A baud rate without a termios name (128000) cannot be read back and is assumed to be correct.
         return _SPEEDS.get(termios.tcgetattr(self._far)[5], self.baud_rate)
 
     def _set_speed(self, baud_rate: int) -> None:

@@ -1,13 +1,14 @@
-"""The solar cells of a body in orbit: their currents, and the ADS1115 converters that measure them.
+"""Solar cell currents of a body in orbit, and the ADS1115 converters that measure the currents.
 
-A solar string is a group of cells in series on one face of the body; the configuration and the faults call
-the cells `strings`. The currents follow from sunlight, the Earth's reflected light, shadow, and the errors of
-the cells. The Earth's light is summed over the visible ground, which is matt, has one albedo everywhere, and
-is sunlit by the cosine law: 0.3 is the Earth's mean (Stephens et al. 2015, Rev. Geophys. 53: 0.29).
+A solar string is a group of cells in series on one face of the body. The configuration and the faults call a
+group of cells a string. The currents follow from sunlight, sunlight reflected by the Earth, shadow, and the
+errors of the cells. The reflected light is summed over the visible ground, which is Lambertian and has a
+uniform albedo. The default albedo of 0.3 is close to the Earth's mean of 0.29 (Stephens et al. 2015, Rev.
+Geophys. 53).
 
-The emulated ADS1115 has the registers Config and Conversion and converts at its own pace (TI SBAS444, Table
-8-3): single-ended inputs and single shots, as the driver uses them. Other settings are stored but convert
-nothing. The voltage is that at the end of the conversion.
+The emulated ADS1115 has the registers Config and Conversion and the conversion times of the data sheet (TI
+SBAS444, Table 8-3). It converts single-ended inputs in single-shot mode, as the driver does. Other settings
+are stored, but start no conversion. A conversion returns the voltage at its end.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from sim_hal.worlds.world import OrbitingWorld, utc_date
 
 DEVICE = "solar strings"
 _RINGS, _SPOKES = 16, 32
-"""Sampling points of the visible ground."""
+"""Numbers of rings and spokes of the sampling points on the visible ground."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,11 +39,11 @@ class SolarCellsModel:
     """The properties of n solar strings.
 
     Attributes:
-        normals: (n, 3) outward unit vectors, body axes.
-        peaks: (n,) A, nominal current at normal incidence and one astronomical unit.
-        gain_errors: (n,) relative errors of the peaks.
-        grazing: rad, angle from the surface below which light is increasingly reflected.
-        noise: A, standard deviation.
+        normals: outward unit vectors (n, 3) of the strings' faces, body axes.
+        peaks: nominal currents (n,) at normal incidence and one astronomical unit, A.
+        gain_errors: relative errors (n,) of the peak currents.
+        grazing: angle from the surface below which more and more light is reflected, rad.
+        noise: standard deviation of the current noise, A.
         albedo: albedo of the Earth.
     """
 
@@ -65,9 +66,10 @@ class SolarCellsModel:
     def currents(
         self, position: FloatArray, sun: FloatArray, body: FloatArray, generator: np.random.Generator
     ) -> FloatArray:
-        """Return the currents (n,) A at `position` (3,) m, the Sun at `sun` (3,) m, geocentric, ICRS.
+        """Return the currents (n,), A, of the solar strings.
 
-        `body` (3, 3) is the attitude matrix, ICRS into body axes.
+        `position` (3,) and the Sun's position `sun` (3,) are geocentric, m, ICRS. `body` (3, 3) is the
+        attitude matrix, ICRS into body axes.
         """
         to_sun = sun - position
         distance = float(np.linalg.norm(to_sun))
@@ -76,26 +78,27 @@ class SolarCellsModel:
         light = share * self._accepted(normals @ to_sun / distance)
         light = light + self._earthlight(normals, position, sun)
         noise = self.noise * generator.standard_normal(len(self.peaks))
-        # The diode of a string blocks reverse current.
+        # The diode of a solar string blocks reverse current.
         return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
 
     def _accepted(self, cosines: FloatArray) -> FloatArray:
-        """Return the relative current (...), 0 .. 1, of light at `cosines` (...) of incidence."""
+        """Return the relative current (...), 0 to 1, for light at `cosines` (...) of the incidence angle."""
         grazing = math.sin(self.grazing)
         dimmed = cosines * np.clip(cosines / grazing, 0.0, 1.0) if grazing > 0.0 else cosines
         return np.asarray(np.maximum(dimmed, 0.0))
 
     def _earthlight(self, normals: FloatArray, position: FloatArray, sun: FloatArray) -> FloatArray:
-        """Return the Earth's light (n,) on strings with `normals` (n, 3), ICRS, relative to sunlight."""
+        """Return the Earth's light (n,), relative to sunlight, on strings with `normals` (n, 3), ICRS."""
         rays, ground, solid = _ground_in_view(position)
         lit = np.maximum(ground @ (sun / np.linalg.norm(sun)), 0.0)
         return np.asarray(self._accepted(normals @ rays.T) @ (self.albedo / np.pi * solid * lit))
 
 
 def _ground_in_view(position: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return directions (m, 3) from `position` (3,) m to the ground, its verticals (m, 3), and sr of each.
+    """Return directions (m, 3) to the ground, the verticals (m, 3) of the ground, and a solid angle.
 
-    The directions sample the visible disc in rings of equal solid angle.
+    The directions start at `position` (3,), m. They sample the visible disc in rings of equal solid angle.
+    The solid angle (sr) is that of one direction.
     """
     distance = float(np.linalg.norm(position))
     down = -position / distance
@@ -120,10 +123,10 @@ _RATES = (8, 16, 32, 64, 128, 250, 475, 860)
 
 
 class EmulatedAds1115:
-    """One converter; `measure(channel)` returns the present voltage at an input.
+    """An emulated ADS1115; the function `measure(channel)` returns the present voltage at an input.
 
     Attributes:
-        address: its address on the bus.
+        address: address of the converter on the I2C bus.
     """
 
     def __init__(self, address: int, now_ns: Callable[[], int], measure: Callable[[int], float]) -> None:
@@ -141,13 +144,13 @@ class EmulatedAds1115:
         self._converting = False
 
     def answers(self, address: int) -> bool:
-        """Return whether the part acknowledges this address: its own and the general call."""
+        """Return whether the address is the converter's own or the general call."""
         return address in {_GENERAL_CALL, self.address}
 
     def write(self, address: int, data: bytes) -> None:
-        """Accept a register pointer, and a word for Config; thresholds are not modelled.
+        """Store a register pointer, and a word for the register Config; thresholds are not modelled.
 
-        The reset by general call is the power-on state (9.5.1.2).
+        The reset by general call restores the power-on state (TI SBAS444, section 9.5.1.2).
         """
         if address == _GENERAL_CALL:
             if data == _RESET:
@@ -171,7 +174,7 @@ class EmulatedAds1115:
         return (word.to_bytes(2, "big") * (count // 2 + 1))[:count]
 
     def _complete(self) -> None:
-        """End a conversion whose time is over."""
+        """Complete a conversion whose time has passed."""
         if not self._converting or self._now_ns() < self._ready_ns:
             return
         self._converting = False
@@ -182,17 +185,17 @@ class EmulatedAds1115:
 
 
 _FRESH_NS = 20_000_000
-"""Time during which one measurement of the currents is used."""
+"""Time (ns) for which one evaluation of the solar currents is used."""
 
 
 class EmulatedSolarCells:
-    """The n solar strings and the converters that measure them.
+    """The n emulated solar strings and the converters that measure their currents.
 
     Attributes:
         parts: the converters.
-        dead: (n,) whether each string gives no current.
-        frozen: whether all currents are constant.
-        gain: gain of all amplifiers relative to a sound one.
+        dead: whether (n,) each string has failed and gives no current.
+        frozen: whether a fault holds all currents constant.
+        gain: gain of all amplifiers relative to the nominal gain.
     """
 
     def __init__(
@@ -216,7 +219,7 @@ class EmulatedSolarCells:
         )
 
     def _voltage(self, address: int, channel: int) -> float:
-        """Return the voltage at the input of a converter."""
+        """Return the voltage (V) at the input of a converter."""
         index, volt_per_ampere = self._strings.get((address, channel), (None, 0.0))
         if index is None:
             return 0.0

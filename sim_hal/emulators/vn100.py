@@ -1,17 +1,18 @@
 """An emulated VN-100 on the device end of a serial line: registers, commands, outputs and power.
 
-The unit executes commands and sends its asynchronous outputs (one ASCII sentence and three binary packets)
-on the 800 Hz grid of its own clock. Register values are kept as the text that the unit prints; contents and
-defaults are those of VectorNav UM001 v2.43 ch. 5. Registers that tune its estimation (21 to 26, 32 to 51, 74,
-82 to 84) are stored and echoed without effect, except the heading mode of 35; of register 85 the windows of
-magnetometer, accelerometer and gyro have an effect. SYNC lines and the second serial port are not emulated.
-The 500 ms of a flash write are VectorNav's; the second of start-up is assumed.
+The unit executes commands and sends its asynchronous outputs (one ASCII sentence and three binary packets) on
+the 800 Hz grid of its own clock. Register values are stored as the text that the unit prints, with the
+contents and defaults of VectorNav UM001 v2.43, chapter 5. The registers that tune the attitude estimation (21
+to 26, 32 to 51, 74, 82 to 84) are stored and echoed without effect, except the heading mode in register 35.
+Of register 85, the filter windows of magnetometer, accelerometer and gyro have an effect. SYNC lines and the
+second serial port are not emulated. VectorNav specifies 500 ms for a flash write, and a start-up time of 1 s
+is assumed.
 
-The commands of the attitude filter are those of VectorNav UM001 ch. 8; set initial heading and set filter
-bias follow VectorNav's SDK 0.99 and the answers of its units with satellite navigation. Assumed: in the
-absolute heading mode the magnetometer sets the heading, so tare and set initial heading change nothing;
-gravity sets pitch and roll in every mode, so only the yaw of a given attitude has an effect. The filter has
-no gyro bias error.
+The commands of the attitude filter are those of VectorNav UM001, chapter 8. The commands "set initial
+heading" and "set filter bias" follow VectorNav's SDK 0.99 and the answers of VectorNav units with satellite
+navigation. In the absolute heading mode the magnetometer is assumed to set the heading, so "tare" and "set
+initial heading" change nothing. Gravity is assumed to set pitch and roll in every mode, so only the yaw of a
+given attitude has an effect. The filter's estimate of the gyro bias has no error.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from sim_hal.emulators.vn100_sensors import (
 from sim_hal.worlds.world import BodyMotion
 
 Rule = Callable[[str], str]
-"""Returns the text as the unit stores it; raises ValueError for an invalid text."""
+"""Function that returns a field's text as the unit stores it, or raises ValueError for an invalid text."""
 
 BAUD_RATES = (9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600)
 ASYNC_RATES_HZ = (1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
@@ -50,12 +51,12 @@ ASYNC_TYPES = (0, 1, 2, 8, 9, 10, 11, 12, 13, 14, 16, 17, 19, 30)
 BINARY_OUTPUTS = (75, 76, 77)
 GYRO_STARTUP_BIAS, FILTER_STARTUP_BIAS = 43, 74
 
-# The fields that a VN-100 has, by group bit; all others need satellite navigation or later units.
+# Bit masks of the binary output fields that a VN-100 has, by group bit.
 SUPPORTED_FIELDS: Mapping[int, int] = {0: 0x3F3D, 1: 0x0191, 2: 0x0FFF, 4: 0x01FF}
 
 
 class UnitError(Exception):
-    """The unit answers `$VNERR` with this code."""
+    """Error for which the unit answers `$VNERR` with an error code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"{code:02X}")
@@ -69,9 +70,9 @@ RECEIVE_OVERFLOW = 0x02
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """One register: a rule for each field, and the defaults.
+    """A register with a rule and a default for each field.
 
-    With `port_option` a write may have a further field, the serial port.
+    If `port_option` is set, a write may have the serial port as an additional field.
     """
 
     rules: tuple[Rule, ...]
@@ -80,7 +81,7 @@ class Register:
     port_option: bool = False
 
     def checked(self, fields: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the fields as the unit stores them. Raises UnitError."""
+        """Return the fields as the unit stores them. Raises UnitError for invalid fields."""
         if not self.writable:
             raise UnitError(UNAUTHORIZED)
         expect_count(fields, len(self.rules), len(self.rules) + self.port_option)
@@ -93,7 +94,7 @@ class Register:
 
 
 def expect_count(fields: tuple[str, ...], least: int, most: int) -> None:
-    """Raise UnitError when the number of fields is out of range."""
+    """Raise UnitError if the number of fields is out of range."""
     if len(fields) < least:
         raise UnitError(TOO_FEW)
     if len(fields) > most:
@@ -189,25 +190,25 @@ REGISTERS: Mapping[int, Register] = {
 _OFF = ("0", "0", "00")
 
 FIELD_BITS = 16
-"""Width of each field of the registers in which bits are flipped."""
-_BASE_10 = 2  # fields of a binary output; the others are hexadecimal
+"""Width (bits) that each register field has for bit flips."""
+_BASE_10 = 2  # number of decimal fields of a binary output; later fields are hexadecimal
 
 
 @dataclass(frozen=True, slots=True)
 class BinaryOutput:
-    """An output set of registers 75 to 77: serial ports, period in 800 Hz ticks, and packet."""
+    """A binary output of registers 75 to 77, with serial ports, period (800 Hz ticks) and packet layout."""
 
     ports: int
     divisor: int
     layout: OutputLayout
 
     def pack(self, now: MessageData) -> bytes:
-        """Return the packet of the data of one time."""
+        """Return the packet that contains the data of one time."""
         return self.layout.pack(now.values(" ".join(BINARY_FIELDS[key] for key in self.layout.fields)))
 
 
 def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
-    """Return the output set of the fields of a register 75 to 77; None without groups. Raises UnitError."""
+    """Return the binary output that register fields define, or None. Raises UnitError."""
     expect_count(fields, 3, 3 + 8)
     try:
         ports, divisor, groups = int(fields[0]), int(fields[1]), int(fields[2], 16)
@@ -228,10 +229,10 @@ def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
 
 
 class RegisterFile:
-    """The registers in use, and those in flash.
+    """The register contents in use, and those in flash.
 
     Attributes:
-        values: the fields of each register in use.
+        values: fields in use of each register.
     """
 
     def __init__(self) -> None:
@@ -241,17 +242,17 @@ class RegisterFile:
         self.values = dict(self._defaults)
 
     def read(self, number: int) -> tuple[str, ...]:
-        """Return a register's fields. Raises UnitError."""
+        """Return the fields of a register. Raises UnitError for an unknown register."""
         if number not in self.values:
             raise UnitError(INVALID_REGISTER)
         return self.values[number]
 
     def integer(self, number: int, index: int = 0) -> int:
-        """Return one field as an integer."""
+        """Return one field of a register as an integer."""
         return int(self.values[number][index])
 
     def write(self, number: int, fields: tuple[str, ...]) -> tuple[str, ...]:
-        """Store a register's new fields; return the unit's echo. Raises UnitError."""
+        """Store the new fields of a register and return the unit's echo. Raises UnitError."""
         if number in BINARY_OUTPUTS:
             binary_output(fields)
             words = (f"{int(text, 16):04X}" for text in fields[3:])
@@ -262,15 +263,16 @@ class RegisterFile:
             raise UnitError(INVALID_REGISTER)
         register = REGISTERS[number]
         kept = register.checked(fields)
-        # Only the first port, that of the line, is emulated.
+        # Only the first serial port, which is connected to the line, is emulated.
         if kept[len(register.rules) :] != ("2",):
             self.values[number] = kept[: len(register.rules)]
         return kept
 
     def flip(self, number: int, bit: int) -> None:
-        """Flip a bit, counted from the lowest bit of the first field; bits beyond the last field are ignored.
+        """Flip a bit of a register; bits after the last field are ignored.
 
-        The register keeps the new content. Raises UnitError if no write could have stored that content.
+        Bits are counted from the lowest bit of the first field. The register keeps the new content. Raises
+        UnitError if a write of the new content would be rejected.
         """
         place, shift = divmod(bit, FIELD_BITS)
         fields = list(self.values[number])
@@ -286,7 +288,7 @@ class RegisterFile:
             REGISTERS[number].checked(self.values[number])
 
     def save(self) -> None:
-        """Write all to flash."""
+        """Write all registers to flash."""
         self._flash = dict(self.values)
 
     def restore(self) -> None:
@@ -294,7 +296,7 @@ class RegisterFile:
         self._flash = dict(self._defaults)
 
     def load(self) -> None:
-        """Load all from flash, as at power-on."""
+        """Load all registers from flash, as at power-on."""
         self.values = dict(self._flash)
 
 
@@ -304,14 +306,14 @@ _VPE_CONTROL, _HEADING_MODE, _ABSOLUTE = 35, 1, 0
 
 
 class AttitudeCommands:
-    """The part of the unit's attitude filter that commands change.
+    """State of the unit's attitude filter that commands change.
 
     Attributes:
-        status: the VPE status word; KMD and KAD set its disturbance bits.
+        status: VPE status word, whose disturbance bits the commands KMD and KAD set.
     """
 
     def __init__(self, registers: RegisterFile, gyro_bias: FloatArray) -> None:
-        """`gyro_bias` (3,) rad/s, sensor axes, is the filter's estimate, which SGB and SFB store."""
+        """Store the filter's estimate `gyro_bias` (3,), rad/s, sensor axes, which SGB and SFB save."""
         self._registers = registers
         self._gyro_bias = gyro_bias
         self._turn: FloatArray | None = None
@@ -323,13 +325,13 @@ class AttitudeCommands:
         self.status = 0
 
     def turned(self, sample: Vn100Sample) -> Vn100Sample:
-        """Return a sample with the heading that commands have set."""
+        """Return `sample` rotated to the heading that commands have set."""
         if self._turn is None:
             return sample
         return replace(sample, quaternion=multiply(sample.quaternion, self._turn))
 
     def execute(self, command: str, fields: tuple[str, ...], sample: Callable[[], Vn100Sample]) -> None:
-        """Execute one of ATTITUDE_COMMANDS; `sample` measures now. Raises UnitError."""
+        """Execute one of ATTITUDE_COMMANDS; the function `sample` measures the present motion."""
         if command in _DISTURBANCES:
             bit = _DISTURBANCES[command]
             self.status = self.status | bit if flag(fields) else self.status & ~bit
@@ -343,7 +345,7 @@ class AttitudeCommands:
                 self._store_biases(everything=command == "SFB")
 
     def _set_heading(self, yaw: float, sample: Callable[[], Vn100Sample]) -> None:
-        """Turn the attitude about the vertical so that the yaw is now `yaw`, rad."""
+        """Rotate the attitude about the vertical so that the present yaw becomes `yaw` (rad)."""
         if self._registers.integer(_VPE_CONTROL, _HEADING_MODE) == _ABSOLUTE:
             return
         change = from_rotation_vector(np.array([0.0, 0.0, yaw - math.radians(sample().yaw_pitch_roll[0])]))
@@ -357,7 +359,7 @@ class AttitudeCommands:
 
 
 def flag(fields: tuple[str, ...]) -> bool:
-    """Return the one field, 0 or 1, of a command. Raises UnitError."""
+    """Return the only field, 0 or 1, of a command as a bool. Raises UnitError for other fields."""
     expect_count(fields, 1, 1)
     if fields[0] not in {"0", "1"}:
         raise UnitError(INVALID_PARAMETER)
@@ -365,7 +367,7 @@ def flag(fields: tuple[str, ...]) -> bool:
 
 
 def _yaw_of(fields: tuple[str, ...]) -> float:
-    """Return the yaw (rad) of a heading or of three angles (deg), or of a quaternion. Raises UnitError."""
+    """Return the yaw (rad) that a heading or three angles (deg) or a quaternion define. Raises UnitError."""
     expect_count(fields, 1, 4)
     if len(fields) == 2:
         raise UnitError(TOO_FEW)
@@ -388,7 +390,7 @@ _OUR_PORT = 1
 
 @dataclass(slots=True)
 class Stream:
-    """One output of `length` bytes, sent every `divisor` ticks, last at `sent_ns` of device time."""
+    """A periodic output of `length` bytes every `divisor` ticks, last sent at `sent_ns` of device time."""
 
     divisor: int
     length: int
@@ -397,10 +399,10 @@ class Stream:
 
 
 class OutputStreams:
-    """The asynchronous outputs of one unit.
+    """The asynchronous outputs of an emulated unit.
 
     Attributes:
-        muted: registers whose output is silent until they are written again.
+        muted: registers whose output is silent until the register is written again.
     """
 
     def __init__(self, registers: RegisterFile) -> None:
@@ -409,12 +411,12 @@ class OutputStreams:
         self.muted: set[int] = set()
 
     def reset(self) -> None:
-        """Remove all streams."""
+        """Remove all output streams."""
         self._streams = {}
         self.muted.clear()
 
     def build(self, device_ns: int) -> None:
-        """Rebuild the streams from the registers. Raises UnitError if the line is too slow for them."""
+        """Rebuild the output streams from the registers. Raises UnitError if the line is too slow."""
         registers = self._registers
         streams: dict[int, Stream] = {}
         output = OUTPUT_BY_TYPE.get(registers.integer(6))
@@ -435,7 +437,7 @@ class OutputStreams:
         self._streams = streams
 
     def next_tick(self, passed: int) -> int | None:
-        """Return the first tick after `passed` on which a stream is due, None without streams."""
+        """Return the first tick after `passed` on which a stream is due, or None without streams."""
         return min(((passed // s.divisor + 1) * s.divisor for s in self._streams.values()), default=None)
 
     def due(self, tick: int) -> list[Stream]:
@@ -469,20 +471,20 @@ TICK_NS = _BILLION // IMU_RATE_HZ
 
 @dataclass(frozen=True, slots=True)
 class Vn100EmulatorSettings:
-    """The properties of this unit.
+    """Properties of an emulated unit.
 
     Attributes:
-        noise: its noise profile.
-        mounting: (4,) sensor axes into body axes.
-        reference: (4,) NED into the world's reference frame.
-        gyro_bias: (3,) rad/s, sensor axes.
-        clock_ppm: rate error of its clock; positive if the clock is fast.
-        uptime_ns: its own time at the start; the remainder of 25 ms is the phase of its outputs.
-        boot_ns: time from reset to the first message.
-        flash_ns: time to write the flash.
-        temperature: degrees C.
-        pressure: kPa.
-        free_fall: whether there is no gravity, so that its own attitude is meaningless.
+        noise: noise profile of the sensors.
+        mounting: quaternion (4,) from sensor axes to body axes.
+        reference: quaternion (4,) from NED axes to the world's reference frame.
+        gyro_bias: constant gyro bias (3,), rad/s, sensor axes.
+        clock_ppm: rate error of the unit's clock, ppm; positive if the clock is fast.
+        uptime_ns: unit's time at the start of the simulation, ns, which sets the phase of the outputs.
+        boot_ns: time from reset to the first message, ns.
+        flash_ns: duration of a flash write, ns.
+        temperature: reported temperature, degrees C.
+        pressure: reported pressure, kPa.
+        free_fall: whether the body is in free fall, so that the unit's attitude is meaningless.
     """
 
     noise: NoiseProfile = PROFILES["thesis"]
@@ -499,11 +501,11 @@ class Vn100EmulatorSettings:
 
 
 class Vn100Emulator:
-    """The unit; a `sim_hal.clock.EmulatedDevice`.
+    """An emulated VN-100, which is a `sim_hal.clock.EmulatedDevice`.
 
     Attributes:
-        registers: the registers.
-        alter: function that alters each sample before it is sent, for faults.
+        registers: registers of the unit.
+        alter: function by which a fault alters each sample before it is sent, or None.
     """
 
     def __init__(
@@ -514,7 +516,7 @@ class Vn100Emulator:
         settings: Vn100EmulatorSettings,
         now_ns: int = 0,
     ) -> None:
-        """Connect a running unit at `now_ns`; `sense` returns the motion at a time."""
+        """Connect a running unit at `now_ns`; the function `sense` returns the motion at a time."""
         self.registers = RegisterFile()
         self.alter: Callable[[Vn100Sample], Vn100Sample] | None = None
         self._sense = sense
@@ -538,22 +540,22 @@ class Vn100Emulator:
         self._start(now_ns, settings.uptime_ns)
 
     def next_event_ns(self) -> int:
-        """Return when the unit next receives or sends something."""
+        """Return the time at which the unit next receives or sends data."""
         return min(self._line.next_arrival_ns(), self._due_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Receive and send all that is due at or before `now_ns`."""
+        """Receive and send everything that is due by `now_ns`."""
         while (event_ns := self.next_event_ns()) <= now_ns:
             if self._due_ns <= event_ns:
                 self._act(event_ns)
             else:
                 data = self._line.read(event_ns)
-                if self._then is None:  # during a start or a flash write the unit receives nothing
+                if self._then is None:  # no reception during a start or a flash write
                     self._receive(data, event_ns)
             self._schedule(event_ns)
 
     def set_baud_rate(self, baud_rate: int) -> None:
-        """Save this speed in the flash, with the fastest output rate that fits. Raises UnitError."""
+        """Save a baud rate in flash, with the fastest output rate that fits. Raises UnitError."""
         self.registers.write(5, (str(baud_rate),))
         length = OUTPUT_BY_TYPE[14].length()
         fitting = [rate for rate in ASYNC_RATES_HZ if rate <= 40 and 10 * length * rate <= baud_rate]
@@ -568,21 +570,21 @@ class Vn100Emulator:
         self._due_ns = NEVER
 
     def switch_on(self, now_ns: int) -> None:
-        """Apply power, or reset: the unit restarts from its flash."""
+        """Apply power or reset the unit, which restarts from its flash."""
         self._restart(now_ns)
         self._schedule(now_ns)
 
     def change_baud_rate(self, baud_rate: int, now_ns: int) -> None:
-        """Change the line's speed, as a write of register 5 does."""
+        """Change the baud rate, as a write of register 5 does."""
         self.registers.write(5, (str(baud_rate),))
         self._line.baud_rate = baud_rate
         self._build_streams(now_ns)
 
     def upset(self, register: int, bit: int, now_ns: int) -> None:
-        """Flip a bit of a register that configures the outputs, as radiation does.
+        """Flip a bit of a register that configures the outputs, as radiation can do.
 
-        Assumed: an output is silent until its register is written if that register is invalid or the line is
-        too slow for it.
+        If the register becomes invalid or the line is too slow for the output, the output is assumed to be
+        silent until the register is written again.
         """
         try:
             self.registers.flip(register, bit)
@@ -592,7 +594,7 @@ class Vn100Emulator:
             self._build_streams(now_ns)
         self._schedule(now_ns)
 
-    # Time: ticks of 1/800 s of the unit's own clock.
+    # Time is counted in ticks of 1/800 s of the unit's own clock.
 
     def _device_ns(self, now_ns: int) -> int:
         return self._uptime_ns + (now_ns - self._origin_ns) * self._clock_rate // _BILLION
@@ -627,7 +629,7 @@ class Vn100Emulator:
     # Commands.
 
     def _receive(self, data: bytes, now_ns: int) -> None:
-        """Execute and answer the commands that `data` completes."""
+        """Execute and answer the commands that are complete after `data`."""
         self._received += data
         while (end := self._received.find(b"\n")) >= 0:
             line = bytes(self._received[: end + 1])
@@ -660,7 +662,7 @@ class Vn100Emulator:
             self._build_streams(now_ns)
 
     def _execute(self, sentence: Sentence, checksum: Checksum, now_ns: int) -> None:
-        """Execute a command and answer it. Raises UnitError."""
+        """Execute a command and send the answer. Raises UnitError."""
 
         def answer(*fields: str, at_ns: int = now_ns) -> None:
             self._line.write(build(sentence.command, *fields, checksum=checksum), at_ns)
@@ -711,7 +713,7 @@ class Vn100Emulator:
         except UnitError:
             self.registers.values[number] = before
             raise
-        # The answer is sent at the old speed.
+        # The answer is sent at the old baud rate.
         answer(fields[0], *echo)
         self._line.baud_rate = self.registers.integer(5)
 
@@ -744,7 +746,7 @@ class Vn100Emulator:
         self._then = now_ns + self._settings.boot_ns, lambda end_ns: self._start(end_ns, 0)
 
     def _start(self, now_ns: int, uptime_ns: int) -> None:
-        """Start from the flash, with the unit's clock at `uptime_ns`."""
+        """Start the unit from its flash, with the unit's clock at `uptime_ns`."""
         self.registers.load()
         self._line.baud_rate = self.registers.integer(5)
         self._sensors.restart()

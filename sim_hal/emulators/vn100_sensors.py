@@ -1,10 +1,10 @@
-"""The VN-100's measurement of a motion (frames, units, noise), and the messages that contain it.
+"""Measurements of an emulated VN-100 (frames, units, noise), and the messages that contain them.
 
-There are two noise profiles. "thesis" has uniform bounds on attitude and rate, as Sease 2013 ch. 5 takes them
-from the unit's data sheet. "datasheet" has white noise of the published densities at the filter windows of
-register 85, an error of the static attitude, and a gyro bias that is drawn at each start. The filters' group
-delay (half a window, 12.5 ms at 20 samples) is not modelled. Layout and number formats: VectorNav UM001
-v2.43 ch. 4 and 5.
+There are two noise profiles. The profile "thesis" has uniform noise of attitude and rate with the bounds of
+Sease 2013, chapter 5. The profile "datasheet" has white noise with the densities of the data sheet and the
+filter windows of register 85, a static attitude error, and a gyro bias that is drawn at each start. The group
+delay of the filters (half a window, 12.5 ms for 20 samples) is not modelled. The layouts and number formats
+are those of VectorNav UM001 v2.43, chapters 4 and 5.
 """
 
 from __future__ import annotations
@@ -22,24 +22,26 @@ from sim_hal.worlds.world import STANDARD_GRAVITY, BodyMotion
 
 IMU_RATE_HZ = 800
 GAUSS_PER_TESLA = 1e4
-_ROOT_BANDWIDTH = math.sqrt(0.5 * IMU_RATE_HZ)  # white noise sampled at 800 Hz fills 400 Hz
+_ROOT_BANDWIDTH = math.sqrt(0.5 * IMU_RATE_HZ)  # white noise sampled at 800 Hz has a bandwidth of 400 Hz
 
 _DRIFT_WITHOUT_GRAVITY = 0.01
-"""Random drift of the attitude in free fall (rad per sample)."""
+"""Standard deviation (rad per sample) of the attitude's random drift in free fall."""
 
 ProfileName = Literal["thesis", "datasheet", "none"]
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseProfile:
-    """Bounds of uniform noise, densities of white noise, and errors that are constant until the next start.
+    """Uniform noise, white noise, and errors that are constant until the next start of the unit.
 
     Attributes:
-        attitude_bound: bound of each vector component of a small rotation quaternion, body axes.
-        rate_bound: rad/s.
-        rate_density, field_density, acceleration_density: rad/s, T, m/s^2 per sqrt(Hz).
-        static_attitude: (3,) rad, standard deviations about north, east and down.
-        gyro_bias: rad/s, standard deviation of each axis.
+        attitude_bound: bound of each vector component of the attitude error's quaternion, body axes.
+        rate_bound: bound of the uniform rate noise, rad/s.
+        rate_density, field_density, acceleration_density: white noise densities, rad/s, T and m/s^2 per
+        sqrt(Hz).
+        static_attitude: standard deviations (3,) of the static attitude error about north, east and down,
+            rad.
+        gyro_bias: standard deviation of the gyro bias on each axis, rad/s.
     """
 
     attitude_bound: float = 0.0
@@ -74,13 +76,13 @@ PROFILES: dict[ProfileName, NoiseProfile] = {
 
 @dataclass(frozen=True, slots=True)
 class Vn100Sample:
-    """One sample, in the unit's own axes and units.
+    """One sample of the unit, in sensor axes and the unit's own units.
 
     Attributes:
-        quaternion: (4,) NED into sensor: the unit's q0..q3.
-        rate: (3,) rad/s.
-        mag: (3,) gauss.
-        accel: (3,) m/s^2, specific force.
+        quaternion: attitude (4,), NED into sensor, which the unit calls q0 to q3.
+        rate: rotation rate (3,), rad/s.
+        mag: magnetic field (3,), gauss.
+        accel: specific force (3,), m/s^2.
     """
 
     quaternion: FloatArray
@@ -90,12 +92,12 @@ class Vn100Sample:
 
     @property
     def matrix(self) -> FloatArray:
-        """The direction cosines (3, 3), NED into sensor."""
+        """Direction cosine matrix (3, 3), NED into sensor."""
         return attitude_matrix(self.quaternion)
 
     @property
     def yaw_pitch_roll(self) -> tuple[float, float, float]:
-        """The 3-2-1 Euler angles in degrees."""
+        """Yaw, pitch and roll (3-2-1 Euler angles), deg."""
         a = self.matrix
         yaw = math.atan2(a[0, 1], a[0, 0])
         pitch = -math.asin(min(1.0, max(-1.0, a[0, 2])))
@@ -114,14 +116,16 @@ class Sensors:
         gyro_bias: FloatArray,
         free_fall: bool = False,
     ) -> None:
-        """Take quaternions, sensor into body and NED into reference frame, and a bias (3,) rad/s.
+        """Create the sensors of a unit.
 
-        In `free_fall` the unit cannot find the vertical, so that its own attitude drifts at random.
+        `mounting` is the quaternion from sensor to body axes, `reference` that from NED to the reference
+        frame. `gyro_bias` (3,) is in rad/s. In `free_fall` the unit cannot measure the vertical, so its
+        attitude drifts at random.
         """
         self._rng = rng
         self._profile = profile
         self._to_sensor = attitude_matrix(conjugate(mounting))
-        # conj(mounting) (small q) reference is linear in q and in small, so a table costs two products only.
+        # conj(mounting) (small q) reference is linear in q and in small, so a table needs only two products.
         body = multiply(np.eye(4)[None, :], np.eye(4)[:, None])
         self._table = multiply(multiply(conjugate(mounting), body), reference).reshape(4, 16)
         self._fixed_bias = gyro_bias
@@ -131,7 +135,7 @@ class Sensors:
         self._scales: dict[tuple[int, ...], FloatArray] = {}
 
     def restart(self) -> None:
-        """Draw the errors that are constant until the next start."""
+        """Draw the errors that are constant until the next start of the unit."""
         draws = self._rng.standard_normal(6)
         self._bias = self._fixed_bias + self._profile.gyro_bias * draws[:3]
         static = np.array(self._profile.static_attitude)
@@ -174,12 +178,12 @@ class MessageData:
     """The data of all messages at one time.
 
     Attributes:
-        device_ns: since start.
-        sample: the measurement.
-        status: the VPE status word.
-        interval: s, since the previous output of the same kind, over which the deltas are formed.
-        temperature: degrees C.
-        pressure: kPa.
+        device_ns: unit's time since its start, ns.
+        sample: measured sample.
+        status: VPE status word.
+        interval: time since the previous output of the same kind, over which deltas are formed, s.
+        temperature: reported temperature, degrees C.
+        pressure: reported pressure, kPa.
     """
 
     device_ns: int
@@ -190,11 +194,11 @@ class MessageData:
     pressure: float
 
     def values(self, names: str) -> Values:
-        """Return the values of named quantities, separated by spaces."""
+        """Return the values of quantities whose names are separated by spaces."""
         return tuple(value for name in names.split() for value in _QUANTITIES[name][0](self))
 
     def text(self, names: str) -> list[str]:
-        """Return the values of named quantities as the unit prints them."""
+        """Return the values of named quantities as text in the unit's format."""
         quantities = (_QUANTITIES[name] for name in names.split())
         return [form % value for read, form in quantities for value in read(self)]
 
@@ -229,7 +233,7 @@ _QUANTITIES: Mapping[str, tuple[Callable[[MessageData], Values], str]] = {
     "delta_angle": (_vector(lambda now: np.degrees(now.sample.rate) * now.interval), "%+08.3f"),
     "delta_velocity": (_vector(lambda now: now.sample.accel * now.interval), "%+08.3f"),
 }
-"""Reader and ASCII format of each quantity; the deltas are in degrees and m/s."""
+"""Function and ASCII format of each quantity; delta angles are in degrees and delta velocities in m/s."""
 
 BINARY_FIELDS: Mapping[tuple[int, int], str] = {
     (0, 0): "time",
@@ -269,12 +273,12 @@ BINARY_FIELDS: Mapping[tuple[int, int], str] = {
     (4, 7): "linear_ned",
     (4, 8): "uncertainty",
 }
-"""Quantities by group bit and field bit, the numbers of `hal.drivers.vn100.protocol.FIELDS`."""
+"""Quantities by group bit and field bit, as in `hal.drivers.vn100.protocol.FIELDS`."""
 
 
 @dataclass(frozen=True, slots=True)
 class AsciiOutput:
-    """One kind of ASCII output: header after `$VN`, number in register 6, register that reads it, content."""
+    """An ASCII output, with header after `$VN`, number in register 6, its data register, and content."""
 
     header: str
     async_type: int
@@ -282,7 +286,7 @@ class AsciiOutput:
     quantities: str
 
     def length(self) -> int:
-        """Return the bytes of one sentence with an 8-bit checksum."""
+        """Return the length (bytes) of one sentence with an 8-bit checksum."""
         return len("$VN") + len(",".join([self.header, *_AT_REST.text(self.quantities)])) + len("*XX\r\n")
 
 
