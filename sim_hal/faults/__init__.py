@@ -1,6 +1,6 @@
-"""Fault injection at device level; faults that would have no effect are rejected.
+"""Fault injection at device level, which rejects faults that would have no effect.
 
-`catalogue` is the table of all faults, and `bench` the hardware that they act on. `schedule` parses and
-checks the faults of a flight and puts them on its time line. `host` injects faults into the flight process
-itself (workers, wall clock, disk).
+The module `catalogue` is the table of all faults, and `bench` describes the hardware that faults act on. The
+module `schedule` parses, checks and schedules the faults of a flight. The module `host` injects faults into
+the flight process itself (workers, wall clock, disk).
 """

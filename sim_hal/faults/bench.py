@@ -1,4 +1,4 @@
-"""The simulated hardware that faults act on, and the description of one kind of fault."""
+"""Simulated hardware that faults act on, and the description of a kind of fault."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import numpy as np
 
 from sim_hal.emulators.serial_line import SOUND, EmulatedSerialLine, HostEnd, LineFaults, PtyLine, Wire
 
-if TYPE_CHECKING:  # parsing faults needs no hardware
+if TYPE_CHECKING:  # only for types, because parsing faults needs no hardware
     from sim_hal.assembly import Hardware
 
 Removal = Callable[[], None]
-"""Removes a fault that has begun."""
+"""Function that removes a fault that has begun."""
 
 
 def no_removal() -> None:
-    """Remove nothing: the effect of the fault stays until something repairs it."""
+    """Do nothing; the effect of the fault lasts until the flight software repairs it."""
 
 
 def hold(part: object | None, attribute: str, value: object, sound: object) -> Removal:
-    """Set an attribute of a part until the fault is removed; a part that is not fitted is left alone."""
+    """Set an attribute of a device until the fault is removed; a device that is None is ignored."""
     if part is None:
         return no_removal
     setattr(part, attribute, value)
@@ -37,7 +37,7 @@ def hold(part: object | None, attribute: str, value: object, sound: object) -> R
 
 
 def all_of(removals: Sequence[Removal]) -> Removal:
-    """Return the removal of several faults together."""
+    """Return one function that removes several faults."""
 
     def remove() -> None:
         for removal in removals:
@@ -48,15 +48,15 @@ def all_of(removals: Sequence[Removal]) -> Removal:
 
 @dataclass(slots=True)
 class Bench:
-    """The parts that faults act on from outside the flight process.
+    """The devices that faults act on from outside the flight process.
 
     Attributes:
         line: serial line of the inertial unit.
-        now_ns: returns the simulation's time.
-        generator: random numbers of the faults.
-        host: host end of the line in memory; None for a pseudo-terminal.
-        flight_process: process identifier of the flight; None in lock-step.
-        gps_line: serial line of the GPS receiver, if one is fitted.
+        now_ns: function that returns the simulation time, ns.
+        generator: random generator of the faults.
+        host: host end of a serial line in memory, or None for a pseudo-terminal.
+        flight_process: process identifier of the flight process; None in lock-step.
+        gps_line: serial line of the GPS receiver, or None.
     """
 
     hardware: Hardware
@@ -69,7 +69,7 @@ class Bench:
     _on_wires: dict[int, list[LineFaults]] = field(default_factory=dict)
 
     def disturb(self, wire: Wire, faults: LineFaults) -> Removal:
-        """Add a fault to those of a wire."""
+        """Add faults to the present faults of a wire, and return their removal."""
         present = self._on_wires.setdefault(id(wire), [])
         present.append(faults)
         wire.faults = reduce(_combined, present, SOUND)
@@ -81,11 +81,11 @@ class Bench:
         return remove
 
     def after(self, seconds: float, action: Callable[[], None]) -> None:
-        """Run `action` after `seconds` of simulated time."""
+        """Run `action` after `seconds` s of simulated time."""
         self.hardware.faults.at(self.now_ns() + round(seconds * 1e9), action)
 
     def toggle(self, begin: Callable[[], Removal], period: float, share: float) -> Removal:
-        """Apply a fault intermittently: for `share` of each `period` s."""
+        """Apply a fault intermittently, during the fraction `share` of each period of `period` s."""
         removals: list[Removal] = []
         stopped = False
 
@@ -123,11 +123,11 @@ def _combined(a: LineFaults, b: LineFaults) -> LineFaults:
 
 Parameters = Mapping[str, float]
 Begin = Callable[[Bench, "FaultKind", Parameters], Removal]
-"""Applies a fault of a kind to the bench and returns its removal."""
+"""Function that applies a fault to the bench and returns the fault's removal."""
 
 
 def intermittently(begin: Begin) -> Begin:
-    """Return the intermittent form of a fault, with the parameters `period` (s) and `share`."""
+    """Return the intermittent form of a fault, whose parameters are `period` (s) and the fraction `share`."""
 
     def toggled(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
         return bench.toggle(lambda: begin(bench, fault, given), given["period"], given["share"])
@@ -136,7 +136,7 @@ def intermittently(begin: Begin) -> Begin:
 
 
 class Where(Enum):
-    """The kind of simulation in which a fault can occur."""
+    """Kind of simulation in which a fault can occur."""
 
     BOTH = "in lock-step and in real time"
     REALTIME = "in real time only"
@@ -148,11 +148,11 @@ class Parameter:
     """A numeric parameter of a fault.
 
     Attributes:
-        default: value if none is given; None for a parameter that is then drawn at random.
+        default: default value, or None for a parameter that is drawn at random by default.
         low, high: its bounds.
         unit: unit of default and bounds; empty for a number without unit.
-        whole: whether it must be a whole number.
-        choices: the allowed values; empty if all values between the bounds are allowed.
+        whole: whether the value must be an integer.
+        choices: allowed values, or empty if all values between the bounds are allowed.
     """
 
     default: float | None
@@ -163,13 +163,13 @@ class Parameter:
     choices: tuple[float, ...] = ()
 
     def accepts(self, value: float) -> bool:
-        """Return whether a value is allowed; NaN is not."""
+        """Return whether a parameter value is allowed; NaN is not."""
         if self.choices:
             return value in self.choices
         return self.low <= value <= self.high and not (self.whole and value % 1.0)
 
     def bounds(self) -> str:
-        """Return the allowed values in words."""
+        """Return a text that describes the allowed values."""
         unit = f" {self.unit}" if self.unit else ""
         if not self.choices:
             return f"{'a whole number ' if self.whole else ''}from {self.low:g} to {self.high:g}{unit}"
@@ -180,7 +180,7 @@ class Parameter:
             else:
                 runs.append([value])
         words = []
-        for run in runs:  # three or more consecutive values are written as a range
+        for run in runs:  # writes three or more consecutive values as a range
             words += [f"{run[0]:g} to {run[-1]:g}"] if len(run) > 2 else [f"{value:g}" for value in run]
         return f"one of {', '.join(words)}{unit}"
 
@@ -190,13 +190,14 @@ class FaultKind:
     """One kind of fault.
 
     Attributes:
-        device, kind: the two parts of its name "device: kind".
-        meaning: the effect, in words.
-        begin: applies it to the bench and returns its removal; None for faults in the flight process.
-        parameters: its parameters by name.
-        momentary: whether it has no duration; its effect then stays until something repairs it.
-        where: the kind of simulation in which it can occur.
-        adds: whether it may be present together with other faults of its device.
+        device, kind: two parts of the fault's name "device: kind".
+        meaning: description of the fault's effect.
+        begin: function that applies the fault to the bench and returns its removal, or None for faults in the
+            flight process.
+        parameters: parameters of the fault by name.
+        momentary: whether the fault has no duration and its effect lasts until repaired.
+        where: kind of simulation in which the fault can occur.
+        adds: whether the fault may be present together with other faults of the same device.
     """
 
     device: str
@@ -210,10 +211,10 @@ class FaultKind:
 
     @property
     def name(self) -> str:
-        """The fault as a user writes it."""
+        """Name of the fault as a user writes it, "device: kind"."""
         return f"{self.device}: {self.kind}"
 
     @property
     def part(self) -> str:
-        """The affected part: a coil with its bridge, and the inertial unit with its magnetometer, are one."""
+        """Affected part; a coil and its bridge are one part, and so are inertial unit and magnetometer."""
         return self.device.replace("bridge-", "coil-").replace("magnetometer", "imu")

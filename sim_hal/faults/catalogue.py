@@ -1,6 +1,6 @@
-"""The table of all faults: name, meaning, parameters, and effect on the emulated hardware.
+"""Table of all faults, with name, meaning, parameters, and effect on the emulated hardware.
 
-A fault that radiation causes in one register bit is an upset; the driver has to find and repair its effect.
+A bit flip that radiation causes in a register is called an upset. The driver must detect and repair an upset.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from sim_hal.faults.bench import (
     no_removal,
 )
 
-if TYPE_CHECKING:  # the table of faults needs no devices
+if TYPE_CHECKING:  # only for types, because the table of faults needs no devices
     from sim_hal.emulators.coil_circuit import EmulatedIna219
     from sim_hal.emulators.i2c_bus import I2cPart
     from sim_hal.emulators.pca9685 import EmulatedPca9685
@@ -58,7 +58,7 @@ def _fault(
 
 
 def _chance(default: float) -> Parameter:
-    return Parameter(default, 1e-6, 1.0)  # a probability of 0 would have no effect
+    return Parameter(default, 1e-6, 1.0)  # above 0, because a probability of 0 would have no effect
 
 
 def _delay(default: float) -> Parameter:
@@ -74,7 +74,7 @@ def _gain(default: float) -> Parameter:
 
 
 def _turns(period: float = 0.5) -> dict[str, Parameter]:
-    """Return period, and share of the period during which an intermittent fault is present."""
+    """Return the parameters of an intermittent fault: its period, and the fraction of it with the fault."""
     return {"period": Parameter(period, 0.05, 3600.0, "s"), "share": Parameter(0.5, 0.01, 0.99)}
 
 
@@ -83,7 +83,7 @@ def _nanoseconds(given: Parameters) -> int:
 
 
 def _held(attribute: str, value: Callable[[FaultKind, Parameters], object], sound: object) -> Begin:
-    """Return the fault that holds an attribute of a device, or of the cameras that `camera` names."""
+    """Return the fault that holds an attribute of a device, or of the cameras selected by `camera`."""
 
     def begin(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
         hardware = bench.hardware
@@ -151,14 +151,14 @@ def _unplugged(bench: Bench, *_: object) -> Removal:
 
 
 def _baud(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
-    # The speed changes even if the outputs do not fit the line: no command was given.
+    # The baud rate changes even if the line becomes too slow for the outputs, because no command checks it.
     with suppress(UnitError):
         bench.hardware.unit.change_baud_rate(round(given["rate"]), bench.now_ns())
     return no_removal
 
 
 def _stuck_samples(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
-    """Repeat the first sample, or only its magnetic field."""
+    """Repeat the first sample of the unit, or only the magnetic field of the first sample."""
     first: list[Vn100Sample] = []
 
     def alter(sample: Vn100Sample) -> Vn100Sample:
@@ -180,7 +180,7 @@ def _wrong_samples(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
 
 
 FULL_SCALE = 2.5
-"""Full scale of one magnetometer axis (gauss) [VN-100 data sheet]."""
+"""Full scale (gauss) of one magnetometer axis, from the VN-100 data sheet."""
 
 
 def _saturated_field(bench: Bench, *_: object) -> Removal:
@@ -196,11 +196,11 @@ def _false_field(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
     return hold(bench.hardware.unit, "alter", lambda sample: replace(sample, mag=sample.mag + false), None)
 
 
-# I2C bus and the parts on it.
+# Faults of the I2C bus and the chips on the bus.
 
 
 class AlteredPart:
-    """A part whose data are altered between it and the bus; it acknowledges as before."""
+    """A chip whose data are altered between chip and bus; the chip acknowledges as before."""
 
     def __init__(
         self,
@@ -208,14 +208,14 @@ class AlteredPart:
         write: Callable[[int, bytes], None] | None = None,
         read: Callable[[bytes], bytes] | None = None,
     ) -> None:
-        """Pass writes to `write` instead of the part, and bytes read from the part through `read`."""
+        """Pass writes to `write` instead of the chip, and data read from the chip through `read`."""
         self._part = part
         self._write = write or part.write
         self._read = read or (lambda data: data)
         self.answers = part.answers
 
     def write(self, address: int, data: bytes) -> None:
-        """Accept a write; a register pointer alone is never altered."""
+        """Process a write; a write of only a register pointer is not altered."""
         (self._part.write if len(data) == 1 else self._write)(address, data)
 
     def read(self, count: int) -> bytes:
@@ -224,7 +224,7 @@ class AlteredPart:
 
 
 def _parts(bench: Bench, device: str) -> Sequence[EmulatedPca9685 | EmulatedIna219 | EmulatedAds1115]:
-    """Return the parts of a device; none if the device is not fitted."""
+    """Return the I2C chips of a device, or an empty tuple if the device is not configured."""
     hardware = bench.hardware
     if device == "strings":
         return () if hardware.orbit.cells is None else hardware.orbit.cells.parts
@@ -279,11 +279,11 @@ def _stretched(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
 
 
 def _part_faults(device: str) -> tuple[FaultKind, ...]:
-    """Return the faults that PWM chip and current monitor share."""
-    low = "it stretches the clock beyond the bus's time-out, with this probability"
+    """Return the faults that both the PWM chip and the current monitor can have."""
+    low = "the chip stretches the clock beyond the bus timeout, with this probability"
     flips = "each bit read or written flips with this probability"
-    lost = "its registers return to their power-on values"
-    off = "no power: nothing acknowledges, the registers are lost"
+    lost = "the chip's registers return to their power-on values"
+    off = "no power: the chip does not acknowledge and its registers are lost"
     refused = intermittently(_refused)
     return (
         _fault(f"{device}: off", off, _parts_off),
@@ -320,7 +320,7 @@ def _stuck_monitor(bench: Bench, *_: object) -> Removal:
     if monitor is None:
         return no_removal
     monitor.frozen = {number: monitor.register(number) for number in range(6)}
-    monitor.frozen[2] |= 0b10  # keep the conversion-ready flag set
+    monitor.frozen[2] |= 0b10  # keeps the conversion-ready flag set
     return monitor.frozen.clear
 
 
@@ -348,9 +348,9 @@ _SET_UP = (MODE1, MODE2, PRE_SCALE)
 _OUTPUTS = tuple(range(LED0_ON_L, LED0_ON_L + 4 * CHANNELS))
 _MONITOR = (CONFIG, CALIBRATION)
 _UNIT = (6, 7, 75)
-"""Registers of the unit's stream: type of sentence, its rate, and binary packet."""
+"""Registers that set the unit's outputs: sentence type, sentence rate, and binary packet."""
 _MAX_FIELDS = 11
-"""Fields of register 75: ports, divisor, groups, and one word for each of eight groups."""
+"""Number of fields of register 75: ports, divisor, groups, and one word for each of eight groups."""
 
 
 def _given_or_drawn(bench: Bench, given: Parameters, name: str, values: Sequence[int]) -> int:
@@ -358,7 +358,7 @@ def _given_or_drawn(bench: Bench, given: Parameters, name: str, values: Sequence
 
 
 def _upset_pwm(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
-    # Uniform draws over all registers would seldom select the three that configure the chip.
+    # A uniform draw over all registers would rarely select one of the three that configure the chip.
     among = _SET_UP if bench.generator.random() < 0.5 else _OUTPUTS
     register = _given_or_drawn(bench, given, "register", among)
     bench.hardware.pwm.flip(register, _given_or_drawn(bench, given, "bit", range(8)))
@@ -387,7 +387,7 @@ def _upset(name: str, begin: Begin, registers: tuple[int, ...], bits: int, meani
     return _fault(name, f"a bit of a register flips{meaning}", begin, given, momentary=True, adds=True)
 
 
-# Coils, cameras, GPS receiver, solar strings, and the flight process.
+# Faults of coils, cameras, GPS receiver, solar strings, and flight process.
 
 
 def _coil(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
@@ -417,9 +417,9 @@ def _coil_faults(axis: str) -> tuple[FaultKind, ...]:
 
 
 def _frame_faults(device: str, *without: str, **parameters: Parameter) -> tuple[FaultKind, ...]:
-    """Return the faults of the star camera or of the horizon cameras; all of them have `parameters`."""
+    """Return the faults of the star camera or the horizon cameras, each with `parameters`."""
     rows: tuple[tuple[str, str, Begin, dict[str, Parameter]], ...] = (
-        ("off", "ignores triggers, delivers no frame", _shown, {}),
+        ("off", "the camera ignores triggers and delivers no frame", _shown, {}),
         ("black", "frames without light", _shown, {}),
         ("saturated", "saturated frames", _shown, {}),
         ("blinded", "the Sun's stray light over the whole frame", _shown, {}),
@@ -427,7 +427,7 @@ def _frame_faults(device: str, *without: str, **parameters: Parameter) -> tuple[
         ("torn", "upper part of the previous frame, lower part of this one", _shown, {}),
         ("garbage", "random pixels", _shown, {}),
         ("wrong", "rows in the opposite order", _shown, {}),
-        ("slow", "one trigger of n gives a frame", _thinned, {"n": _count(3.0, 2.0, 1000.0)}),
+        ("slow", "only every n-th trigger gives a frame", _thinned, {"n": _count(3.0, 2.0, 1000.0)}),
         ("delayed", "frames arrive later, s", _late, {"delay": _delay(3.0)}),
         ("intermittent", "off intermittently", intermittently(_shown), _turns(6.0)),
     )
@@ -480,10 +480,10 @@ def _stopped(bench: Bench, *_: object) -> Removal:
 
 def _worker_faults(device: str) -> tuple[FaultKind, ...]:
     return (
-        _fault(f"{device}: nan", "all numbers of its result are NaN", None),
-        _fault(f"{device}: exception", "it raises an exception", None),
-        _fault(f"{device}: endless", "it never returns", None),
-        _fault(f"{device}: killed", "its process is killed during a job", None),
+        _fault(f"{device}: nan", "all numbers of the worker's result are NaN", None),
+        _fault(f"{device}: exception", "the worker raises an exception", None),
+        _fault(f"{device}: endless", "the worker never returns", None),
+        _fault(f"{device}: killed", "the worker's process is killed during a job", None),
         _fault(f"{device}: slow", "results arrive later, s", None, {"delay": _delay(1.5)}),
     )
 
@@ -505,7 +505,7 @@ _ALL = (
     _fault("imu: stuck", "valid packets, constant values", _stuck_samples),
     _fault("imu: garbage", "random bytes replace its own", _on_line, adds=True),
     _fault("imu: wrong", "valid packets, wrong values", _wrong_samples, _WRONG),
-    _fault("imu: slow", "one packet of n arrives", _on_line, {"n": _count(8.0, 2.0, 1000.0)}, adds=True),
+    _fault("imu: slow", "one of n packets arrives", _on_line, {"n": _count(8.0, 2.0, 1000.0)}, adds=True),
     _fault("imu: delayed", "every byte arrives later, s", _on_line, {"delay": _delay(0.2)}, adds=True),
     _fault("imu: intermittent", "silent intermittently", intermittently(_on_line), _turns(), adds=True),
     _fault("imu: bits", _EACH_BIT, _on_line, {"chance": _chance(1e-3)}, adds=True),
@@ -513,13 +513,13 @@ _ALL = (
         "imu: cut", "packets lose bytes with this probability", _on_line, {"chance": _chance(0.3)}, adds=True
     ),
     _fault("imu: reset", "restarts from its saved settings", _unit_reset, momentary=True),
-    _fault("imu: baud", "its baud rate changes", _baud, {"rate": _RATE}, momentary=True),
+    _fault("imu: baud", "the unit's baud rate changes", _baud, {"rate": _RATE}, momentary=True),
     _upset("imu: upset", _upset_unit, _UNIT, FIELD_BITS * _MAX_FIELDS, _EACH_FIELD),
-    _fault("magnetometer: stuck", "the same field for ever", _stuck_samples),
+    _fault("magnetometer: stuck", "a constant field", _stuck_samples),
     _fault("magnetometer: saturated", "all axes at full scale", _saturated_field),
     _fault("magnetometer: false", "a constant field is added, T", _false_field, {"field": _FIELD}),
     *_part_faults("pwm"),
-    _fault("pwm: stuck", "it acknowledges, but its outputs do not change", _stuck_pwm),
+    _fault("pwm: stuck", "the chip acknowledges, but its outputs do not change", _stuck_pwm),
     _fault("pwm: delayed", "writes take effect later, s", _delayed_pwm, {"delay": _delay(0.2)}),
     _fault(
         "pwm: wrong", "a register upset: wrong PWM frequency", _wrong_frequency, momentary=True, adds=True
@@ -527,7 +527,7 @@ _ALL = (
     _upset("pwm: upset", _upset_pwm, (*_SET_UP, *_OUTPUTS), 8),
     *_part_faults("monitor"),
     _fault("monitor: stuck", "always the same conversion", _stuck_monitor),
-    _fault("monitor: delayed", "it reports old measurements, s", _old_conversions, {"delay": _delay(2.0)}),
+    _fault("monitor: delayed", "old measurements are read, s", _old_conversions, {"delay": _delay(2.0)}),
     _fault("monitor: wrong", "measured values are multiplied by gain", _multiplied, {"gain": _gain(2.0)}),
     _upset("monitor: upset", _upset_monitor, _MONITOR, 16),
     _fault("bus: off", "no part acknowledges", _silent_bus, adds=True),
@@ -539,11 +539,11 @@ _ALL = (
     _fault("bus: intermittent", _LOW_AT_TIMES, intermittently(_hanging_bus), _turns(), adds=True),
     *(fault for axis in "xyz" for fault in _coil_faults(axis)),
     *_frame_faults("camera"),
-    _fault("gps: off", "no power; afterwards set-up and satellites are lost", _gps_off),
+    _fault("gps: off", "no power; afterwards configuration and satellites are lost", _gps_off),
     _fault("gps: silent", "no byte arrives", _on_line, adds=True),
     _fault("gps: no-fix", "no satellite is received", _held("blind", lambda *_: True, False)),
     _fault("gps: stuck", "the same epoch repeatedly", _frozen),
-    _fault("gps: false", "a valid fix at a false place, m away", _false_position, {"distance": _DISTANCE}),
+    _fault("gps: false", "a valid fix with a wrong position, m", _false_position, {"distance": _DISTANCE}),
     _fault("gps: clock", "a valid fix with the wrong time, s", _wrong_time, {"seconds": _SECONDS}, adds=True),
     _fault("gps: garbage", "random bytes replace its own", _on_line, adds=True),
     _fault("gps: bits", _EACH_BIT, _on_line, {"chance": _chance(1e-3)}, adds=True),
@@ -552,11 +552,11 @@ _ALL = (
     _fault("strings: off", "no power: no converter acknowledges", _parts_off),
     _fault(
         "strings: dead",
-        "this string gives no current; 0: none does",
+        "this string gives no current; 0: all strings",
         _dead,
         {"string": _count(1.0, 0.0, 4.0)},
     ),
-    _fault("strings: stuck", "the same currents for ever", _frozen),
+    _fault("strings: stuck", "constant currents", _frozen),
     _fault("strings: wrong", "all currents are multiplied by gain", _multiplied, {"gain": _gain(0.5)}),
     _fault("strings: garbage", "reads return random bytes", _random_reads),
     # `camera` is the number of a camera in the order of the configuration; 0 means all.
@@ -582,7 +582,7 @@ CATALOGUE: dict[str, FaultKind] = {kind.name: kind for kind in _ALL}
 
 
 def listing() -> str:
-    """Return every fault with its parameters and meaning, one fault to a line."""
+    """Return a text that lists every fault with its parameters and meaning, one fault per line."""
     lines = []
     for kind in CATALOGUE.values():
         given = ", ".join(

@@ -1,7 +1,7 @@
-"""Faults inside the flight process: its workers, wall clock and disk, and the configuration file.
+"""Faults inside the flight process, which affect workers, wall clock, disk and configuration file.
 
-The application passes clock, workers and log files through this module only when a simulation requests such
-faults. The wrappers apply each fault in its window of mission time, in lock-step and in real time.
+The application wraps clock, workers and log files by this module only if a simulation requests such faults.
+The wrappers apply each fault during the fault's window of mission time, in lock-step and in real time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sim_hal.settings import Simulation
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A job of a worker: its function as MODULE:NAME, its argument, and its fault, empty for none."""
+    """A worker's job, with its function as MODULE:NAME, its argument, and its fault (empty for none)."""
 
     function: str
     argument: Any
@@ -51,7 +51,7 @@ def perform(task: Task) -> Any:
 
 
 def without_numbers(value: Any) -> Any:
-    """Return a value with every float replaced by NaN."""
+    """Return a copy of `value` with every float replaced by NaN."""
     if isinstance(value, float):
         return float("nan")
     if isinstance(value, np.ndarray) and value.dtype.kind == "f":
@@ -65,15 +65,15 @@ def without_numbers(value: Any) -> Any:
 
 
 DEVICES = ("planner", "vision", "clock", "disk")
-"""The devices whose faults act inside the flight process."""
+"""Devices whose faults act inside the flight process."""
 
 
 class ProcessFaults:
-    """The faults inside one flight process; none occurs before `begin`.
+    """The faults inside a flight process; faults occur only after `begin`.
 
     Attributes:
-        realtime: whether jobs run in processes of their own, which can hang and be killed.
-        now_ns: returns the flight's time.
+        realtime: whether jobs run in separate processes, which can hang and be killed.
+        now_ns: function that returns the flight's time, ns.
     """
 
     def __init__(self, faults: Sequence[ScheduledFault], clock: Clock, realtime: bool) -> None:
@@ -88,7 +88,7 @@ class ProcessFaults:
         self._epoch_ns = epoch_ns
 
     def active(self, device: str) -> ScheduledFault | None:
-        """Return the fault that a device has now."""
+        """Return the present fault of a device, or an empty text."""
         if self._epoch_ns is None:
             return None
         now = (self.now_ns() - self._epoch_ns) * 1e-9
@@ -98,36 +98,36 @@ class ProcessFaults:
         return None
 
     def concerns(self, *devices: str) -> bool:
-        """Return whether any of these devices has a fault in this flight."""
+        """Return whether any of `devices` has a fault in this flight."""
         return any(fault.kind.device in devices for fault in self._faults)
 
     def clock(self) -> Clock:
-        """Return the clock of the flight process, with its faults."""
+        """Return the clock of the flight process with the faults of the wall clock."""
         return cast("Clock", _SteppedClock(self._clock, self)) if self.concerns("clock") else self._clock
 
     def opener(self, opener: Callable[[Path], Any]) -> Callable[[Path], Any]:
-        """Return an opener of files on a disk that may fail."""
+        """Return a function that opens log files on a disk that may fail."""
         return (lambda path: _FailingFile(opener, path, self)) if self.concerns("disk") else opener
 
     def workers(self, specs: Sequence[Any]) -> list[Any]:
-        """Return workers whose function may fail."""
+        """Return workers whose functions may fail."""
         if not self.concerns("planner", "vision"):
             return list(specs)
         return [dataclasses.replace(spec, function=perform) for spec in specs]
 
     def jobs(self, runner: Any, specs: Sequence[Any], result: Callable[..., Any]) -> Any:
-        """Return a runner that passes the faults on to the workers; `result` makes a job's result."""
+        """Return a job runner that passes the faults to the workers; `result` makes the result of a job."""
         return _FaultyRunner(runner, specs, result, self) if self.concerns("planner", "vision") else runner
 
 
 def host_faults(section: Simulation, clock: Clock, realtime: bool) -> ProcessFaults | None:
-    """Return the faults inside the flight process; None if it has none."""
+    """Return the faults of a section that act inside the flight process; None if it has none."""
     faults = ProcessFaults(schedule(section.faults), clock, realtime)
     return faults if faults.concerns(*DEVICES) else None
 
 
 def corrupted_by(faults: Sequence[str], text: str, seed: int | None) -> str:
-    """Return a configuration's text after any `config: corrupted` among the faults."""
+    """Return the text of a configuration after the `config: corrupted` faults among `faults`."""
     for fault in map(parse, faults):
         if fault.kind.name == "config: corrupted":
             text = corrupted(text, round(fault.parameters["bytes"]), seed or 1)
@@ -135,7 +135,7 @@ def corrupted_by(faults: Sequence[str], text: str, seed: int | None) -> str:
 
 
 def corrupted(text: str, count: int, seed: int) -> str:
-    """Return a file's text with one bit flipped in each of `count` of its bytes."""
+    """Return the text of a file with one bit flipped in each of `count` random bytes."""
     data = bytearray(text.encode())
     rng = np.random.default_rng([seed, count, len(data)])
     for index in rng.choice(len(data), min(count, len(data)), replace=False):
@@ -144,7 +144,7 @@ def corrupted(text: str, count: int, seed: int) -> str:
 
 
 class _SteppedClock:
-    """A clock whose UTC label may step; its monotonic time is unchanged."""
+    """A clock whose UTC label may step, while its monotonic time is unchanged."""
 
     def __init__(self, clock: Clock, faults: ProcessFaults) -> None:
         self._clock = clock
@@ -159,7 +159,7 @@ class _SteppedClock:
 
 
 class _FailingFile:
-    """A file of the log on a disk that may be full or failing."""
+    """A log file on a disk that may be full or failing."""
 
     def __init__(self, opener: Callable[[Path], Any], path: Path, faults: ProcessFaults) -> None:
         self._faults = faults
@@ -182,7 +182,7 @@ class _FailingFile:
 
 @dataclass(slots=True)
 class _ModelledOutcome:
-    """The outcome of a job that no worker answers; its runner reports it at `due_ns`."""
+    """Outcome of a job that no worker answers, which the job runner reports at `due_ns`."""
 
     due_ns: int
     outcome: str
@@ -191,7 +191,7 @@ class _ModelledOutcome:
 
 
 class _FaultyRunner:
-    """A JobRunner that wraps another and adds faults."""
+    """A JobRunner that wraps another JobRunner and adds faults."""
 
     def __init__(
         self, runner: Any, specs: Sequence[Any], result: Callable[..., Any], faults: ProcessFaults
@@ -209,7 +209,7 @@ class _FaultyRunner:
         fault = self._faults.active(worker)
         kind = "" if fault is None else fault.kind.kind
         spec, now_ns, realtime = self._specs[worker], self._faults.now_ns(), self._faults.realtime
-        # In lock-step this process runs the jobs itself, so these outcomes are modelled.
+        # In lock-step the flight process runs the jobs itself, so a hung or killed worker is modelled.
         if kind == "endless" and not realtime:
             text = f"no result within {spec.timeout_ns * 1e-9:g} s"
             self._modelled[worker] = _ModelledOutcome(now_ns + spec.timeout_ns, "timed-out", text, now_ns)

@@ -1,8 +1,9 @@
-"""The grammar of faults, and the check and scheduling of the faults of a flight.
+"""Grammar of faults, and the check and scheduling of the faults of a flight.
 
-A fault is written `DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]`. Seconds are of mission time.
-Without `@` a fault begins at 0, without `for` it lasts to the end. In the `simulation` section of a
-configuration the same fault is written `{fault: 'imu: silent', at: 120, for: 5}`.
+A fault is written `DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]`. Both times are in seconds,
+and `@` gives the mission time. A fault without `@` begins at 0, and a fault without `for` lasts to the end.
+In the `simulation` section of a configuration the same fault is written `{fault: 'imu: silent', at: 120, for:
+5}`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from sim_hal.settings import FaultEntry
 GRAMMAR = "DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]"
 
 LONGEST = 1e9
-"""Latest begin and longest duration of a fault (s): thirty years, which fits into 64 bits of ns."""
+"""Latest begin and longest duration (s) of a fault, thirty years, which fit into 64 bits of ns."""
 
 _FAULT = re.compile(
     r"\s*(?P<name>[\w-]+\s*:\s*[\w-]+)\s*(\((?P<given>[^()]*)\))?"
@@ -33,7 +34,7 @@ _FAULT = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class ScheduledFault:
-    """A fault that begins at `at` s of mission time and lasts `span` s; None for a fault without end."""
+    """A fault that begins at mission time `at` (s) and lasts `span` s, or to the end if `span` is None."""
 
     kind: FaultKind
     at: float
@@ -42,7 +43,7 @@ class ScheduledFault:
 
     @property
     def end(self) -> float:
-        """The end (s): the beginning for a momentary fault, infinity for a fault without end."""
+        """Mission time (s) of the fault's end, which is infinity for a fault without end."""
         if self.kind.momentary:
             return self.at
         return math.inf if self.span is None else self.at + self.span
@@ -70,7 +71,7 @@ def parse(text: str) -> ScheduledFault:
     at = _seconds(found["at"], "@", text) if found["at"] is not None else 0.0
     span = _seconds(found["span"], "for", text) if found["span"] is not None else None
     if span == 0.0:
-        raise UsageError(f"fault {text!r}: `for 0` is an empty duration: give more, or leave `for` out")
+        raise UsageError(f"fault {text!r}: `for 0` is an empty duration: give more, or omit `for`")
     values = {name: value.default for name, value in known.parameters.items() if value.default is not None}
     for word in filter(None, (word.strip() for word in (found["given"] or "").split(","))):
         name, equals, value = (part.strip() for part in word.partition("="))
@@ -104,7 +105,7 @@ def _number(word: str, what: str, text: str) -> float:
 
 
 def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
-    """Read the faults of a `simulation` section. Raises UsageError naming the entry."""
+    """Parse the faults of a `simulation` section. Raises UsageError that names the entry."""
     read = []
     for number, entry in enumerate(entries):
         key = f"simulation.faults[{number}]"
@@ -125,9 +126,10 @@ def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
 
 
 def entries(texts: Sequence[str]) -> tuple[FaultEntry, ...]:
-    """Return faults of the command line as those of a section. Raises UsageError for an invalid fault.
+    """Return the command line's faults as entries of a `simulation` section.
 
-    Faults that only the command line can inject are left out: they were applied to the text already.
+    Faults that only the command line can inject are omitted, because they have already been applied to the
+    configuration's text. Raises UsageError for an invalid fault.
     """
     faults = map(parse, texts)
     return tuple(
@@ -136,7 +138,7 @@ def entries(texts: Sequence[str]) -> tuple[FaultEntry, ...]:
 
 
 def scheduled(entries: Sequence[FaultEntry], realtime: bool) -> tuple[ScheduledFault, ...]:
-    """Read a section's faults for this kind of simulation. Raises UsageError for an impossible fault."""
+    """Parse the faults of a section for lock-step or real time. Raises UsageError for an impossible fault."""
     faults = schedule(entries)
     for fault in faults:
         if fault.kind.where is Where.REALTIME and not realtime:
@@ -164,7 +166,7 @@ _SECTIONS = {
     "strings": "solar_strings",
     "wide": "wide_cameras",
 }
-"""The optional configuration section of each device that can be absent."""
+"""Optional configuration section of each device that can be absent."""
 
 
 def fitted(device: str, config: Config) -> bool:
@@ -176,7 +178,7 @@ def fitted(device: str, config: Config) -> bool:
 
 
 def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tuple[ScheduledFault, ...]:
-    """Read the faults of a flight of `config`. Raises UsageError for a fault without effect."""
+    """Parse and check the faults of a flight. Raises UsageError for a fault without effect."""
     faults = scheduled(entries, realtime)
     for fault in faults:
         if fault.at >= config.duration:

@@ -1,1 +1,1 @@
-"""Emulated devices in a process of their own, in real time."""
+"""Emulated devices that run in a separate process in real time."""

@@ -1,8 +1,9 @@
-"""The link to `sim_hal.serving.server`: one line of JSON per message, over a Unix socket.
+"""Client of the device server `sim_hal.serving.server`, with one line of JSON per message over a Unix socket.
 
-It uses the standard library only and imports quickly, because the guardian, which must start at once and
-without numpy, opens the emulated bus through `open_bus`. `multiprocessing.connection` would delay the
-guardian by tens of milliseconds; it also blocks on a partial message and unpickles the data it reads.
+This module uses only the standard library and imports quickly, because the guardian opens the emulated bus
+through `open_bus` and must start at once and without numpy. `multiprocessing.connection` is not used because
+it would delay the guardian by tens of milliseconds, blocks on a partial message and unpickles the data that
+it reads.
 """
 
 from __future__ import annotations
@@ -19,28 +20,28 @@ from collections.abc import Sequence
 from typing import Any
 
 _ANSWER_S, _FIRST_ANSWER_S, _FIRST_S = 0.1, 5.0, 2.0
-"""Time-out of an answer (s); time-out while the server may still be starting (s); length of that time (s)."""
+"""Timeout of an answer (s), timeout (s) while the server may be starting, and time (s) of the start."""
 
 
 def pack(message: Any) -> bytes:
-    """Return a message as bytes."""
+    """Return a message as one line of JSON."""
     return json.dumps(message, separators=(",", ":")).encode() + b"\n"
 
 
 class Inbox:
-    """Splits received bytes into messages."""
+    """Decoder that splits received bytes into messages."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def take(self, chunk: bytes) -> list[Any]:
-        """Return the messages that `chunk` completes, oldest first."""
+        """Return the messages that are complete after `chunk`, oldest first."""
         *lines, self._rest = (self._rest + chunk).split(b"\n")
         return [json.loads(line) for line in lines]
 
 
 class DeviceLink:
-    """One connection to the server."""
+    """One connection to the device server."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -56,11 +57,11 @@ class DeviceLink:
         self._numbers = itertools.count(1)
 
     def fileno(self) -> int:
-        """Return the socket's descriptor, for select."""
+        """Return the file descriptor of the socket, for `select`."""
         return self._line.fileno()
 
     def send(self, name: str, *arguments: Any) -> int:
-        """Send a request; return its number."""
+        """Send a request and return the request's number."""
         if self._patient_until is not None and time.monotonic() > self._patient_until:
             self._patient_until = None
             self._line.settimeout(_ANSWER_S)
@@ -88,7 +89,7 @@ class DeviceLink:
 
 
 class RemoteI2cBus:
-    """An I2cBus whose parts are in the server process. It is safe for several threads."""
+    """An I2cBus whose chips are in the server process. The bus is safe for several threads."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._link = DeviceLink(path)
@@ -99,7 +100,7 @@ class RemoteI2cBus:
         with self._lock:
             try:
                 number = self._link.send(name, *arguments)
-                # Skip answers to requests that have timed out.
+                # Answers to requests that have timed out are skipped.
                 while (answer := self._link.receive())[0] != number:
                     pass
             except TimeoutError as error:
@@ -110,7 +111,7 @@ class RemoteI2cBus:
         return result
 
     def write_byte(self, address: int, value: int) -> None:
-        """Write one byte without a register."""
+        """Write one byte without a register address."""
         self.call("write_byte", address, value)
 
     def read_byte_data(self, address: int, register: int) -> int:
@@ -135,5 +136,5 @@ class RemoteI2cBus:
 
 
 def open_bus(where: str) -> RemoteI2cBus:
-    """Return the emulated bus behind the socket `where`; the guardian calls this."""
+    """Return the emulated bus of the server at the socket `where`, for the guardian."""
     return RemoteI2cBus(where)

@@ -1,13 +1,11 @@
-"""`sim_hal emulate i2c`: serves the coils' I2C bus to programs that open /dev/i2c-N themselves.
+"""Command `sim_hal emulate i2c`, which serves the coils' I2C bus to programs that open /dev/i2c-N.
 
 Programs reach the bus through a preload library (`i2c_preload.c`) rather than a CUSE device. A CUSE device
 needs a kernel module, its device node and the right to use both, which containers and shared machines lack.
-The library needs a C compiler once for each version. Programs that are linked statically, or set-user-id, do
-not load it.
-
-The library sends requests over a Unix socket. A request is its length and one of three kinds of content; an
-answer is an errno, a length and data. All numbers are in the machine's own byte order, because both ends are
-on one machine.
+Each version of the library is compiled once by a C compiler. Programs that are linked statically or run
+set-user-id do not load the library. The library sends requests over a Unix socket. A request consists of its
+length and one of three kinds of content. An answer consists of an errno, a length and data. All numbers are
+in native byte order, because both ends are on one machine.
 """
 
 from __future__ import annotations
@@ -49,7 +47,10 @@ _COMPILERS = ("cc", "gcc", "clang")
 
 
 def library() -> Path:
-    """Return the compiled library, from the user's cache if it is there. Raises UsageError."""
+    """Return the path of the compiled library in the user's cache folder.
+
+    Raises UsageError if the library cannot be compiled or written.
+    """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "knightcube"
     text = SOURCE.read_bytes()
     path = folder / f"i2c-preload-{os.uname().machine}-{hashlib.sha256(text).hexdigest()[:16]}.so"
@@ -83,11 +84,11 @@ _SMBUS_HEAD = struct.Struct("=?BIH")
 _MESSAGE_HEAD = struct.Struct("=HHH")
 _READ = 0x0001
 _UNSUPPORTED = 0x0410
-"""Flags of a message that are not supported: ten-bit address, length sent by the part."""
+"""Message flags that are not supported: ten-bit address, and a length sent by the chip."""
 
 
 class I2cServer:
-    """Answers the requests of programs that open /dev/i2c-N."""
+    """Server for the requests of programs that open /dev/i2c-N."""
 
     def __init__(self, bus: EmulatedI2cBus, path: Path) -> None:
         """Listen on a new socket at `path`."""
@@ -100,7 +101,7 @@ class I2cServer:
         self._received: dict[socket.socket, bytearray] = {}
 
     def serve(self, wait: float) -> None:
-        """Answer the requests of the next `wait` s."""
+        """Answer the requests that arrive during the next `wait` s."""
         for key, _ in self._selector.select(wait):
             line = key.fileobj
             assert isinstance(line, socket.socket)
@@ -155,7 +156,7 @@ class I2cServer:
 
 
 def _messages(request: bytes) -> list[Message]:
-    """Return the messages of a request. Raises OSError for unsupported flags."""
+    """Return the I2C messages of a request. Raises OSError for unsupported flags."""
     messages, at = [], 2
     for _ in range(request[1]):
         address, flags, length = _MESSAGE_HEAD.unpack_from(request, at)
@@ -174,11 +175,11 @@ _LONGEST_WAIT_S = 0.05
 
 
 def emulate(options: argparse.Namespace) -> int:
-    """Serve until the program ends, or without a program until SIGINT, SIGTERM or the duration's end."""
+    """Serve the bus until the program ends, or without a program until a signal or the duration's end."""
     config = configuration.load(options.config)
     text = options.config.read_text(encoding="utf-8")
     section = configuration.simulation_section(text, str(options.config), Simulation)
-    if section is None:  # the configuration of a board: its coils have the configured values
+    if section is None:  # a board's configuration without simulation: the coils have the configured values
         section = Simulation(release=Release(q2=0.0))
     coils = assemble_coils(config, section, np.random.default_rng(options.seed), SystemClock().now_ns)
     with tempfile.TemporaryDirectory(prefix="knightcube-i2c-") as folder:
@@ -208,7 +209,7 @@ def emulate(options: argparse.Namespace) -> int:
 def _run_program(
     server: I2cServer, program: list[str], environment: Mapping[str, str], duration: float | None
 ) -> int:
-    """Run a program with the server; return its exit status as a shell does."""
+    """Run a program with the server, and return the exit status of the program as a shell does."""
     try:
         process = subprocess.Popen(program, env={**os.environ, **environment})
     except OSError as error:
@@ -221,7 +222,7 @@ def _run_program(
 
 
 def _serve(server: I2cServer, process: subprocess.Popen[bytes] | None, duration: float | None) -> None:
-    """Answer requests until the process, the duration or a signal ends it."""
+    """Answer requests until the process ends, the duration is over or a signal arrives."""
     clock = SystemClock()
     end_ns = None if duration is None else clock.now_ns() + round(duration * SECOND_NS)
     with stop_signals() as stopped:
@@ -233,7 +234,7 @@ def _serve(server: I2cServer, process: subprocess.Popen[bytes] | None, duration:
 
 @contextmanager
 def stop_signals() -> Iterator[threading.Event]:
-    """Give an event that SIGINT and SIGTERM set; restore the previous handlers afterwards."""
+    """Yield an event that SIGINT and SIGTERM set, and restore the previous handlers afterwards."""
     stopped = threading.Event()
 
     def stop(_signal: int, _frame: FrameType | None) -> None:

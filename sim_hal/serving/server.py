@@ -1,8 +1,9 @@
-"""Simulated hardware in real time, in a process of its own that survives the flight process.
+"""Server of simulated hardware in real time, in a process that survives the flight process.
 
-The VN-100 is served on a pseudo-terminal. The I2C bus and the camera answer on a Unix socket, one request
-after the other on each connection (`sim_hal.rig` is the other end); the pixels of a frame pass through a file
-in the folder of the socket. A helper process renders the frames, so that the devices keep time.
+The VN-100 is served on a pseudo-terminal. The I2C bus and the cameras answer requests on a Unix socket, whose
+client is `sim_hal.rig`. Each connection is answered one request after the other. The pixels of a frame are
+passed in a file in the folder of the socket. Another process renders the frames, so that the rendering does
+not delay the devices.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ _renderer: list[StarRenderer] = []
 
 
 def _prepare_renderer(camera: Camera | None, sky: SkySection, seed: int) -> None:
-    """Load the sky once in the rendering process, which ends with the server."""
+    """Load the star catalogue once in the rendering process, which ends with the server."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if camera is not None:
@@ -68,7 +69,7 @@ def _render(sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Seq
 
 
 class _DeviceClient:
-    """The connection of a flight process's bus or camera."""
+    """Connection of a flight process to its bus or to a camera."""
 
     def __init__(self, line: socket.socket) -> None:
         self.line = line
@@ -76,7 +77,7 @@ class _DeviceClient:
         self._inbox = Inbox()
 
     def requests(self) -> list[Any] | None:
-        """Return the complete requests received; None after the client has disconnected."""
+        """Return the complete requests received, or None after the client has disconnected."""
         try:
             chunk = self.line.recv(65536)
         except ConnectionError:
@@ -84,7 +85,7 @@ class _DeviceClient:
         return self._inbox.take(chunk) if chunk else None
 
     def answer(self, message: Any) -> None:
-        """Send a message; a client that has ended or does not read is ignored."""
+        """Send a message to the client; a client that has ended or does not read is ignored."""
         try:
             self.line.sendall(pack(message))
         except OSError:
@@ -92,7 +93,7 @@ class _DeviceClient:
 
 
 class DeviceServer:
-    """Serves the devices of one configuration until stopped."""
+    """Server of the devices of one configuration."""
 
     def __init__(self, config: Config, section: Simulation, folder: Path) -> None:
         self._clock = SystemClock()
@@ -132,11 +133,11 @@ class DeviceServer:
         self.gps_device = None if self._gps_pty is None else self._gps_pty.name
 
     def stop(self, *_: int | FrameType | None) -> None:
-        """End `serve`; a signal handler."""
+        """Stop `serve`; this is also a signal handler."""
         self._stopped = True
 
     def serve(self, patience_ns: int | None = None) -> None:
-        """Advance the devices and answer requests, until stopped or `patience_ns` without clients."""
+        """Advance the devices and answer requests, until stopped or for `patience_ns` without clients."""
         left_ns: int | None = None
         while not self._stopped:
             now_ns = self._clock.now_ns()
@@ -177,7 +178,7 @@ class DeviceServer:
         self, sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]
     ) -> Future[Image]:
         assert self._pool is not None
-        # The previous exposure is finished or abandoned; rendering it first would delay this one.
+        # The previous exposure is finished or abandoned, and rendering it now would delay this exposure.
         if self._rendering is not None:
             self._rendering.cancel()
         self._rendering = self._pool.submit(_render, sequence, times, attitudes, tracks)
@@ -243,7 +244,7 @@ class DeviceServer:
         put([parse(text) for text in faults], bench, epoch_ns)
 
     def _cameras(self) -> tuple[EmulatedCamera | None, ...]:
-        """Return the star camera, number 0, and the horizon cameras."""
+        """Return the cameras by number, 0 for the star camera and 1 or more for the horizon cameras."""
         return self.hardware.camera, *self.hardware.orbit.wide
 
     def _deliver_frames(self) -> None:
@@ -262,7 +263,7 @@ class DeviceServer:
 
 
 def _renderer_pool(config: Config, section: Simulation) -> ProcessPoolExecutor | None:
-    """Start the rendering process and wait until it has loaded its sky."""
+    """Start the rendering process and wait until it has loaded the star catalogue."""
     if config.camera is None and not config.wide_cameras:
         return None
     pool = ProcessPoolExecutor(
