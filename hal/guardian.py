@@ -234,7 +234,7 @@ def _survive() -> None:
 
 DEVICE = "guardian"
 _ROOT = Path(__file__).resolve().parents[1]
-_QUEUE_BYTES = 16384  # about one second of heartbeats, including kernel overhead
+_QUEUE_BYTES = 16384  # send buffer (bytes) for about one second of heartbeats, including kernel overhead
 _RETRY_NS = 1_000_000_000
 _END_TIMEOUT_S = 0.5
 

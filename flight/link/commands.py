@@ -539,7 +539,7 @@ class DatagramChannel:
         for _ in range(AT_MOST):
             try:
                 data, sender = self._socket.recvfrom(LONGEST + 1)
-            except OSError:  # no datagram is waiting, or an ICMP error for an earlier answer
+            except OSError:  # no datagram is waiting, or an earlier answer caused an ICMP error
                 break
             if self._peers is None or any(IPv4Address(sender[0]) in peers for peers in self._peers):
                 found.append((data, sender))

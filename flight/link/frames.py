@@ -108,7 +108,7 @@ class TelemetryFramer:
         self._seal = seal
         self._count = 0
         self._data = bytearray()
-        self._starts: list[int] = []  # offsets of packets in _data
+        self._starts: list[int] = []  # offsets of the waiting packets in `_data`
 
     @property
     def waits(self) -> bool:

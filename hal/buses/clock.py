@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # these Protocols import numpy, which the guardian must not load
+if TYPE_CHECKING:  # hal.interfaces.wires imports numpy, which the guardian must not load
     from hal.interfaces.wires import Ticker
 
 

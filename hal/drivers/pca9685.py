@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused, answering
 
-if TYPE_CHECKING:  # these Protocols import numpy, which the guardian must not load
+if TYPE_CHECKING:  # hal.interfaces.wires imports numpy, which the guardian must not load
     from hal.interfaces.wires import Clock, I2cBus
 
 MODE1 = 0x00
@@ -105,7 +105,7 @@ class Pca9685:
             mode = self._read(MODE1)
         asleep = mode & ~RESTART | SLEEP
         self._write(MODE1, asleep)
-        self._write(PRE_SCALE, self._prescale)  # writable only in sleep mode
+        self._write(PRE_SCALE, self._prescale)  # the prescaler is writable only in sleep mode
         self._write(MODE1, AUTO_INCREMENT)
         self._clock.sleep_until_ns(self._clock.now_ns() + OSCILLATOR_START_NS)
         self._write(MODE2, TOTEM_POLE)

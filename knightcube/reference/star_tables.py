@@ -85,7 +85,7 @@ class KVector:
         with np.errstate(over="ignore"):
             # An infinite quotient, for a value far above the keys, is clipped to the last cell.
             cell = np.clip((value - self.origin) / self.slope, 0.0, last).astype(np.int64)
-        # The cell is corrected if rounding has moved the quotient across the boundary of a cell.
+        # The cell index is corrected if rounding has moved the quotient across the boundary of a cell.
         cell = np.maximum(cell - (self.origin + self.slope * cell > value), 0)
         cell = np.minimum(cell + (self.origin + self.slope * (cell + 1) <= value), last)
         lower = self.count[cell].astype(np.int64)

@@ -495,7 +495,7 @@ class Receiver:
 
     def _place(self) -> None:
         try:
-            self.keep()  # store the record first, so that a restart can move the file
+            self.keep()  # the record is stored first, so that a restart can move the file
             self.close()
             self._store.place(self.record)
         except FileError as error:
@@ -684,7 +684,7 @@ class Entity:
         match content:
             case Finished():
                 return [answer_to(content)]
-            case Nak():  # cancel an unknown transfer, so that the receiver stops waiting
+            case Nak():  # the receiver of an unknown transfer must stop waiting
                 return [Eof(Condition.CANCELLED, 0, 0)]
             case _:
                 return []

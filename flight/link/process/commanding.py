@@ -118,7 +118,9 @@ class Verification:
     """Tracker of the stages of commands that were sent to the control process."""
 
     def __init__(self) -> None:
-        self._open: tuple[Sent, Mode, int] | None = None  # command, final mode, mission time of answer
+        self._open: tuple[Sent, Mode, int] | None = (
+            None  # open command, its final mode, mission time of its answer (ns)
+        )
 
     def answered(self, sent: Sent, answer: bytes) -> list[Report]:
         """Return the reports for an answer of the control process. Empty bytes stand for a missing answer."""
@@ -427,7 +429,7 @@ class Scheduling:
             problem = self._problem(entry, utc_ns)
             try:
                 self._timetable.remove(entry.number)
-            except TimetableError as error:  # entry still on disk, could be executed again after a restart
+            except TimetableError as error:  # the entry is still on disk, so a restart could execute it again
                 problem = str(error)
                 self._timetable.forget(entry.number)
             if problem:

@@ -425,7 +425,7 @@ class Station:
         try:
             frames = self._downlink.frames(now_ns)
             self._problem = ""
-        except FlightError as error:  # no free counter: a command can still set a new key
+        except FlightError as error:  # a command can still set a new key if no counter is free
             self._problem, frames = str(error), []
         for line in self._lines:
             line.send(frames, now_ns)

@@ -191,7 +191,7 @@ class SegmentStore:
         try:
             self._file.truncate(self._size + whole)
             self._size += whole
-        except OSError:  # readers skip the incomplete packet
+        except OSError:  # readers of the log skip the incomplete packet
             self._size += written
 
 
@@ -202,7 +202,10 @@ LEAST_FREE_BYTES = 64 << 20
 """Minimum free disk space (bytes) at the start of a run, enough for several hours of packets."""
 
 DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
-"""Error numbers (errno) of a full or failing disk. Other error numbers indicate a wrong path."""
+"""Error numbers (errno) of a full or failing disk.
+
+A different error number indicates a wrong path of the log.
+"""
 
 _NAME = re.compile(r"run-(\d{6,})")
 
@@ -354,7 +357,9 @@ class FlightLog:
         self._retry_ns = 0
         self._busy_since_ns: int | None = None
         self._closed = False
-        self._draining = threading.Lock()  # held while the queue is written, never taken by write()
+        self._draining = (
+            threading.Lock()
+        )  # lock held while the queue is written to disk, never taken by write()
         self._store: SegmentStore | None = None
 
         def begin() -> SegmentStore:

@@ -39,7 +39,7 @@ PacketArray = npt.NDArray[np.void]
 HEADER_BYTES = 6
 SECONDARY_BYTES = 9
 CRC_BYTES = 2
-LONGEST_PACKET = 4096  # maximum length (bytes), limits the search in a damaged log
+LONGEST_PACKET = 4096  # maximum packet length (bytes), which limits the search in a damaged log
 SEQUENCE_MODULUS = 1 << 14
 UNSEGMENTED = int(PacketSeqCtrl(SequenceFlags.UNSEGMENTED, 0).raw())
 

@@ -249,7 +249,7 @@ def parse(line: bytes, *, allow_none: bool = False) -> Sentence | None:
     `XX`.
     """
     text = line.rstrip(b"\r\n")
-    body, star, digits = text[1:].partition(b"*")  # a sentence contains exactly one star
+    body, star, digits = text[1:].partition(b"*")  # a valid sentence contains exactly one star
     if not (text.startswith(b"$VN") and star and body.isascii() and len(body) >= 5):
         return None
     checksum = _verify(body, digits, allow_none)
@@ -307,7 +307,7 @@ def error_meaning(sentence: Sentence) -> tuple[int, str] | None:
     return code, ERRORS.get(code, "an error without a published meaning")
 
 
-LONGEST_LINE = 256  # bytes; receive buffer of the unit (longest answer: about 100 bytes)
+LONGEST_LINE = 256  # receive buffer of the unit (bytes); its longest answer has about 100 bytes
 
 _START = re.compile(rb"[\xfa$]")
 # A `$` ends a candidate line, so that the line after a truncated line is still found.

@@ -375,7 +375,7 @@ def weighted_fit(observations: Sequence[VectorObservation]) -> AttitudeFix:
         information, moment, _ = _normal_equations(quaternion, observations)
         step = np.asarray(np.linalg.solve(information, moment), dtype=float)
         quaternion = normalise(multiply(from_rotation_vector(step), quaternion))
-        if float(step @ step) < 1e-9**2:  # rad; the convergence is nearly quadratic
+        if float(step @ step) < 1e-9**2:  # convergence limit (rad); the convergence is nearly quadratic
             break
     information, _, loss = _normal_equations(quaternion, observations)
     return AttitudeFix(quaternion, np.asarray(np.linalg.inv(information), dtype=float), loss)

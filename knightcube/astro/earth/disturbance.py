@@ -94,7 +94,7 @@ def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
 def box_areas(inertia: FloatArray) -> FloatArray:
     """Return the relative areas (3,) of the faces of a homogeneous box with a given inertia.
 
-    The areas are scaled to a mean projected area of one. If a homogeneous box cannot have these moments of
+    The areas are scaled to a mean projected area of one. If no homogeneous box has the given moments of
     inertia, a flat box is used.
 
     Args:
