@@ -455,7 +455,7 @@ class CoilResponse:
     ) -> FloatArray | None:
         """Return the field measured in the present or last pause, rotated with the body.
 
-        None before a pause.
+        The result is None before the first pause.
         """
         since_ns, currents = self._commands[-1]
         settle_ns = self._settings.settle_ns or 0

@@ -1,7 +1,7 @@
 """Imaging: triggers the star camera, passes its frames to the vision worker, and the results to navigation.
 
-The star camera is monitored by the sequence number, pixels and age of its frames, and by whether the detected
-stars match the catalogue. The objects that vision detects are tracked from frame to frame.
+The star camera is monitored by sequence number, pixels and age of its frames, and by whether the detected
+stars match the catalogue. Objects that vision detects are tracked from frame to frame.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
 _LEAST_PRIOR_SIGMA = 5e-4
 """Standard deviation (rad) of the alignment between star camera and inertial unit."""
 _COURSE_NODES = 17
-"""Number of times in an exposure at which the rate is sampled."""
+"""Number of equally spaced times in an exposure at which the body rate is sampled."""
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
 
 
@@ -63,23 +63,23 @@ class ImagingSettings:
     """Properties and time limits of the star camera, and the settings of vision.
 
     Attributes:
-        exposures: exposure time as a function of the rate.
-        fine_rest_ns: minimum time (ns) between exposures while the attitude knowledge is FINE and no object
-            is searched for.
-        seeks: function that returns whether an object is searched for.
-        calm: function of a time and an exposure time; returns the first time from then on at which the coil
-            currents are constant for the whole exposure.
-        late_ns: delay (ns) of a frame after its exposure from which the frame counts as late.
-        max_rate: body rate (rad/s) above which there is no exposure.
-        slow_ns: processing time (ns) of a frame from which vision is reported as slow.
+        exposures: exposure time as a function of the body rate.
+        fine_rest_ns: minimum time (ns) between exposures while the attitude is fine and no object is searched
+            for.
+        seeks: function that returns whether the body searches for an object.
+        calm: function of a time and an exposure time that returns the first later time at which no coil
+            switches during the exposure.
+        late_ns: time (ns) after the end of an exposure from which its frame counts as late.
+        max_rate: body rate (rad/s) above which no exposure is made.
+        slow_ns: processing time (ns) of a frame above which vision is reported as slow.
         mounting: quaternion (4,) from body axes to camera axes.
-        angular_acceleration_psd: function of time; returns the power spectral density (3, 3), rad^2/s^3, of
-            the body's white angular acceleration.
-        objects: settings of the search for objects; None without a search.
-        kept: storage of frames; None if frames are not stored.
-        velocity: function of time; returns the velocity (3,), m/s, relative to the Sun, or None if the
-            velocity in `tracker` is to be used.
-        knowledge: function that returns the present quality of the attitude estimate.
+        angular_acceleration_psd: function of a time that returns the power spectral density (3, 3),
+            rad^2/s^3, of the body's white angular acceleration.
+        objects: settings of the search for objects, or None without a search.
+        kept: storage of frames, or None if frames are not stored.
+        velocity: function of a time that returns the velocity (3,), m/s, relative to the Sun, or None if the
+            velocity in `tracker` is used.
+        knowledge: function that returns how well the attitude is known.
     """
 
     camera: CameraModel
@@ -102,7 +102,7 @@ class ImagingSettings:
 
 
 class FrameMeasurer:
-    """Makes worker jobs from frames, and measurements from the results of these jobs."""
+    """Makes jobs for the vision worker from frames, and measurements from the results."""
 
     def __init__(self, settings: ImagingSettings, navigation: Navigation) -> None:
         self._settings = settings
@@ -110,10 +110,10 @@ class FrameMeasurer:
         self._body_to_camera = attitude_matrix(settings.mounting)
 
     def job(self, frame: Frame, last_checksum: int | None, spare: bool = True) -> FrameJob:
-        """Return the worker's job for a frame.
+        """Return the vision worker's job for a frame.
 
-        `last_checksum` is the checksum of the previous frame, by which a repeated frame is detected. `spare`
-        is whether there is time to search for objects.
+        The checksum `last_checksum` of the previous frame serves to detect a repeated frame. If `spare` is
+        true, there is enough time to search for objects.
         """
         past, kept = self._navigation.past(middle_ns(frame)), self._settings.kept
         tracker, velocity = self._settings.tracker, self._settings.velocity(middle_ns(frame))
@@ -121,8 +121,8 @@ class FrameMeasurer:
             tracker = replace(tracker, solve=replace(tracker.solve, velocity=velocity))
         estimator = self._settings.estimator
         if past is None and isinstance(estimator, LikelihoodSettings):
-            # A change of the rate shifts the stars from their positions at mid-exposure. Without an estimate
-            # of the acceleration it is fitted to the pixels.
+            # A changing rate displaces the stars from their positions at mid-exposure.
+            # Without an estimate, the rate's change is therefore fitted to the pixels.
             estimator = replace(estimator, rate_model="accelerating")
         return FrameJob(
             frame.pixels,
@@ -137,7 +137,7 @@ class FrameMeasurer:
         )
 
     def exposure_ns(self, now_ns: int) -> int:
-        """Return the exposure time (ns) for the next frames, from the estimated rate across the boresight."""
+        """Return the exposure time (ns) for the next frame, from the estimated rate across the boresight."""
         exposures, estimate = self._settings.exposures, self._navigation.estimate(now_ns)
         if estimate is None:
             return round(exposures.usual * SECOND_NS)
@@ -145,7 +145,7 @@ class FrameMeasurer:
         return round(exposures.at(math.hypot(x, y)) * SECOND_NS)
 
     def _priors(self, frame: Frame, past: Estimate | None) -> tuple[RatePrior | None, AttitudePrior | None]:
-        """Return the prior rate and attitude in camera axes, from the estimate `past` at mid-exposure."""
+        """Return the priors of rate and attitude in camera axes, from the estimate `past` at mid-exposure."""
         if past is None:
             return None, None
         rate_sigma = math.sqrt(max(float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1]), 0.0))
@@ -166,17 +166,14 @@ class FrameMeasurer:
         return RatePrior(self._body_to_camera @ past.rate, rate_sigma, course), attitude
 
     def mean_rate(self, frame: Frame, motion: FrameMotion) -> MeanRateMeasurement | None:
-        """Return the mean body rate over the exposure.
-
-        None without a rate, or without an estimate at its start.
-        """
+        """Return the mean body rate over the exposure, or None without a rate or an initial estimate."""
         start_ns = frame.exposure_start_ns
         if motion.status is not StreakStatus.RATE or self._navigation.past(start_ns) is None:
             return None
         return MeanRateMeasurement(start_ns, start_ns + frame.exposure_ns, *self.rate_in_body(motion))
 
     def attitude(self, frame: Frame, found: FrameFound) -> AttitudeMeasurement | None:
-        """Return the attitude at mid-exposure; None without a star fix."""
+        """Return the measured attitude at mid-exposure, or None without a star fix."""
         fix = found.solution.fix if found.solution is not None else None
         if fix is None:
             return None
@@ -186,7 +183,7 @@ class FrameMeasurer:
         return AttitudeMeasurement(middle_ns(frame), quaternion, covariance)
 
     def rate_in_body(self, found: FrameMotion | None) -> tuple[FloatArray, FloatArray]:
-        """Return the rate (3,) and its covariance (3, 3) in body axes; NaN without a rate."""
+        """Return the rate (3,) and its covariance (3, 3) in body axes, or NaN without a rate."""
         if found is None or found.rate is None or found.covariance is None:
             return _NAN
         turn = self._body_to_camera.T
@@ -207,24 +204,24 @@ class FrameMeasurer:
 
 
 def middle_ns(frame: Frame) -> int:
-    """Return the time of mid-exposure."""
+    """Return the time (ns) of mid-exposure."""
     return frame.exposure_start_ns + frame.exposure_ns // 2
 
 
 _MANY_STARS = 12
-"""Number of unmatched detections from which a frame counts as invalid, because it does not show the sky."""
+"""Number of unmatched detections from which a frame is considered not to show the sky."""
 _NAMED_ELSEWHERE = {
     StreakStatus.TOO_SHORT,  # no motion
     StreakStatus.BLACK,
     StreakStatus.SATURATED,
     StreakStatus.FROZEN,
 }
-"""Results for which `unused` reports no event: a body at rest, or a frame with another event."""
+"""Results for which `unused` reports no event, because the body is at rest or another event is reported."""
 _NAN4, _NAN33 = np.full(4, np.nan), np.full((3, 3), np.nan)
 
 
 class FrameReport:
-    """Records frames. `accepted` is the number of rates from streaks that the filter accepted."""
+    """Records frames. The attribute `accepted` counts the rates from streaks that the filter accepted."""
 
     def __init__(self, measurer: FrameMeasurer, view: BodyView, services: Services) -> None:
         self._measurer = measurer
@@ -236,7 +233,7 @@ class FrameReport:
     def rate(
         self, frame: Frame, motion: FrameMotion, rate: MeanRateMeasurement | None, now_ns: int, accepted: bool
     ) -> None:
-        """Record the rate from the streaks, and report a rejected rate."""
+        """Record a rate measured from streaks, and report a rejected rate."""
         self.accepted += accepted
         if rate is not None and not accepted:
             text = f"frame {frame.sequence}: {self._view.rate_text(rate)}"
@@ -244,7 +241,7 @@ class FrameReport:
         self.record(frame, motion.status.value, motion, now_ns, accepted)
 
     def unused(self, frame: Frame, found: FrameFound, now_ns: int) -> None:
-        """Report a frame of a rotating body that gave neither rate nor attitude."""
+        """Report a frame of a rotating body that provided neither rate nor attitude."""
         if found.motion.status in _NAMED_ELSEWHERE:
             return
         stars = f", stars {found.solution.status.value}" if found.solution is not None else ""
@@ -259,9 +256,9 @@ class FrameReport:
         now_ns: int,
         accepted: bool | None,
     ) -> None:
-        """Record the attitude from the stars; `accepted` is None if it was not passed to the filter."""
+        """Record an attitude measured with stars; `accepted` is None if it was not passed to the filter."""
         if is_strange(solution):
-            text = f"frame {frame.sequence}: {len(solution.points)} stars that are nowhere in the sky"
+            text = f"frame {frame.sequence}: {len(solution.points)} detected stars match no part of the sky"
             self._events.report(events.CAMERA_STRANGE, now_ns, text)
         if accepted is False:
             text = f"frame {frame.sequence}: {len(solution.matched)} stars"
@@ -306,7 +303,7 @@ class FrameReport:
 
 
 def is_strange(solution: FrameSolution | None) -> bool:
-    """Return whether a frame shows many stars but matches no part of the sky."""
+    """Return whether a frame contains many stars that match no part of the sky."""
     if solution is None or solution.status is not SolveStatus.NO_MATCH:
         return False
     return len(solution.points) >= _MANY_STARS
@@ -321,19 +318,19 @@ _ROWS = 32
 _FRAMES = 4
 """Number of frame buffers of a camera driver."""
 _LEAST_CHANGES = 0.125
-"""Minimum fraction of neighbouring pixels that differ, in a row that has noise."""
+"""Minimum fraction of different neighbouring pixels in a row that contains noise."""
 
 
 class RepeatedRows:
-    """Detects rows that were copied from earlier frames, by checksums of some rows of the last frames."""
+    """Detects rows copied from earlier frames, by the checksums of some rows of the last frames."""
 
     def __init__(self) -> None:
         self._seen: deque[dict[int, int]] = deque(maxlen=_FRAMES)
 
     def look(self, pixels: Image) -> int:
-        """Return how many of the sampled rows of a frame (rows, columns) are copies from an earlier frame.
+        """Return how many of the sampled rows of a frame are copies from an earlier frame.
 
-        The number is 0 for an intact frame, and for a frame whose rows are all copies.
+        The result is 0 for a frame without copied rows, and for a frame in which all rows are copies.
         """
         rows = np.unique(np.linspace(0, len(pixels) - 1, _ROWS).astype(int)).tolist()
         noisy = [row for row in rows if np.mean(pixels[row][1:] != pixels[row][:-1]) >= _LEAST_CHANGES]
@@ -356,7 +353,7 @@ class ObjectTracks:
         self._events = services.events
 
     def ingest(self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int) -> None:
-        """Accept the detected objects of frame number `sequence`, whose mid-exposure is at `middle_ns`."""
+        """Accept the objects detected in the frame `sequence`, whose mid-exposure is at `middle_ns`."""
         x, y = np.reshape(sighted.points, (-1, 2)).T
         self._recorder.record(
             SIGHTINGS,
@@ -426,7 +423,7 @@ WORKER = "vision"
 
 
 class Imaging:
-    """Triggers and monitors the star camera, and owns the frame that is being processed."""
+    """Triggers and monitors the star camera, and keeps the frame that the worker processes."""
 
     def __init__(
         self,
@@ -452,19 +449,19 @@ class Imaging:
         self._last_frame_ns = 0
         self._triggered_ns = -settings.fine_rest_ns
         self._ordered: tuple[int, int] | None = None  # start and duration (ns) of an ordered exposure
-        self._due_ns: int | None = None  # time (ns) at which the frame of the oldest trigger is due
+        self._due_ns: int | None = None  # latest arrival (ns) of the frame of the oldest trigger
         self._rows = RepeatedRows()
         self._busy_since_ns = 0
         self._frames = 0
         self._objects = objects
-        self._spare = True  # whether the last frame left time to search for objects
+        self._spare = True  # whether there was time to search the last frame for objects
 
     def counts(self) -> tuple[int, int]:
         """Return the number of frames, and the number of rates from streaks that the filter accepted."""
         return self._frames, self._report.accepted
 
     def busy_since_ns(self) -> int | None:
-        """Return the time (ns) at which the worker received the present frame; None while it is idle."""
+        """Return the time (ns) at which the worker received its present frame, or None while it is idle."""
         return None if self._frame is None else self._busy_since_ns
 
     def begin(self, time_ns: int) -> None:
@@ -474,13 +471,13 @@ class Imaging:
     def trigger(self, cycle: Cycle) -> None:
         """Order an exposure. This is the task of the camera's rate group.
 
-        No exposure is made while the body rotates too fast. While the attitude is known finely, exposures are
-        less frequent. An exposure starts at a time at which the coil currents stay constant until its end, so
-        that the rate is nearly constant.
+        No exposure is made while the body rotates faster than permitted. Exposures are less frequent while
+        the attitude is fine. An exposure starts when no coil will switch until its end, so that the body rate
+        is nearly constant.
         """
         if self._navigation.speed > self._settings.max_rate:
             self._last_frame_ns = cycle.start_ns
-            self._streams.note("camera", cycle.start_ns)  # the camera pauses intentionally
+            self._streams.note("camera", cycle.start_ns)  # the pause is intended, so the camera is not stale
             return
         rested_ns = cycle.start_ns - self._triggered_ns
         fine = self._settings.knowledge() is Knowledge.FINE and not self._settings.seeks()
@@ -492,7 +489,7 @@ class Imaging:
         self._expose(now_ns)
 
     def _expose(self, now_ns: int) -> None:
-        """Start the ordered exposure once its time has come."""
+        """Start the ordered exposure when its start time is reached."""
         if self._ordered is None or now_ns < self._ordered[0]:
             return
         (_, exposure_ns), self._ordered = self._ordered, None
@@ -502,11 +499,11 @@ class Imaging:
             self._facts.update(facts.CAMERA_LOST, True, now_ns, str(error))
             return
         if self._due_ns is None:
-            # A free-running camera first completes its present exposure.
+            # A free-running camera first completes the exposure under way.
             self._due_ns = now_ns + 2 * exposure_ns + self._settings.late_ns
 
     def serve(self, now_ns: int) -> None:
-        """Start a due exposure; check the camera; pass a new frame to the worker."""
+        """Start an exposure that is due, check the camera, and pass a new frame to the worker."""
         if self._frame is not None and now_ns - self._busy_since_ns > self._settings.slow_ns:
             self._judge_speed(now_ns)
         self._expose(now_ns)
@@ -523,13 +520,13 @@ class Imaging:
                 self._facts.update(facts.CAMERA_LOST, True, now_ns, f"no frame for {age_ns * 1e-9:.1f} s")
             return
         if frame.sequence <= self._last_sequence:
-            # A repeated frame does not reset the age.
-            text = f"frame {frame.sequence} comes again"
+            # A repeated frame does not count as a new one.
+            text = f"frame {frame.sequence} was delivered again"
             self._events.report(events.CAMERA_FROZEN, now_ns, text)
             self._report.record(frame, StreakStatus.FROZEN.value, None, now_ns, False)
             return
         self._due_ns = None
-        # The age of a frame counts from its exposure, not from its arrival.
+        # The age of a frame is measured from the end of its exposure, not from its arrival.
         self._last_frame_ns = frame.exposure_start_ns + frame.exposure_ns
         age_ns = now_ns - self._last_frame_ns
         late = age_ns > self._settings.max_age_ns
@@ -540,7 +537,7 @@ class Imaging:
             self._streams.note("camera", now_ns)
         old = self._rows.look(frame.pixels)
         if old:
-            text = f"frame {frame.sequence}: {old} of the rows looked at are an earlier frame's"
+            text = f"frame {frame.sequence}: {old} sampled rows are copies from an earlier frame"
             self._events.report(events.CAMERA_TORN, now_ns, text)
         self._frames += 1
         self._last_sequence = frame.sequence
@@ -553,7 +550,7 @@ class Imaging:
             self._events.report(events.VISION_FAILED, now_ns, "the worker is busy or not running")
 
     def finish(self, result: JobResult, now_ns: int) -> None:
-        """Accept the worker's result."""
+        """Accept the worker's result, and pass its measurements to navigation."""
         frame, self._frame = self._frame, None
         if frame is None:
             return
@@ -566,7 +563,7 @@ class Imaging:
         motion = found.motion
         self._last_checksum = motion.checksum
         if motion.status is StreakStatus.FROZEN:
-            text = f"frame {frame.sequence} has the pixels of the last"
+            text = f"frame {frame.sequence} repeats the pixels of the last frame"
             self._events.report(events.CAMERA_FROZEN, now_ns, text)
         elif motion.status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
             text = f"frame {frame.sequence} is {motion.status.value}"
@@ -598,5 +595,5 @@ class Imaging:
     def _judge_speed(self, now_ns: int) -> None:
         taken_ns = now_ns - self._busy_since_ns
         self._spare = taken_ns <= self._settings.slow_ns
-        text = f"{taken_ns * 1e-9:.2f} s over a frame, {self._settings.slow_ns * 1e-9:g} s expected"
+        text = f"{taken_ns * 1e-9:.2f} s for a frame, {self._settings.slow_ns * 1e-9:g} s expected"
         self._facts.update(facts.VISION_SLOW, taken_ns > self._settings.slow_ns, now_ns, text)

@@ -1,12 +1,12 @@
-"""Modes: the state machine of the satellite, and the task that turns commands into transitions.
+"""Modes: the state machine of the flight, and the task that turns commands and reactions into mode changes.
 
-The table holds the result of every trigger in every mode. `TriggerAnswer.STAY` is for a trigger without
-effect in that mode, `TriggerAnswer.REFUSE` for a command that is refused.
+The transition table contains the result of every trigger in every mode. The result `TriggerAnswer.STAY` means
+that the trigger has no effect in a mode, `TriggerAnswer.REFUSE` that a command is refused.
 
-`AttitudeWatch` observes the attitude and the spin of a body that must acquire its attitude, `PointingWatch`
-the rate and the pointing error of a steered body. `HoldTimer` measures how long a condition has held without
-interruption. Entering a mode never waits for an estimate: a hold takes its attitude from the first cycle with
-an estimate.
+The class `AttitudeWatch` monitors attitude knowledge and spin of a body that must acquire its attitude. The
+class `PointingWatch` monitors rate and pointing error of a steered body. The class `HoldTimer` measures how
+long a condition has held without interruption. A mode is entered without waiting for an estimate: a hold
+takes its attitude from the first cycle that has an estimate.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from knightcube.gnc.guidance.three_axes.pointing_target import SUN, PointingTarg
 
 
 class Trigger(Enum):
-    """A trigger of the mode table: end of the boot, command, reaction to an event, or a goal reached."""
+    """A trigger of the transition table: end of the boot, command, reaction to an event, or reached goal."""
 
     START_SAFE = "start in safe"
     START_DETUMBLE = "start in detumble"
@@ -63,7 +63,7 @@ STARTS = {
     Mode.HOLD: Trigger.START_HOLD,
     Mode.TESTBED_DEMO: Trigger.START_DEMO,
 }
-"""The trigger that ends the boot, for each mode that can be configured."""
+"""Trigger that ends the boot, for each mode that may be configured as the initial mode."""
 
 COMMANDS = {
     Mode.SAFE: Trigger.COMMAND_SAFE,
@@ -74,17 +74,17 @@ COMMANDS = {
     Mode.SUN: Trigger.COMMAND_SUN,
     Mode.POINT: Trigger.COMMAND_POINT,
 }
-"""The trigger that a command of each mode causes; BOOT and ACQUIRE cannot be commanded."""
+"""Trigger for a command of each mode; the modes BOOT and ACQUIRE cannot be commanded."""
 
 KNOWN = {Mode.SUN: Trigger.KNOWN_SUN, Mode.POINT: Trigger.KNOWN_POINT}
-"""The trigger that ends the acquisition, for each mode that may follow."""
+"""Trigger that ends the attitude acquisition, for each mode that may follow."""
 
 SAFING = (Trigger.COMMAND_SAFE, Trigger.REACT_SAFE)
-"""The triggers that must lead to SAFE from every mode."""
+"""Triggers that must lead to SAFE from every mode."""
 
 
 class TriggerAnswer(Enum):
-    """The result of a trigger that changes no mode."""
+    """Result of a trigger that does not change the mode."""
 
     STAY = "stays"
     REFUSE = "is refused"
@@ -99,7 +99,7 @@ _USUAL: Row = {
     Trigger.REACT_SAFE: Mode.SAFE,
     Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
 }
-"""Default answers of a mode that steers the body; the table overrides some of them."""
+"""Default results of the triggers in modes that steer the body; table rows override some of them."""
 
 TRANSITIONS: Table = {
     Mode.BOOT: {
@@ -109,7 +109,7 @@ TRANSITIONS: Table = {
         Trigger.COMMAND_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
     },
-    Mode.SAFE: {  # the body leaves SAFE only by command; a command to point first starts the acquisition
+    Mode.SAFE: {  # SAFE is left only by command; a command to point starts the acquisition first
         **_USUAL,
         Trigger.COMMAND_SUN: Mode.ACQUIRE,
         Trigger.COMMAND_POINT: Mode.ACQUIRE,
@@ -117,7 +117,7 @@ TRANSITIONS: Table = {
         Trigger.REACT_SAFE: TriggerAnswer.STAY,
         Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
     },
-    Mode.DETUMBLE: {  # a command to point takes effect once the rate is low and the attitude known
+    Mode.DETUMBLE: {  # a command to point takes effect after the rate is low and the attitude known
         **_USUAL,
         Trigger.COMMAND_SUN: TriggerAnswer.STAY,
         Trigger.COMMAND_POINT: TriggerAnswer.STAY,
@@ -126,9 +126,9 @@ TRANSITIONS: Table = {
         Trigger.DETUMBLED: Mode.HOLD,
         Trigger.SLOWED: Mode.ACQUIRE,
     },
-    Mode.HOLD: _USUAL,  # a second command keeps the attitude of that moment
+    Mode.HOLD: _USUAL,  # a repeated command holds the attitude at its time
     Mode.SLEW: {**_USUAL, Trigger.REACT_HOLD: Mode.HOLD, Trigger.ARRIVED: Mode.HOLD},
-    # Without a plan the demonstration holds the attitude, and continues with the next plan.
+    # Without a plan, the demonstration holds the attitude until the next plan arrives.
     Mode.TESTBED_DEMO: {**_USUAL, Trigger.COMMAND_DEMO: TriggerAnswer.STAY},
     Mode.ACQUIRE: {
         **_USUAL,
@@ -145,7 +145,7 @@ TRANSITIONS: Table = {
 
 
 def check(table: Table) -> None:
-    """Validate a table; raises FlightError naming the first error."""
+    """Check a transition table, and raise FlightError for the first error."""
     for mode in Mode:
         row = table.get(mode)
         if row is None:
@@ -173,7 +173,7 @@ def check(table: Table) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ModeChange:
-    """A transition from one mode to another, or to the same mode again."""
+    """A change from one mode to another, or a repeated entry of the same mode."""
 
     before: Mode
     after: Mode
@@ -181,21 +181,24 @@ class ModeChange:
 
 
 class ModeMachine:
-    """The mode and the transition table, without side effects. `since_ns` is when the mode was entered."""
+    """The present mode and the transition table, without side effects.
+
+    The attribute `since_ns` is the time (ns) at which the mode was entered.
+    """
 
     def __init__(self, table: Table = TRANSITIONS) -> None:
-        """Begin in BOOT. Raises FlightError for an invalid table."""
+        """Begin in BOOT. Raises FlightError for an invalid transition table."""
         check(table)
         self._table = table
         self.mode = Mode.BOOT
         self.since_ns = 0
 
     def answer(self, trigger: Trigger) -> Mode | TriggerAnswer:
-        """Return the mode to which `trigger` would lead now, or the answer that keeps the mode."""
+        """Return the mode to which `trigger` would lead now, or why it would not change the mode."""
         return self._table[self.mode][trigger]
 
     def fire(self, trigger: Trigger, now_ns: int) -> ModeChange | None:
-        """Apply a trigger; return the change, or None if the mode stays or the trigger is refused."""
+        """Apply a trigger, and return the mode change, or None if the mode does not change."""
         after = self.answer(trigger)
         if isinstance(after, TriggerAnswer):
             return None
@@ -205,18 +208,18 @@ class ModeMachine:
 
 
 class HoldTimer:
-    """Detects that a condition has held for a given time."""
+    """Detects that a condition has held for a required time."""
 
     def __init__(self, seconds: float) -> None:
         self._needed_ns = round(seconds * 1e9)
         self._since_ns: int | None = None
 
     def require(self, seconds: float) -> None:
-        """Change the required time (s)."""
+        """Replace the required time (s)."""
         self._needed_ns = round(seconds * 1e9)
 
     def update(self, holds: bool, now_ns: int) -> bool:
-        """Update whether the condition holds now; return whether it has held for the required time."""
+        """Update the condition, and return whether it has held for the required time."""
         if not holds:
             self._since_ns = None
             return False
@@ -230,16 +233,16 @@ class HoldTimer:
 
 
 class AttitudeWatch:
-    """Finds the triggers that lead from acquisition to pointing, and decides when SAFE detumbles the body.
+    """Finds the triggers between acquisition and pointing, and decides what a body in SAFE does.
 
     Attributes:
-        follows: the mode that follows the acquisition; None if the body stays in ACQUIRE.
-        detumbles: whether a body in SAFE is detumbled.
-        acquires_sun: whether a body in SAFE turns to the Sun.
+        follows: mode that follows the acquisition, or None if the body stays in ACQUIRE.
+        detumbles: whether a body in SAFE is being detumbled.
+        acquires_sun: whether a body in SAFE is being turned to the Sun.
     """
 
     def __init__(self, settings: Modes, low_rate: float, low_for: float) -> None:
-        """Set the end of detumbling: a rate below `low_rate` (rad/s) for `low_for` (s)."""
+        """Detumbling ends when the rate has been below `low_rate` (rad/s) for `low_for` (s)."""
         self.follows = None if settings.acquired == Mode.ACQUIRE.label else Mode.named(settings.acquired)
         self.detumbles = self.acquires_sun = False
         self._fast, self._low = settings.tumble_rate, low_rate
@@ -249,20 +252,20 @@ class AttitudeWatch:
         self._slow = HoldTimer(low_for)
 
     def adopt(self, settings: Modes) -> None:
-        """Replace the limits by those of a new table of parameters."""
+        """Replace the limits by those of a new table of onboard parameters."""
         self._fast = settings.tumble_rate
         self._lost.require(settings.lost_for)
         for timer in (self._known, self._spins):
             timer.require(settings.known_for)
 
     def reset(self) -> None:
-        """Restart all timers because another mode is entered."""
+        """Restart all timers, because another mode is entered."""
         self.detumbles = self.acquires_sun = False
         for timer in (self._known, self._lost, self._spins, self._slow):
             timer.reset()
 
     def trigger(self, mode: Mode, known: bool, now_ns: int) -> Trigger | None:
-        """Return the trigger that is due; `known` is whether the attitude permits steering."""
+        """Return the trigger that is due, if any; `known` states whether the attitude permits steering."""
         if mode is Mode.ACQUIRE and self.follows is not None and self._known.update(known, now_ns):
             return KNOWN[self.follows]
         if mode in POINTING and self._lost.update(not known, now_ns):
@@ -277,10 +280,10 @@ class AttitudeWatch:
         acquire_sun: Callable[[int], None],
         now_ns: int,
     ) -> None:
-        """In SAFE, detumble a body that rotates fast until it is slow; otherwise turn the body to the Sun.
+        """In SAFE, detumble a body that rotates fast, and turn a slow body to the Sun.
 
-        Neither is done while a latched fault forbids it (`barred`). `detumble` or `acquire_sun` is called
-        when detumbling or Sun acquisition begins.
+        A latched fault (`barred`) forbids both actions. The function `detumble` or `acquire_sun` is called
+        when this action begins.
         """
         if self.detumbles:
             self.detumbles = not (barred or self._slow.update(rate < self._low, now_ns))
@@ -295,7 +298,7 @@ class AttitudeWatch:
 
 
 class PointingWatch:
-    """Updates the facts TUMBLING and HOLD_IMPOSSIBLE."""
+    """Monitors rate and pointing error, and updates the facts TUMBLING and HOLD_IMPOSSIBLE."""
 
     def __init__(self, settings: Modes, targets: BodyTargets, facts_: Facts) -> None:
         self._settings = settings
@@ -304,23 +307,23 @@ class PointingWatch:
         self._off = HoldTimer(settings.hold_patience)
 
     def adopt(self, settings: Modes) -> None:
-        """Replace the limits by those of a new table of parameters."""
+        """Replace the limits by those of a new table of onboard parameters."""
         self._settings = settings
         self._off.require(settings.hold_patience)
 
     def reset(self) -> None:
-        """Restart the timer of the pointing error because another mode is entered."""
+        """Restart the timer of the pointing error, because another mode is entered."""
         self._off.reset()
 
     def watch_rate(self, rate: float, now_ns: int) -> None:
-        """Update the fact TUMBLING from the magnitude of the body rate (rad/s)."""
+        """Update the fact TUMBLING from the magnitude (rad/s) of the body rate."""
         limit = self._settings.tumble_rate
         self._facts.update(facts.TUMBLING, rate > limit, now_ns, f"{rate:.3f} rad/s, {limit:g} allowed")
 
     def watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
-        """Update both facts from the pointing error `off` (rad); return the error.
+        """Update both facts from the pointing error `off` (rad), and return this error.
 
-        While no attitude is due yet, `off` is None and the error 0.
+        While no attitude is due, `off` is None and the returned error is 0.
         """
         settings = self._settings
         self.watch_rate(self._targets.speed(estimate), now_ns)
@@ -336,11 +339,11 @@ SAFING_REACTIONS = {
     Reaction.DETUMBLE: Trigger.REACT_DETUMBLE,
     Reaction.HOLD: Trigger.REACT_HOLD,
 }
-"""The trigger of each reaction that may change the mode."""
+"""Trigger of each reaction that may change the mode."""
 
 
 def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
-    """Return the modes in which a reaction has an effect: all modes, if it changes no mode."""
+    """Return the modes in which a reaction has an effect: all modes, if it does not change the mode."""
     trigger = SAFING_REACTIONS.get(reaction)
     if trigger is None:
         return frozenset(Mode)
@@ -352,8 +355,9 @@ class ModeSettings:
     """Bounds of the modes.
 
     Attributes:
-        low_rate, low_for: detumbling ends when the rate has been below `low_rate` (rad/s) for `low_for` (s).
-        stop: ends the flight after the running cycle, with a reason.
+        low_rate, low_for: limits of detumbling, which ends when the rate has been below `low_rate` (rad/s)
+            for `low_for` (s).
+        stop: function of a reason that ends the flight after the running cycle.
     """
 
     modes: Modes
@@ -363,14 +367,14 @@ class ModeSettings:
 
 
 class ModeControl:
-    """Owns the state machine, and the targets that commands set.
+    """Owns the mode state machine, and the targets that commands set.
 
-    The class is longer than 200 lines because commands, reactions and reached goals all change the same mode
+    The class is longer than 200 lines, because commands, reactions and reached goals all change the same mode
     and target.
 
     Attributes:
-        restart: why the process must be restarted; empty if it need not.
-        wanted: the target of a hold, a slew, the Sun, or a command to point; None in other modes.
+        restart: reason why the process must be restarted; empty if no restart is needed.
+        wanted: target that a hold, a slew, the mode SUN or a command to point has set; None in other modes.
     """
 
     def __init__(
@@ -378,8 +382,8 @@ class ModeControl:
     ) -> None:
         """Connect the state machine with the body, the steering and the event log.
 
-        Raises FlightError for a fact whose reaction has no effect, ConfigError for an initial mode that the
-        body does not have.
+        Raises FlightError for a fact whose reaction has no effect, and ConfigError for an initial mode that
+        the body does not have.
         """
         facts.check(facts.FACTS, modes_moved_by)
         self._settings = settings.modes
@@ -417,32 +421,32 @@ class ModeControl:
 
     @property
     def since_ns(self) -> int:
-        """Time at which the mode was entered."""
+        """The time (ns) at which the present mode was entered."""
         return self._machine.since_ns
 
     @property
     def flies_steps(self) -> bool:
-        """Whether the configured steps are flown, or will be after BOOT."""
+        """Whether the configured steps are flown, or will be flown after BOOT."""
         booting = self.mode is Mode.BOOT and self._initial is Mode.TESTBED_DEMO
         return self.mode is Mode.TESTBED_DEMO or (booting and not self._too_many_crashes)
 
     @property
     def detumbles(self) -> bool:
-        """Whether the body is detumbled: in DETUMBLE, and in SAFE while it spins."""
+        """Whether the body is being detumbled: in DETUMBLE, and in SAFE while it rotates fast."""
         return self.mode is Mode.DETUMBLE or self._attitude.detumbles
 
     @property
     def acquires_sun(self) -> bool:
-        """Whether the body turns to the Sun without an attitude: in SAFE, once it is slow."""
+        """Whether the body is being turned to the Sun without an attitude: in SAFE, once it is slow."""
         return self._attitude.acquires_sun
 
     def target(self, mission_time_ns: int) -> Target | None:
-        """Return the target in force at a mission time; None in a mode without one."""
+        """Return the target in force at a mission time, or None if the mode has no target."""
         configured = self.flies_steps or (self.mode is Mode.POINT and self.wanted is None)
         return self._targets.configured(mission_time_ns) if configured else self.wanted
 
     def adopt(self, modes: Modes) -> None:
-        """Replace the limits by those of a new table of parameters."""
+        """Replace the limits by those of a new table of onboard parameters."""
         self._settings = modes
         self._arrived.require(modes.arrived_for)
         self._pointing.adopt(modes)
@@ -463,16 +467,16 @@ class ModeControl:
         coils_answer: bool,
         now_ns: int,
     ) -> Mode:
-        """Check the conditions of the present mode; return the mode for this cycle.
+        """Check the conditions of the present mode, and return the mode for this cycle.
 
         Args:
-            estimate: of this cycle; None if the attitude is not known.
-            rate: magnitude (rad/s) of the newest body rate measured in this cycle; None without a reading.
-            overdue: angle (rad) to the attitude that is due; None while no attitude is due.
-            coils_answer: whether the PWM chip takes commands.
-            now_ns: time of the cycle.
+            estimate: state estimate of this cycle, or None while the attitude is not known.
+            rate: magnitude (rad/s) of the newest body rate measured in this cycle, or None without a reading.
+            overdue: angle (rad) between body and due attitude, or None while no attitude is due.
+            coils_answer: whether the PWM chip acknowledges commands.
+            now_ns: time (ns) of the cycle.
         """
-        # A body that acquires its attitude needs no estimate: a measured rate is enough.
+        # A body that acquires its attitude needs a measured rate, but no estimate.
         measured = rate is not None if Mode.ACQUIRE in self._modes else estimate is not None
         self._measured_ns = now_ns if measured else self._measured_ns
         if self.mode is Mode.BOOT:
@@ -498,9 +502,10 @@ class ModeControl:
         return self.mode
 
     def command(self, mode: Mode, now_ns: int, wanted: float | PointingTarget | None = None) -> str:
-        """Execute a command; return why it is refused, empty if it is executed.
+        """Execute a mode command, and return why it is refused, or an empty text.
 
-        `wanted` is the target of SLEW and POINT; POINT without a target returns to the configured targets.
+        The value `wanted` is the target of SLEW or POINT. A POINT without a target returns to the configured
+        targets.
         """
         trigger = COMMANDS.get(mode)
         if trigger is None or mode not in self._modes:
@@ -554,8 +559,8 @@ class ModeControl:
             self._facts.update(facts.BOOT_WAITS, late, now_ns, f"for {waited:.1f} s: coils at zero")
 
     def _brake(self, estimate: Estimate | None, rate: float, now_ns: int) -> None:
-        """Check whether detumbling is over."""
-        # A hold needs an attitude at which the coils have authority: wait until the body has turned further.
+        """End detumbling when the rate is low enough."""
+        # If a hold follows, wait for an attitude at which the coils can produce torque.
         holds = Mode.HOLD in self._modes
         within = not holds or (estimate is not None and self._targets.can_hold(estimate))
         if self._slow.update(rate < self._low_rate and within, now_ns):
@@ -563,7 +568,7 @@ class ModeControl:
             self._fire(over, f"below {self._low_rate:g} rad/s", now_ns)
 
     def _keep(self, estimate: Estimate, now_ns: int) -> None:
-        """Check the progress of a hold or a slew."""
+        """Check the progress of a hold or of a slew."""
         settings = self._settings
         if self.wanted is None:
             self.wanted = self._targets.hold_here(estimate, now_ns)
@@ -581,12 +586,12 @@ class ModeControl:
             self._enter(change, reason, now_ns)
 
     def _enter(self, change: ModeChange, reason: str, now_ns: int) -> None:
-        """Enter a mode: reset timers, release an old path, zero the coils of a mode without steering."""
+        """Enter a mode: reset timers, discard an old path, and switch the coils off if it does not steer."""
         self._facts.enter(change.after)
         for timer in (self._slow, self._arrived, self._pointing, self._attitude):
             timer.reset()
         if change.before not in STEERING | {Mode.BOOT}:
-            self._paths.release()  # an old path does not start at the body's attitude
+            self._paths.release()  # an old path would not start at the present attitude
         if change.after is Mode.DETUMBLE:
             self._steering.begin_detumbling(now_ns)
         if change.after is Mode.SUN:
@@ -616,8 +621,8 @@ class ModeControl:
 
 
 def _barred(known: Facts) -> str:
-    """Return which latched facts keep the body in SAFE; empty if none does."""
+    """Return a text about the latched facts that keep the body in SAFE; empty if there are none."""
     held = [
         fact.begins.name for fact in known.held() if fact.latching and fact.begins.reaction is Reaction.SAFE
     ]
-    return f"not before it is cleared: {', '.join(held)}" if held else ""
+    return f"refused until cleared: {', '.join(held)}" if held else ""

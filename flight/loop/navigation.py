@@ -1,7 +1,7 @@
-"""Navigation: passes readings of inertial unit, GPS receiver and solar cells to the filter; monitors them.
+"""Navigation: passes readings of inertial unit, GPS and solar cells to the filter, and monitors them.
 
 The serial line of the inertial unit is monitored for silence (no bytes), corruption (bytes without valid
-packets) and implausible values. Rates from streaks and attitudes from stars update the estimate at the time
+packets) and implausible values. Rates from streaks and attitudes from stars update the estimate at the times
 of their measurement.
 """
 
@@ -34,9 +34,9 @@ from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 
 _AT_A_TIME = 16
-"""Number of measurements that one cycle applies again (a few ms).
+"""Number of measurements that one cycle repeats after a late measurement, which takes a few ms.
 
-A second of measurements takes a few cycles.
+Repeating the measurements of one second takes a few cycles.
 """
 
 
@@ -45,10 +45,10 @@ class NavigationSettings:
     """Age limits of the inertial unit's readings.
 
     Attributes:
-        max_age_ns: age limit (ns) of a reading that is used to drive the coils.
-        coast_ns: longest propagation (ns) of the estimate without a measurement; such an estimate is used for
+        max_age_ns: largest age (ns) of a reading by which the coils are driven.
+        coast_ns: longest propagation (ns) of the estimate without measurements; such an estimate is used for
             telemetry only.
-        period_ns: period (ns) of the control cycle; a commanded current flows for at least this time.
+        period_ns: period (ns) of the control cycle, during which a commanded current flows.
     """
 
     max_age_ns: int
@@ -71,15 +71,15 @@ class Navigation:
         self._facts = services.facts
         self._streams = services.streams
         self._since_ns = 0
-        self._received_ns = 0  # newest reading, and newest that agreed with the estimate (ns)
+        self._received_ns = 0  # times (ns): newest reading, newest agreeing reading
         self._agreed_ns = 0
         self._link = unit.link()
         self._bytes_since_ns = 0
         self.speed = 0.0
-        """Body rate (rad/s) of the newest reading, including the gyro's bias."""
+        """Body rate (rad/s) of the newest reading, including the gyro bias."""
 
     def begin(self, time_ns: int) -> None:
-        """Ignore readings before the release of the body at `time_ns`."""
+        """Ignore readings made before the release of the body at `time_ns`."""
         self._since_ns = time_ns
         self._received_ns = self._agreed_ns = time_ns
         self._bytes_since_ns = time_ns
@@ -90,13 +90,13 @@ class Navigation:
         return self._link
 
     def commanded(self, in_force: CoilState, known: CurrentValidity) -> None:
-        """Pass the coil currents to the filter, and whether they are known."""
+        """Pass the coil currents, and whether they are known, to the filter."""
         if known.uncertain_since_ns is not None:
             self._filter.mark_unknown(known.uncertain_since_ns)
         self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
 
     def update(self, now_ns: int) -> tuple[ImuReading, ...]:
-        """Apply new and late measurements; return the readings of this cycle, oldest first."""
+        """Apply new and late measurements, and return the readings of this cycle, oldest first."""
         self._filter.catch_up(_AT_A_TIME)
         try:
             polled = self._unit.poll()
@@ -113,19 +113,19 @@ class Navigation:
             self.speed = math.hypot(*reading.rate.tolist())
         self._watch_line(now_ns)
         doubted = self._filter.doubts_commands
-        text = "the rate departs from the commanded" if doubted else "the rate follows the commands"
+        text = "the body rate contradicts the commands" if doubted else "the rate follows the commands"
         self._facts.update(facts.COMMANDS_DOUBTED, doubted, now_ns, text)
         return readings
 
     def is_current(self, now_ns: int) -> bool:
-        """Return whether readings are recent enough to drive the coils until the next cycle."""
+        """Return whether the newest reading will be recent enough for control until the next cycle."""
         return self._is_fresh(self._received_ns, now_ns)
 
     def is_measured(self, now_ns: int) -> bool:
-        """Return whether the estimate is recent enough to drive the coils until the next cycle.
+        """Return whether the estimate will be recent enough for driving the coils until the next cycle.
 
-        The newest reading that agreed with the estimate must stay within its age limit until the next cycle.
-        An estimate that was propagated by the model alone is recorded, but not used for steering.
+        The newest reading that agreed with the estimate must stay within its age limit until then. An
+        estimate that is only propagated by the model is recorded, but not used for steering.
         """
         return self._filter.started and self._is_fresh(self._agreed_ns, now_ns)
 
@@ -133,35 +133,32 @@ class Navigation:
         return now_ns + self._settings.period_ns - time_ns < self._settings.max_age_ns
 
     def estimate(self, now_ns: int) -> Estimate | None:
-        """Return the present estimate, from measurements or propagated by the model.
-
-        None without an estimate.
-        """
-        # During a long silence the propagation would take longer in every cycle, and its result would be too
-        # inaccurate to be used.
+        """Return the present estimate, measured or propagated by the model, or None without an estimate."""
+        # During a long silence, the propagated estimate becomes inaccurate and slow to compute.
         if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
             return None
         return self._filter.at(now_ns)
 
     def past(self, time_ns: int) -> Estimate | None:
-        """Return the estimate of a past time, None beyond the filter's history."""
+        """Return the estimate at a past time, or None beyond the filter's history."""
         return self._filter.past(time_ns) if self._filter.started else None
 
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
-        """Return times (n,) ns and rates (n, 3) rad/s that span a past interval; None beyond the history."""
+        """Return times (n,), ns, and rates (n, 3), rad/s, of a past interval, or None beyond the history."""
         return self._filter.rates(begin_ns, end_ns) if self._filter.started else None
 
     def begin_from(self, attitude: AttitudeMeasurement) -> bool:
-        """Start a filter that has no estimate from an attitude by the stars.
+        """Start a filter that has no estimate from an attitude measured with stars.
 
         Return whether the filter started.
         """
         return not self._filter.started and self._feed.begin(attitude)
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of a frame at their times, over the next cycles.
+        """Apply the measurements of a frame at their times, over the next cycles.
 
-        `report` is called, at once or in a later cycle, with whether each measurement passed the gate.
+        The function `report` is called now or in a later cycle, with a flag for each measurement that passed
+        its gate.
         """
         if self._filter.started:
             self._filter.measure_late(late, report)
@@ -204,7 +201,7 @@ class Navigation:
         bad = link.bad_checksum - before.bad_checksum
         stray = link.discarded_bytes - before.discarded_bytes
         if bad or stray:
-            text = f"{bad} packets with a wrong checksum, {stray} bytes of no packet"
+            text = f"{bad} packets with a wrong checksum, {stray} bytes outside packets"
             self._events.report(events.IMU_CORRUPT, now_ns, text)
         odd = link.out_of_range - before.out_of_range
         endless = link.not_finite - before.not_finite
@@ -214,11 +211,11 @@ class Navigation:
 
 
 CLOCK_OFF_NS = SECOND_NS
-"""Largest permitted difference (ns) between the wall clock and the time of the GPS receiver."""
+"""Largest accepted difference (ns) between the wall clock and the GPS receiver's time."""
 
 
 class Positioning:
-    """Reads the GPS receiver and passes its fixes to the body."""
+    """Reads the GPS receiver, and passes its fixes to the body."""
 
     def __init__(
         self,
@@ -227,7 +224,10 @@ class Positioning:
         max_age_ns: int,
         services: Services,
     ) -> None:
-        """`accept` returns whether the body uses a fix. A receiver without a fix for `max_age_ns` is lost."""
+        """`accept` is a function that returns whether the body uses a fix.
+
+        A receiver is reported as lost after `max_age_ns` without a fix.
+        """
         self._receiver = receiver
         self._accept = accept
         self._max_age_ns = max_age_ns
@@ -242,7 +242,7 @@ class Positioning:
         self._fixed_ns = time_ns
 
     def run(self, now_ns: int) -> None:
-        """Accept the fixes since the last call."""
+        """Accept the fixes that have arrived since the last call."""
         error, clock = "", self._clock
         try:
             readings = self._receiver.poll()
@@ -254,20 +254,20 @@ class Positioning:
             self._streams.note("gps", reading.time_ns)
             if self._accept(reading):
                 self._fixed_ns = reading.time_ns
-                # Before the first fix, the computed position depends on the wall clock.
+                # Before the first fix, the position was computed with the wall clock.
                 off_ns = clock.utc_ns() - (clock.now_ns() - reading.time_ns) - reading.utc_ns
                 text = f"the wall clock is {off_ns * 1e-9:+.1f} s off the receiver's time"
                 self._facts.update(facts.CLOCK_OFF, abs(off_ns) > CLOCK_OFF_NS, now_ns, text)
             else:
                 self._events.report(events.GPS_REFUSED, now_ns, f"{reading.satellites} satellites")
         age_ns = now_ns - self._fixed_ns
-        text = error or f"no fix of use for {age_ns * 1e-9:.0f} s"
+        text = error or f"no usable fix for {age_ns * 1e-9:.0f} s"
         lost_now = bool(error) or age_ns > self._max_age_ns
         self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes come again")
 
 
 class SunSensing:
-    """Reads the solar cells and passes their currents to the body."""
+    """Reads the solar cells, and passes their currents to the body."""
 
     def __init__(
         self,
@@ -276,7 +276,7 @@ class SunSensing:
         max_age_ns: int,
         services: Services,
     ) -> None:
-        """`accept` is `BodyEstimation.accept_sun`; a reading older than `max_age_ns` is not used."""
+        """`accept` is `BodyEstimation.accept_sun`; readings older than `max_age_ns` are not used."""
         self._strings = strings
         self._accept = accept
         self._max_age_ns = max_age_ns
@@ -288,7 +288,7 @@ class SunSensing:
         self._read_ns = time_ns
 
     def run(self, now_ns: int) -> None:
-        """Accept the newest reading, once."""
+        """Accept the newest reading, unless it was accepted before."""
         reading = self._strings.latest()
         if reading is not None and reading.time_ns > self._read_ns:
             self._read_ns = reading.time_ns

@@ -1,29 +1,29 @@
 """State that is stored for the next boot: its content, its two copies on disk, and the thread that writes it.
 
-The state is typed, bounded and validated. UTC is stored as a label only and is not used in computations.
-Crashes are counted over operating time, which is the monotonic running time summed over all boots. A wrong
-wall clock therefore has no effect on the count, and a board that crashes repeatedly right after its start
-does not forget its earlier crashes.
+The stored state has typed and bounded values, and is checked when it is read. UTC is stored only as a label,
+and is not used in computations. Crashes are counted over the operating time, which is the monotonic running
+time summed over all boots. A wrong wall clock therefore does not affect the count, and a board that crashes
+repeatedly soon after its start does not forget its earlier crashes.
 
-The learned parameters are the estimated properties of the devices, such as biases; attitude and rate are not
-stored. The next boot starts from these parameters. Their covariance is increased by a fraction of the
-configured prior, because the devices may have changed meanwhile. Values that are implausible under the prior
-are rejected.
+The learned parameters are estimated properties of the devices, such as biases; attitude and rate are not
+stored. The next boot starts its filter from these parameters. The covariance of the learned parameters is
+increased by a fraction of the configured prior, because the devices may have changed since then. Learned
+values that are implausible under the configured prior are rejected.
 
-A copy consists of a line of JSON and a line with the CRC-32 of the first line. Both copies are written each
-time, one after the other, so that one copy survives if a crash damages the other one. A file is replaced
-atomically, so that a crash at any moment leaves either the old or the new content. The order of the system
-calls follows Pillai et al., "All File Systems Are Not Created Equal" (OSDI 2014), section 2: write a
-temporary file, sync it, rename it over the old one, sync the folder. Each call goes through `LinuxFiles`, so
-that a test can simulate a power loss before any of them.
+Each copy of the state is a file with a line of JSON and a line with the CRC-32 of the first line. Both copies
+are written each time, one after the other, so that at least one copy survives a crash. A file is replaced
+atomically, so that it contains either the old or the new content after a crash. The order of the system calls
+follows Pillai et al., "All File Systems Are Not Created Equal" (OSDI 2014), section 2: write a temporary
+file, sync it, rename it over the old file, sync the folder. All calls go through `LinuxFiles`, so that a test
+can simulate a power loss before any call.
 
-The number of each boot is also written to files in the state's folder and in the folder of its run. An intact
-copy may be outdated after the repair of a file system or the restore of a backup. It is recognised by a boot
-count that is smaller than a number in these files.
+The number of each boot is also written to files in the folder of the state and in the folder of the run.
+After the repair of a file system or the restore of a backup, an intact copy of the state may be outdated. An
+outdated copy is recognised by a boot count that is smaller than the boot number in these files.
 
-The control thread sets values in memory, and a ticker thread writes them to disk. The disk is also written at
-the start, before the loop runs, and at the end, when the coil currents are zero. A hanging disk delays only
-the ticker thread.
+The control thread sets values in memory, and a ticker thread writes them to disk. The state is also written
+at the start, before the loop runs, and at the end, when the coil currents are zero. A disk that hangs delays
+only the ticker thread.
 """
 
 from __future__ import annotations
@@ -68,15 +68,15 @@ LONGEST_LABEL = 32
 Label = Annotated[str, Meta(max_length=LONGEST_LABEL)]
 
 REMEMBERED = 32
-"""Number of unclean shutdowns that are stored, the newest ones."""
+"""Number of the newest unclean shutdowns that are stored."""
 
 
 class StatePart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class of the parts of the state; unknown keys are rejected."""
+    """Base class of the stored types, which reject unknown keys."""
 
 
 class Learned(StatePart, frozen=True):
-    """Parameters learned in flight: `values` (n,) and their covariance (n, n) row by row, in SI units."""
+    """Parameters learned in flight: `values` (n,) and the rows of their covariance (n, n), in SI units."""
 
     values: Annotated[tuple[float, ...], Meta(min_length=1, max_length=16)]
     covariance: tuple[tuple[float, ...], ...]
@@ -93,7 +93,7 @@ class Learned(StatePart, frozen=True):
 
 
 class UncleanShutdown(StatePart, frozen=True):
-    """An unclean shutdown: boot number, operating time (s) and UTC label of the last state before it."""
+    """An unclean shutdown: boot number, and operating time (s) and UTC label of the last state before it."""
 
     boot: Count
     operated: Seconds
@@ -101,12 +101,12 @@ class UncleanShutdown(StatePart, frozen=True):
 
 
 class KeptTable(StatePart, frozen=True, kw_only=True):
-    """A table of parameters that was loaded by command: values by the keys of the configuration.
+    """A table of onboard parameters that a command has loaded, with values by configuration key.
 
     Attributes:
-        before: the values that were in use before this table; empty for the values of the configuration.
-        proven: whether the table was in use long enough to be trusted after an unclean shutdown.
-        loads: number of tables loaded so far.
+        before: values in use before this table was loaded; empty for those of the configuration.
+        proven: whether the table has been in use long enough to be kept after an unclean shutdown.
+        loads: number of tables that have been loaded so far.
     """
 
     values: Annotated[dict[Label, float], Meta(max_length=256)] = {}
@@ -119,15 +119,15 @@ class StoredState(StatePart, frozen=True, kw_only=True, omit_defaults=True):
     """The state that is stored for the next boot.
 
     Attributes:
-        boot_count: number of starts of the application.
+        boot_count: number of times that the application was started.
         operated: total operating time (s) by the monotonic clock, over which crashes are counted.
         running: true from the start of the application until its clean end.
         unclean: unclean shutdowns, oldest first.
         mode: name of the mode at the last write.
         utc: UTC of the last write, as a label.
         learned: learned parameters by name.
-        devices: digest of the configuration of the devices for which the parameters were learned.
-        table: the table of parameters that an operator loaded.
+        devices: digest of the device configuration for which the parameters were learned.
+        table: table of onboard parameters that an operator has loaded.
     """
 
     boot_count: Count = 0
@@ -142,7 +142,7 @@ class StoredState(StatePart, frozen=True, kw_only=True, omit_defaults=True):
 
 
 def check(state: StoredState) -> None:
-    """Raise ValueError for a state that must not be stored: a non-finite number, an invalid covariance."""
+    """Raise ValueError for a state that must not be stored, such as one with a non-finite number."""
     if not all(
         math.isfinite(t) for t in (state.operated, *(shutdown.operated for shutdown in state.unclean))
     ):
@@ -166,13 +166,13 @@ def check(state: StoredState) -> None:
 
 @dataclass(frozen=True, slots=True)
 class BootRecord:
-    """The information about earlier boots that is needed at the start.
+    """Information about earlier boots that is needed at the start.
 
     Attributes:
-        boot_count: number of this boot; the first boot is number 1.
-        unclean_recent: number of unclean shutdowns within the given window of operating time.
+        boot_count: number of this boot, which is 1 for the first boot.
+        unclean_recent: number of unclean shutdowns within the last operating time.
         after_unclean: whether the previous boot ended uncleanly.
-        mode: name of the mode at the last stop; empty for the first boot.
+        mode: name of the mode at the last stop; empty at the first boot.
     """
 
     boot_count: int
@@ -183,7 +183,7 @@ class BootRecord:
 
 @dataclass(frozen=True, slots=True)
 class Noted:
-    """Values that the loop set for the next write: mode, learned parameters and table of parameters."""
+    """Values that the loop has set for the next write: mode, learned parameters and parameter table."""
 
     mode: str
     learned: Mapping[str, Learned]
@@ -191,10 +191,10 @@ class Noted:
 
 
 def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
-    """Return the state of the next boot, marked as running; a crash of the last boot is added to it.
+    """Return the state of the next boot, marked as running; a crash of the last boot is recorded in it.
 
-    Parameters that were learned for other `devices` are discarded. After a crash, an unproven table is
-    replaced by the previous table.
+    Parameters that were learned for other `devices` are discarded. After a crash, a table that is not proven
+    is replaced by the previous table.
     """
     unclean = state.unclean
     if state.running:
@@ -215,9 +215,9 @@ def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
 
 
 def state_after(begun: StoredState, elapsed: float, noted: Noted, utc: str) -> StoredState:
-    """Return the state `elapsed` s after the state `begun` of the start.
+    """Return the state `elapsed` s after a boot that began with the state `begun`.
 
-    New learned parameters replace old ones.
+    New learned parameters replace old parameters of the same name.
     """
     return msgspec.structs.replace(
         begun,
@@ -230,16 +230,19 @@ def state_after(begun: StoredState, elapsed: float, noted: Noted, utc: str) -> S
 
 
 def end_cleanly(state: StoredState) -> StoredState:
-    """Return the state after a clean end."""
+    """Return the state as stored after a clean end."""
     return msgspec.structs.replace(state, running=False)
 
 
 CRASH_WINDOW = 600.0
-"""Window of operating time (s) within which an unclean shutdown counts as recent."""
+"""Operating time (s) within which an unclean shutdown counts as recent."""
 
 
 def boot_record(begun: StoredState, window: float) -> BootRecord:
-    """Return the boot record of the state of a new boot; `window` in s of operating time."""
+    """Return the record for a boot that begins with a state; `window` is in s of operating time.
+
+    `window` in s of operating time.
+    """
     recent = sum(begun.operated - shutdown.operated <= window for shutdown in begun.unclean)
     after = bool(begun.unclean) and begun.unclean[-1].boot == begun.boot_count - 1
     return BootRecord(begun.boot_count, recent, after, begun.mode)
@@ -248,14 +251,15 @@ def boot_record(begun: StoredState, window: float) -> BootRecord:
 GYRO_BIAS, PLANT, IMU_LATENCY, MAGNETOMETER_BIAS = "gyro-bias", "plant", "imu-latency", "magnetometer-bias"
 
 _PLAUSIBLE_SIGMAS = 4.0
-"""Largest plausible deviation of a learned value from the configured prior, in standard deviations."""
+"""Largest plausible deviation of a learned value from its configured prior, in standard deviations."""
 
 
 def learned_of(estimate: Estimate) -> dict[str, Learned]:
     """Return the slowly changing parameters of an estimate by name, in the estimate's units and axes.
 
-    The parameters are gyro bias, torsion, damping and coil gain of the plant, latency of the inertial unit's
-    samples, and magnetometer bias. Their cross-covariances are discarded.
+    The parameters are the gyro bias, the torsion, damping and coil gain of the plant, the latency of the
+    inertial unit's samples, and the magnetometer bias. The cross-covariances of these parameters are
+    discarded.
     """
     parts: dict[str, tuple[FloatArray, slice]] = {
         GYRO_BIAS: (estimate.bias, BIAS),
@@ -269,17 +273,17 @@ def learned_of(estimate: Estimate) -> dict[str, Learned]:
 
 
 def digest_of(config: Config) -> str:
-    """Return a digest of the device sections of a configuration."""
+    """Return a digest of the hardware sections of a configuration."""
     return f"{zlib.crc32(msgspec.json.encode(config.hardware())):08x}"
 
 
 def start_from(
     learned: Mapping[str, Learned], configured: SlowPrior, changed: float
 ) -> tuple[SlowPrior, list[str]]:
-    """Return the filter's prior, and why learned parameters were rejected.
+    """Return the filter's prior, and the reasons why learned parameters were rejected.
 
-    `configured` is the prior without learned parameters. The change of a value since the last boot has a
-    standard deviation of `changed` times the standard deviation in `configured`.
+    The prior without learned parameters is `configured`. The assumed change of a value since the last boot
+    has a standard deviation of `changed` times that in `configured`.
     """
     problems: list[str] = []
 
@@ -290,13 +294,13 @@ def start_from(
         variance = np.diag(covariance)
         sigma, problem = np.sqrt(variance), ""
         if found.shape != values.shape:
-            problem = f"{len(values)} values are wanted"
+            problem = f"{len(values)} values are required"
         elif np.any((sigma > 0.0) & (np.abs(found - values) > _PLAUSIBLE_SIGMAS * sigma)):
             problem = f"not within {_PLAUSIBLE_SIGMAS:g} sigma of {values.tolist()} +- {sigma.tolist()}"
         if problem:
             problems.append(f"{name} {found.tolist()}: {problem}")
             return values, covariance
-        # Values that are configured not to be estimated keep their configured value.
+        # Parameters that are not to be estimated keep their configured value.
         estimated = variance > 0.0
         wide = np.where(np.outer(estimated, estimated), spread, 0.0) + np.diag(changed**2 * variance)
         return np.where(estimated, found, values), wide
@@ -324,27 +328,27 @@ LARGEST_FILE = 1 << 20
 
 
 class LinuxFiles:
-    """The file system calls that are used; each can raise OSError.
+    """The file system calls for storing the state, all of which may raise OSError.
 
-    Tests replace them to simulate a power loss.
+    Tests replace this class to simulate a power loss.
     """
 
     def read(self, path: Path) -> bytes | None:
-        """Return the content of a regular file of at most `LARGEST_FILE` bytes; None if it does not exist."""
+        """Return the content of a regular file of at most `LARGEST_FILE` bytes, or None without a file."""
         return read_regular(path, LARGEST_FILE)
 
     def create(self, path: Path) -> int:
-        """Create an empty file, which replaces an existing file, and return its descriptor for writing."""
+        """Create an empty file instead of any existing file, and return a descriptor for writing."""
         with suppress(FileNotFoundError):
             os.unlink(path)
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
 
     def write(self, file: int, data: bytes) -> int:
-        """Write at most all of `data`; return the number of bytes written."""
+        """Write `data` or a first part of it, and return the number of bytes written."""
         return os.write(file, data)
 
     def sync(self, file: int) -> None:
-        """Make the file's content durable."""
+        """Make the content of a file durable."""
         os.fsync(file)
 
     def close(self, file: int) -> None:
@@ -352,7 +356,7 @@ class LinuxFiles:
         os.close(file)
 
     def rename(self, old: Path, new: Path) -> None:
-        """Rename a file atomically, replacing a file of the new name."""
+        """Rename a file atomically, and replace any file with the new name."""
         os.rename(old, new)
 
     def sync_folder(self, folder: Path) -> None:
@@ -361,7 +365,7 @@ class LinuxFiles:
 
 
 def replace_file(files: LinuxFiles, path: Path, data: bytes) -> None:
-    """Replace the content of a file durably. If OSError is raised, the old content remains."""
+    """Replace the content of a file durably. If OSError is raised, the file keeps its old content."""
     temporary = path.with_suffix(".tmp")
     file = files.create(temporary)
     try:
@@ -382,7 +386,7 @@ NOTE = "boots"
 
 
 def note_boot(folders: Iterable[Path], number: int) -> None:
-    """Write the number of a boot to a file in each of the folders. Never raises."""
+    """Write the number of a boot to a file in each folder. Never raises."""
     for folder in folders:
         with suppress(OSError):
             replace_file(LinuxFiles(), folder / NOTE, b"%d\n" % number)
@@ -394,7 +398,7 @@ def newest_boot(folders: Iterable[Path]) -> int:
     for folder in folders:
         with suppress(OSError):
             text = (LinuxFiles().read(folder / NOTE) or b"").strip()
-            if text.isdigit() and len(text) < 16:  # 2^53, the highest count, has 16 digits
+            if text.isdigit() and len(text) < 16:  # 2^53, the largest boot count, has 16 digits
                 numbers.append(int(text))
     return max(numbers)
 
@@ -406,7 +410,7 @@ Report = Callable[[EventKind, str], None]
 
 
 class _StateCopy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The JSON content of one file."""
+    """JSON content of one copy of the state."""
 
     generation: Annotated[int, Meta(ge=1, le=2**62)]
     state: StoredState
@@ -414,7 +418,7 @@ class _StateCopy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True)
 class _ReadCopy:
-    """One copy as it was read; `problem` is empty if the copy is valid or missing."""
+    """The result of reading one copy; `problem` is empty if the copy is valid or missing."""
 
     name: str
     copy: _StateCopy | None
@@ -432,7 +436,7 @@ class StateStore:
         self._order: tuple[str, ...] = COPIES
 
     def load(self) -> StoredState:
-        """Return the newest valid copy, or the defaults if there is no valid copy. Never raises.
+        """Return the newest valid copy of the state, or the defaults if there is none. Never raises.
 
         A lost state counts as an unclean shutdown.
         """
@@ -442,7 +446,9 @@ class StateStore:
         # A missing copy is written first, because only an interrupted first write leaves a single copy.
         self._order = tuple(r.name for r in sorted(read, key=lambda r: r.copy is not None or bool(r.problem)))
         first = newest is None or newest.copy is None or newest.copy.generation == 1
-        problems = ((r.name, r.problem or ("is gone" if r.copy is None and not first else "")) for r in read)
+        problems = (
+            (r.name, r.problem or ("is missing" if r.copy is None and not first else "")) for r in read
+        )
         bad = "; ".join(f"{name}: {problem}" for name, problem in problems if problem)
         if newest is None or newest.copy is None:
             if not bad:
@@ -455,7 +461,7 @@ class StateStore:
         return newest.copy.state
 
     def store(self, state: StoredState) -> bool:
-        """Write both copies; return whether at least one is durable.
+        """Write both copies, and return whether at least one of them is durable.
 
         Raises ValueError for an invalid state.
         """
@@ -468,8 +474,7 @@ class StateStore:
                 failures.append(f"{name}: {error.strerror or error}")
         if failures:
             self._report(events.STATE_UNWRITTEN, "; ".join(failures))
-        # A generation number is never used twice, because a copy may be on disk although its write reported
-        # an error.
+        # A generation number is never reused, because a write that failed may have reached the disk.
         self._generation += 1
         return len(failures) < len(COPIES)
 
@@ -487,7 +492,7 @@ class StateStore:
 
 
 def encode(generation: int, state: StoredState) -> bytes:
-    """Return the bytes of one copy. Raises ValueError for a state that `decode` would reject."""
+    """Return the bytes of one copy of the state. Raises ValueError for a state that `decode` would reject."""
     check(state)
     line = msgspec.json.encode(_StateCopy(generation, state)) + b"\n"
     data = line + b"%08x\n" % zlib.crc32(line)
@@ -496,7 +501,10 @@ def encode(generation: int, state: StoredState) -> bytes:
 
 
 def decode(data: bytes) -> _StateCopy:
-    """Return the content of one copy. Raises ValueError for anything that `encode` does not produce."""
+    """Return the content of one copy of the state.
+
+    Raises ValueError for bytes that `encode` does not produce.
+    """
     if len(data) > LARGEST_FILE:
         raise ValueError(f"{len(data)} bytes are too many")
     line, end, crc = data.partition(b"\n")
@@ -536,7 +544,7 @@ class StateKeeper:
         record: information about earlier boots.
         learned: parameters that earlier boots learned, by name.
         counted: whether the number of this boot was written to disk.
-        table: the table of parameters to use.
+        table: table of onboard parameters to be used.
     """
 
     def __init__(
@@ -552,10 +560,10 @@ class StateKeeper:
     ) -> None:
         """Load the state, increase its boot count, and store it as running.
 
-        `window` is the operating time (s) within which an unclean shutdown counts as recent. `devices` is the
-        digest of the present devices; parameters that were learned for other devices are discarded. `boots`
-        is the boot number known from other files. A state with a smaller number is outdated or lost, and the
-        last boot then counts as unclean.
+        The time `window` is the operating time (s) within which an unclean shutdown counts as recent. The
+        digest `devices` identifies the present devices; parameters learned for other devices are discarded.
+        The number `boots` is the boot number in other files. If the state has a smaller boot count, the state
+        is outdated or lost, and the last boot counts as unclean.
         """
         self._store = store
         self._notices = notices
@@ -563,7 +571,9 @@ class StateKeeper:
         self._begun_ns = clock.now_ns()
         loaded = store.load()
         if boots > loaded.boot_count:
-            notices.report(events.STATE_OLD, f"of boot {loaded.boot_count}, but boot {boots} was noted")
+            notices.report(
+                events.STATE_OLD, f"state of boot {loaded.boot_count}, but boot {boots} is on record"
+            )
             loaded = msgspec.structs.replace(loaded, boot_count=boots, running=True)
         self._begun = begin_boot(loaded, self._label(), devices)
         self.record: BootRecord = boot_record(self._begun, window)
@@ -577,15 +587,16 @@ class StateKeeper:
         self._ticker = clock.ticker("state", period_ns, self._write)
 
     def _report_changes(self, loaded: StoredState) -> None:
-        """Report how the start of this boot changed the stored state."""
+        """Report how this boot changed the stored state."""
         begun, report = self._begun, self._notices.report
         if loaded.learned and not begun.learned:
-            text = (
-                f"learned of the devices {loaded.devices or 'of an older version'}, these are {begun.devices}"
-            )
+            former = loaded.devices or "of an older version"
+            text = f"learned for devices {former}, present devices {begun.devices}"
             report(events.LEARNED_REFUSED, text)
         if begun.table.values != loaded.table.values:
-            report(events.PARAMETERS_LEFT, "it had just been loaded when the last boot ended uncleanly")
+            report(
+                events.PARAMETERS_LEFT, "the table had just been loaded when the last boot ended uncleanly"
+            )
         if self.record.after_unclean:
             last = begun.unclean[-1]
             recent = self.record.unclean_recent
@@ -593,21 +604,24 @@ class StateKeeper:
             report(events.UNCLEAN_SHUTDOWN, text)
 
     def note(self, mode: str, learned: Mapping[str, Learned] | None = None) -> None:
-        """Set the mode and the learned parameters for the next write. Never waits."""
+        """Set mode and learned parameters for the next write. Never waits."""
         self._noted = replace(
             self._noted, mode=mode, learned=self._noted.learned if learned is None else learned
         )
 
     def note_table(self, table: KeptTable) -> None:
-        """Set the table of parameters for the next write. Never waits."""
+        """Set the table of onboard parameters for the next write. Never waits."""
         self._noted = replace(self._noted, table=table)
 
     def notices(self) -> list[tuple[EventKind, str]]:
-        """Return the events of the state since the last call, for the event log."""
+        """Return the events about the stored state since the last call."""
         return self._notices.drain()
 
     def close(self, clean: bool) -> None:
-        """Write the final state, with or without a clean end. May be called twice; waits at most 5 s."""
+        """Write the final state, which records whether the end is clean.
+
+        This method may be called twice, and waits at most 5 s.
+        """
         self._ticker.stop()
         if self._closed or not self._writing.acquire(timeout=_HUNG_DISK_S):
             self._closed = True
@@ -631,8 +645,7 @@ class StateKeeper:
         try:
             self._store.store(end_cleanly(state) if ended else state)
         except ValueError as error:
-            # Only the learned parameters can be invalid. Operating time and clean end are stored without
-            # them.
+            # Only the learned parameters can be invalid, so the state is stored without them.
             self._notices.report(events.STATE_UNWRITTEN, str(error))
             self._noted = replace(noted, learned={})
             state = state_after(self._begun, elapsed, self._noted, self._label())
@@ -644,7 +657,7 @@ class StateKeeper:
 
 
 def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
-    """Return the folder of the state: the configured folder, or that of systemd for real devices, or None."""
+    """Return the configured folder of the state, or that of systemd, or None if there is no folder."""
     if config.state.folder is not None:
         return Path(config.state.folder)
     if config.simulation is not None:
@@ -653,7 +666,7 @@ def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
 
 
 def service_folder(environment: Mapping[str, str]) -> Path | None:
-    """Return the state folder of a systemd service; None outside a service."""
+    """Return the state folder of a systemd service, or None outside a service."""
     # systemd separates several folders by colons; the first folder belongs to the application.
     first = environment.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(first) if first else None
@@ -666,16 +679,16 @@ def open_state(
     stack: ExitStack,
     runs: Sequence[Path] = (),
 ) -> StateKeeper | None:
-    """Open the stored state and count this boot; return None if no state is stored.
+    """Open the stored state and count this boot, or return None if no state is stored.
 
-    `runs` are the folders of the newest runs, of which the last is the present run; they contain files with
-    boot numbers. `stack` closes the state, as a clean end unless an exception passes. A DeviceError counts as
-    a clean end, because it is reported as a device error and safe mode would not help.
+    The folders `runs` of the newest runs, of which the last is the present run, contain files with boot
+    numbers. When `stack` closes, the final state is written: as a clean end, unless an exception passes. A
+    DeviceError counts as a clean end, because it is reported as a device error and safe mode would not help.
     """
     folder = state_folder(config, environment)
     if folder is None:
         return None
-    with suppress(OSError):  # the first write will fail and be reported; the flight continues
+    with suppress(OSError):  # if this fails, the first write reports the error
         folder.mkdir(parents=True, exist_ok=True)
     notices = Notices()
     keeper = StateKeeper(

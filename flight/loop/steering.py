@@ -1,9 +1,9 @@
-"""Steering: computes the coil command from the estimate and the path; zero without a trusted estimate.
+"""Steering: computes the coil command from estimate and path, or zero if the estimate is not trusted.
 
-The coil drive excludes failed axes and reallocates the current among the remaining axes so that the torque
-direction is preserved. Commands that were sent to the driver are compared with the supply current and the
-body's motion (`flight.loop.coil_monitor`). A verdict on an axis raises a fact. The fact raises an event,
-whose reaction excludes the axis.
+The coil drive excludes failed axes, and reallocates the current among the remaining axes so that the
+direction of the torque is preserved. The sent commands are compared with the supply current and the body's
+motion (`flight.loop.coil_monitor`). A verdict on an axis activates a fact. The fact reports an event, whose
+reaction excludes the axis.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class CoilDriveSettings:
     """Properties of the coils.
 
     Attributes:
-        dipole_per_ampere: turns times area of each coil, m^2.
-        limits: (3,) largest current of each coil, A.
-        free_axis: (3,) unit vector of the only axis about which the body can rotate; None for a free body.
+        dipole_per_ampere: number of turns times the area of each coil, m^2.
+        limits: largest current (3,), A, of each coil.
+        free_axis: unit vector (3,) of the only axis about which the body can rotate, or None for a free body.
     """
 
     dipole_per_ampere: float
@@ -44,11 +44,11 @@ class CoilDriveSettings:
 
 
 class CoilDrive:
-    """Commands the coils and monitors their response.
+    """Commands the coils, and monitors their response.
 
     Attributes:
-        command: currents (3,) A that were sent to the driver in this cycle.
-        available: (3,) bool, the axes in use.
+        command: currents (3,), A, that were sent to the driver in this cycle.
+        available: flags (3,) of the axes that are not excluded.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class CoilDrive:
         self.command: FloatArray = np.zeros(3)
 
     def state(self) -> CoilState:
-        """Return the command that the PWM chip holds now."""
+        """Return the command that the PWM chip holds at present."""
         return self._coils.state()
 
     def off(self) -> None:
@@ -79,20 +79,21 @@ class CoilDrive:
         self._coils.off()
 
     def fault(self) -> str:
-        """Return why the PWM chip does not accept commands; empty if it accepts them."""
+        """Return why the PWM chip does not accept commands; empty if it does."""
         return self._coils.state().error
 
     @property
     def is_suspect(self) -> bool:
-        """Whether the current of a coil without a verdict may differ from its command."""
+        """Whether a coil without a verdict may carry another current than commanded."""
         return self._watch.doubts_currents
 
     def look(
         self, in_force: CoilState, readings: Sequence[ImuReading], now_ns: int, *, known: bool = True
     ) -> None:
-        """Compare the command in force with the supply current and the motion, once in each control cycle.
+        """Compare the command in force with supply current and motion; called once in each control cycle.
 
-        If the coil currents since the last cycle are not `known`, all earlier evidence is discarded.
+        If `known` is false, the coil currents since the last cycle are unknown, and all earlier evidence is
+        discarded.
         """
         watch = self._watch
         if in_force.written_ns >= 0:
@@ -113,7 +114,7 @@ class CoilDrive:
         self._facts.update(facts.POWER_DOUBTED, bool(watch.monitor_doubted), now_ns, watch.monitor_doubted)
 
     def adopt(self, modes: Modes) -> None:
-        """Replace the bounds of the modes."""
+        """Replace the limits by those of a new table of onboard parameters."""
         self._watch.tumble_rate = modes.tumble_rate
 
     def isolate(self) -> None:
@@ -121,7 +122,7 @@ class CoilDrive:
         self.available = self._watch.available
 
     def trust(self, now_ns: int) -> None:
-        """Use all axes again, on command. A lasting fault will be detected again."""
+        """Use all axes again, as commanded by the ground. If a fault persists, it will be detected again."""
         for axis in range(3):
             self._watch.forget(axis)
         self._verdicts = 0
@@ -129,11 +130,15 @@ class CoilDrive:
         self._events.report(events.COIL_TRUSTED, now_ns, "all three axes are in use again")
 
     def send(self, currents: FloatArray, field: Callable[[], FloatArray | None]) -> None:
-        """Command currents (3,) A. For reallocation, `field` returns the field (3,) T in body axes."""
+        """Command currents (3,) A.
+
+        The function `field` returns the magnetic field (3,), T, in body axes, for the reallocation of
+        currents.
+        """
         usable = self.available & ~self._watch.resting
         if not all(usable.tolist()) and currents.any():
-            # The usable axes produce the torque that all axes were commanded to produce. While the field is
-            # unknown, each usable axis keeps its own current.
+            # The usable axes share the torque that was commanded for all axes.
+            # While the field is unknown, each usable axis keeps its own current.
             known, settings = field(), self._settings
             if known is None:
                 currents = np.where(usable, currents, 0.0)
@@ -156,7 +161,7 @@ class CoilDrive:
         self._coils.command(self.command)
 
     def _brake(self, axes: Axes) -> None:
-        """Brake bridges, because a bridge with a leg stuck high drives its coil even at zero command."""
+        """Brake bridges, because a leg stuck high would drive its coil even at zero command."""
         if axes != self._braked:
             self._coils.brake(axes)
             self._braked = axes
@@ -168,11 +173,11 @@ _NO_DIPOLE: FloatArray = np.zeros(3)
 class Steering:
     """Steers the body along its path, detumbles it, or keeps the coils at zero.
 
-    Control is lost when no reading within its age limit agrees with the estimate, or, while detumbling, when
-    there is no reading within its age limit. The model propagates the estimate over a silence, so that
-    control returns smoothly, but the currents are zero within a tenth of a second of the last reading.
-    Without a planner the body is steered along its last path and held at its end (event `holding`). Without a
-    path the currents are zero.
+    Control is lost when no recent reading agrees with the estimate or, in detumbling, when there is no recent
+    reading. The estimate is propagated by the model during a silence of the inertial unit, so that control
+    returns smoothly. The currents are zero within a tenth of a second after the last reading. If the planner
+    fails, the body follows its last path and is held at its end (event `holding`). Without a path, the
+    currents are zero.
     """
 
     def __init__(self, body: FlightBody, drive: CoilDrive, services: Services) -> None:
@@ -181,10 +186,9 @@ class Steering:
         self._facts = services.facts
 
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
-        """Follow the path or hold its end; `estimate` is None unless it is based on measurements.
+        """Follow the path or hold its end. The estimate must be None unless it is based on measurements.
 
-        `ever_started` is whether there was an estimate before. An estimate of None then means a loss of
-        control.
+        If an estimate existed before (`ever_started`), an estimate of None is a loss of control.
         """
         control = self._body.control
         reference = control.paths.sample(now_ns)
@@ -206,22 +210,22 @@ class Steering:
         return self._steered(state, now_ns, reference, dipole, saturated)
 
     def begin_detumbling(self, now_ns: int) -> None:
-        """Begin the measuring and acting windows of detumbling."""
+        """Begin the control windows of detumbling."""
         self._body.control.detumbling.begin(now_ns)
 
     def begin_sun_acquisition(self, now_ns: int) -> None:
-        """Begin the windows of Sun acquisition, if the body has it."""
+        """Begin the control windows of Sun acquisition, if the body has this law."""
         if (acquisition := self._body.control.sun_acquisition) is not None:
             acquisition.begin(now_ns)
 
     def detumble(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
-        """Detumble in this cycle; `current` is whether the newest reading is within its age limit."""
+        """Detumble in this cycle; `current` states whether the newest reading is within its age limit."""
         return self._run_law(self._body.control.detumbling, readings, current, now_ns)
 
     def acquire_sun(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
-        """Turn the body to the Sun without an attitude.
+        """Turn the body to the Sun, which requires no attitude.
 
-        Without Sun acquisition, zero current is commanded.
+        A body without Sun acquisition is commanded zero current.
         """
         acquisition = self._body.control.sun_acquisition
         if acquisition is None:
@@ -245,7 +249,7 @@ class Steering:
         return self._steered(SteeringState.BRAKING, now_ns, None, wanted.dipole)
 
     def rest(self, now_ns: int) -> Steered:
-        """Keep the coils at zero in this cycle."""
+        """Keep the coils at zero in this cycle, and return the result."""
         self._release()
         return self._steered(SteeringState.OFF, now_ns, None, _NO_DIPOLE)
 
@@ -269,7 +273,7 @@ class Steering:
         dipole: FloatArray,
         saturated: bool = False,
     ) -> Steered:
-        """Check the PWM chip, whose fault switches the coils off; return the final commanded currents."""
+        """Check the PWM chip, whose fault switches the coils off, and return the result of this cycle."""
         error = self._drive.fault()
         text = error or "the PWM chip takes commands again"
         self._facts.update(facts.COIL_FAULT, bool(error), now_ns, text)

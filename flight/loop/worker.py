@@ -1,20 +1,20 @@
 """A worker process, and the messages between the control process and its workers.
 
 The job runner starts a worker as `python -m flight.loop.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD PARENT
-CORES`. The worker serves one function until its socket closes. The function's module may define `prepare`,
-which is called before the first job, for imports that only the worker needs. The kernel kills the process
-when its parent's thread ends, so no worker outlives its flight.
+CORES`. A worker serves one function until its socket closes. The function's module may define `prepare`,
+which is called before the first job, for imports that only the worker needs. The kernel kills a worker when
+the thread that started it ends, so that no worker outlives its flight.
 
-Large arrays of a message are passed in shared memory. A worker trusts the control process and unpickles its
-messages. The control process decodes the worker's answer as plain values: decoding may construct dataclasses,
-enumerations and arrays of numbers, but does not call or import anything else. A worker whose memory is
-damaged can send a wrong value, but cannot run code in the control process or crash it. Answers are not
-pickled, because numpy crashes while it unpickles some damaged messages.
+Large arrays of a message are passed in shared memory. A worker trusts the control process, and unpickles its
+messages. The control process decodes a worker's answer as plain values: decoding constructs dataclasses,
+enumerations and arrays of numbers, but does not call or import anything else. A worker with damaged memory
+may send a wrong value, but cannot run code in the control process or crash it. Answers are not pickled,
+because numpy may crash when it unpickles damaged messages.
 
-Plain values are encoded as MessagePack by msgspec. Numbers, texts, bytes and None are encoded directly; every
-other value is a list that begins with a tag. The content of an array of numbers is in a separate buffer; the
-MessagePack bytes state its type and shape. Only dataclasses, named tuples and enumerations of modules that
-are already imported are constructed, without a call of their own code.
+Plain values are encoded as MessagePack by msgspec. Numbers, texts, bytes and None are encoded directly; any
+other value is encoded as a list that begins with a tag. The content of an array is in a separate buffer; its
+type and shape are encoded as MessagePack. Only dataclasses, named tuples and enumerations of modules that are
+already imported are constructed, and none of their own code is called.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _MOST_DIMENSIONS = 32
 
 
 def encode_values(value: Any) -> tuple[bytes, list[Array]]:
-    """Return the bytes of a value, and its arrays separately. Raises FlightError for an unsupported type."""
+    """Return the encoded bytes of a value, and its arrays. Raises FlightError for an unsupported type."""
     arrays: list[Array] = []
     tree = _tree(value, arrays)
     try:
@@ -62,12 +62,15 @@ def encode_values(value: Any) -> tuple[bytes, list[Array]]:
 
 
 def decode_values(data: bytes, buffers: Sequence[bytearray]) -> Any:
-    """Decode a result of `encode_values`; arrays are views. Damaged data raise any exception."""
+    """Decode a result of `encode_values`, with arrays that are views of `buffers`.
+
+    Damaged data may raise any exception.
+    """
     return _Reader(buffers).made(msgspec.msgpack.decode(data))
 
 
 def _tree(value: Any, arrays: list[Array]) -> Any:
-    """Return plain lists and scalars for a value; its arrays are appended to `arrays`."""
+    """Return a value as plain lists and scalars, and append its arrays to `arrays`."""
     kind = type(value)
     if kind in _PLAIN:
         return value
@@ -94,7 +97,7 @@ def _tree_of_class(value: Any, name: str, arrays: list[Array]) -> list[Any]:
 
 
 class _Reader:
-    """Decodes a value from plain lists and scalars; each array uses the next buffer."""
+    """Decodes a value from plain lists and scalars; each array takes the next buffer."""
 
     def __init__(self, buffers: Sequence[bytearray]) -> None:
         self._buffers = iter(buffers)
@@ -125,7 +128,7 @@ class _Reader:
 
 
 def _array(dtype: str, shape: list[Any], buffer: bytearray) -> Array:
-    """Return a writable array of numbers whose size equals that of its buffer."""
+    """Return a writable array of numbers, which must have the size of its buffer."""
     if dtype not in _DTYPES or len(shape) > _MOST_DIMENSIONS:
         raise FlightError(f"no array has type {dtype[:20]!r} and {len(shape)} dimensions")
     if not all(type(length) is int and length >= 0 for length in shape):
@@ -169,25 +172,25 @@ def _class(name: str) -> type:
 
 
 def _field_names(kind: Any) -> tuple[str, ...] | None:
-    """Return the field names of a dataclass or a named tuple; None for any other class."""
+    """Return the field names of a dataclass or named tuple, or None for any other class."""
     if dataclasses.is_dataclass(kind):
         return tuple(field.name for field in dataclasses.fields(kind))
     return kind._fields if issubclass(kind, tuple) and hasattr(kind, "_fields") else None
 
 
 SLAB_BYTES = 64 * 1024 * 1024
-"""Size (bytes) of the shared memory for a job's arrays; unused pages take no memory."""
+"""Size (bytes) of the shared memory for a job's arrays; unused pages occupy no memory."""
 LONGEST_BYTES = 16 * 1024 * 1024
-"""Largest length (bytes) of a message without its arrays; a greater length indicates damage."""
+"""Largest length (bytes) of a message without its arrays; a larger length is a sign of damage."""
 
 _HEADER = struct.Struct("<QQI")
-"""Header of a message: length of the list of array sizes, length of the body, and the CRC-32 of both."""
+"""Header of a message: length of the list of array sizes, length of the body, and CRC-32 of both."""
 
 
 def pack_trusted(value: Any, slab: mmap.mmap) -> bytes:
-    """Pickle a value; copy its large buffers into the slab, and return the rest after its length.
+    """Pickle a value into a message with a header, and copy its large buffers into the shared memory `slab`.
 
-    Raises FlightError if the slab is too small.
+    Raises FlightError if the shared memory is too small.
     """
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
@@ -195,29 +198,35 @@ def pack_trusted(value: Any, slab: mmap.mmap) -> bytes:
 
 
 def unpack_trusted(message: bytes, slab: mmap.mmap) -> Any:
-    """Unpickle a message of a trusted process, with copies of its buffers from the slab."""
+    """Unpickle a message of a trusted process, with copies of its buffers in the shared memory."""
     body, buffers = _parts(message, slab)
     return pickle.loads(body, buffers=buffers)
 
 
 def pack_values(value: Any, slab: mmap.mmap) -> bytes:
-    """Pack a value for a receiver that does not trust the sender. Raises FlightError for other types."""
+    """Encode a value as a message for a receiver that does not trust the sender.
+
+    Raises FlightError for an unsupported type.
+    """
     body, arrays = encode_values(value)
     return _framed(body, [array.reshape(-1).view("u1").data for array in arrays], slab)
 
 
 def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
-    """Return the value of a message of a worker, made by `pack_values`. Raises FlightError for damage."""
+    """Return the value of a worker's message that `pack_values` made.
+
+    Raises FlightError for a damaged message.
+    """
     try:
         return decode_values(*_parts(message, slab))
     except FlightError:
         raise
-    except Exception as error:  # damaged data can raise any exception
+    except Exception as error:  # damaged data may raise any exception
         raise FlightError(f"unreadable: {type(error).__name__}: {str(error)!r}") from error
 
 
 def message_length(data: bytes | bytearray) -> int | None:
-    """Return the length of the message at the start of `data`; None while its header is incomplete.
+    """Return the length of the message at the start of `data`, or None if its header is incomplete.
 
     Raises FlightError for a length outside the permitted range.
     """
@@ -259,7 +268,7 @@ _PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
 def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
-    """Announce readiness, then answer each message with (outcome, value, error, execution time in ns)."""
+    """Announce readiness, then answer each job with (outcome, value, error, execution time in ns)."""
     line.sendall(pack_values(None, slab))
     received = bytearray()
     while chunk := line.recv(1 << 20):
@@ -269,7 +278,7 @@ def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
             del received[:length]
             line.sendall(_answer(function, argument, slab))
             del argument
-            # Memory is returned after the result was sent, so that the result is not delayed.
+            # Memory is returned to the kernel after the result was sent, which does not delay the result.
             give_back()
 
 
@@ -292,14 +301,14 @@ def _run(function: Any, argument: Any) -> tuple[str, Any, str, int]:
 
 
 def end_with(parent: int) -> None:
-    """Make the kernel kill this process when its parent ends; end now if the parent has ended."""
+    """Let the kernel kill this process when its parent ends, and exit if the parent has already ended."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:
         os._exit(0)
 
 
 def give_back() -> None:
-    """Return the free memory of the heap to the kernel: tens of MB after a frame; takes about 2 ms."""
+    """Return free heap memory to the kernel: tens of megabytes after a frame, in about 2 ms."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
@@ -308,10 +317,10 @@ def give_back() -> None:
 def lean_numpy() -> None:
     """Prevent scipy from importing unused parts of numpy, which saves 11 MiB and 0.2 s in each process.
 
-    scipy (scipy/_lib/array_api_compat) copies every name that numpy lists, and so imports numpy's masked
-    arrays, test support and Fortran reader. This function must be called before scipy is imported. It removes
-    these modules from numpy's list of names; they can still be imported explicitly. With another version of
-    numpy it has no effect.
+    In scipy/_lib/array_api_compat, scipy copies every name that numpy lists, and so imports numpy's masked
+    arrays, test support and Fortran reader. This function must be called before scipy is imported. The
+    function removes these modules from numpy's list of names; they can still be imported explicitly. With a
+    different version of numpy, the function may have no effect.
     """
     np.__all__ = [name for name in np.__all__ if name not in _SELDOM]
     lazy = getattr(np, "__numpy_submodules__", None)
@@ -324,7 +333,7 @@ def main(arguments: list[str]) -> None:
     function_name, socket_fd, memory_fd, parent, cores = arguments
     end_with(int(parent))
     module, _, name = function_name.partition(":")
-    os.nice(5)  # the control loop comes first
+    os.nice(5)  # the control loop has priority
     if cores:
         os.sched_setaffinity(0, map(int, cores.split(",")))
     lean_numpy()

@@ -1,15 +1,15 @@
-"""Job runner for real time: a thread starts, supervises, restarts and reaps the worker processes.
+"""Job runner for real time: a thread that starts, supervises, restarts and reaps the worker processes.
 
-The control thread exchanges finished values with the supervising thread through queues that never wait, so
-that starts and deaths of workers do not delay the control thread. Each worker process has a socket for
-messages, and a memory file for arrays that both processes map, so that frames of several megabytes are not
-sent through a pipe. Each death of a worker is reported as `WorkerNews`.
+The control thread and the supervising thread exchange values through queues that never wait, so that starts
+and deaths of workers do not delay the control thread. Each worker process has a socket for messages, and a
+memory file for arrays that both processes map, so that frames of several megabytes are not sent through a
+pipe. Each death of a worker is reported as `WorkerNews`.
 
-A worker that dies or exceeds its time limit is restarted, within a budget. The first restart is immediate and
-the second is delayed by half a second; each later delay is twice the previous one. The budget is reset when a
-worker has run for a minute. After `BUDGET` deaths in a row, no restart is attempted for ten minutes; then the
-budget is reset, so that the worker recovers on a long flight once the cause has disappeared. One worker is
-therefore started at most `BUDGET` times in 12 minutes.
+A worker that dies or exceeds its time limit is restarted, unless its budget of restarts is used up. The first
+restart is immediate, the second is delayed by half a second, and each later delay is twice as long as the
+previous one. The budget of restarts is reset when a worker has run for a minute. After `BUDGET` deaths in a
+row, the worker is not restarted for ten minutes. Then its budget is reset, so that it recovers on a long
+flight once the cause has disappeared. A worker is therefore started at most `BUDGET` times in 12 minutes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError
 
 BUDGET = 10
-"""Number of deaths in a row after which restarts pause. The delays between them add up to 127.5 s."""
+"""Number of deaths in a row after which restarts pause. The delays of these restarts add up to 127.5 s."""
 FIRST_NS = SECOND_NS // 2
 STEADY_NS = 60 * SECOND_NS
 """Running time (ns) after which a worker's budget of restarts is reset."""
@@ -46,13 +46,13 @@ REST_NS = 600 * SECOND_NS
 
 
 class Attempts:
-    """Counts the deaths of one worker since it last ran for longer than a minute."""
+    """Counts the deaths of a worker since it last ran for more than a minute."""
 
     def __init__(self) -> None:
         self.deaths = 0
 
     def died(self, lived_ns: int) -> int:
-        """Count a death after a running time of `lived_ns`; return the delay (ns) of the restart."""
+        """Count a death after a running time of `lived_ns`, and return the delay (ns) of the restart."""
         if lived_ns >= STEADY_NS or self.is_spent:
             self.deaths = 0
         self.deaths += 1
@@ -67,16 +67,19 @@ class Attempts:
 
 
 JobAnswer = tuple[Outcome, Any, str, int]
-"""Answer of a worker: outcome, value, error, and execution time of the job (ns)."""
+"""A worker's answer: outcome, value, error, and execution time (ns) of the job."""
 
 MODULE = "flight.loop.worker"
-"""Module that a worker process runs."""
+"""Name of the module that a worker process runs."""
 
 _REAPED_WITHIN_S = 1.0
 
 
 class WorkerProcess:
-    """A running worker process. Only one thread may use it. `ready` is whether its function is imported."""
+    """A running worker process. Only one thread may use this object.
+
+    The attribute `ready` states whether the worker has imported its function.
+    """
 
     def __init__(self, worker: Worker, cores: Set[int] = frozenset()) -> None:
         """Start the process on the given cores; an empty set permits all cores. Raises OSError."""
@@ -107,10 +110,10 @@ class WorkerProcess:
             [sys.executable, "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
-            # A process group of its own keeps Ctrl-C from the worker; the control process closes its workers.
-            # The group stays in the session of the control process. If the control process dies while a
-            # worker is stopped, the group is orphaned, and the kernel ends the stopped worker by SIGHUP and
-            # SIGCONT (setpgid(2)), even before Python runs in it.
+            # The process group of its own keeps Ctrl-C from the worker, which the control process closes.
+            # The group stays in the session of the control process.
+            # If the control process dies while a worker is stopped, the group is orphaned.
+            # The kernel then ends the stopped worker by SIGHUP and SIGCONT, even before Python runs.
             process_group=0,
         )
 
@@ -121,17 +124,17 @@ class WorkerProcess:
 
     def is_stopped(self) -> bool:
         """Return whether a signal such as SIGSTOP has stopped the process, even during its start."""
-        look = os.WSTOPPED | os.WNOHANG | os.WNOWAIT  # the process can still be reaped
+        look = os.WSTOPPED | os.WNOHANG | os.WNOWAIT  # with WNOWAIT, the process can still be reaped
         with suppress(ChildProcessError):  # reaped already
             return os.waitid(os.P_PID, self._process.pid, look) is not None
         return False
 
     def fileno(self) -> int:
-        """Return the socket's descriptor, to wait for an answer."""
+        """Return the descriptor of the socket, on which an answer can be awaited."""
         return self._socket.fileno()
 
     def send(self, argument: Any) -> None:
-        """Submit a job. Raises FlightError if it cannot be sent, EOFError if the process has died."""
+        """Submit a job. Raises FlightError if it cannot be sent, and EOFError if the process has died."""
         message = pack_trusted(argument, self._slab)
         if len(message) > LONGEST_BYTES:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
@@ -143,9 +146,9 @@ class WorkerProcess:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
 
     def receive(self) -> JobAnswer | None:
-        """Return an answer that has arrived, else None.
+        """Return an answer that has arrived, or None.
 
-        Raises EOFError if the process died, FlightError for damage.
+        Raises EOFError if the process has died, and FlightError for a damaged message.
         """
         try:
             while chunk := self._socket.recv(1 << 16):
@@ -164,19 +167,19 @@ class WorkerProcess:
                 case ("done" | "failed" as outcome, value, str(text), int(execution_ns)):
                     return outcome, value, text, execution_ns
                 case _:
-                    raise FlightError("the answer is none of a job")
+                    raise FlightError("the answer does not belong to a job")
         return None
 
     def end(self) -> str:
         """Kill the process, reap it and release its memory; return how the process ended."""
         status = self._process.poll()
         if status is None:
-            with suppress(subprocess.TimeoutExpired):  # the process may be writing while it ends
+            with suppress(subprocess.TimeoutExpired):  # the process may still be writing while it ends
                 status = self._process.wait(0.05)
         self._process.kill()
         with suppress(
             subprocess.TimeoutExpired
-        ):  # a process that hangs in the kernel is reaped by a later start
+        ):  # a process that hangs in the kernel is reaped at a later start
             self._process.wait(_REAPED_WITHIN_S)
         self._socket.close()
         self._slab.close()
@@ -186,7 +189,7 @@ class WorkerProcess:
 
 
 START_LIMIT_NS = 60 * SECOND_NS
-"""Longest time (ns) that a worker may take to import its function before it is restarted."""
+"""Longest time (ns) in which a worker must import its function; otherwise it is restarted."""
 _IDLE_MS = 1000.0
 _CLOSE_S = 5.0
 
@@ -206,7 +209,7 @@ class _Kept:
         self._deaths = 0
 
     def due_ns(self) -> int:
-        """Return the next time (ns) at which this worker needs service without a message.
+        """Return the next time (ns) at which this worker must be served without a message, or -1.
 
         -1 for no such time.
         """
@@ -216,12 +219,12 @@ class _Kept:
         return min([*dues, *([] if self.process.ready else [self._begun_ns + START_LIMIT_NS])], default=-1)
 
     def serve(self) -> tuple[list[JobResult], list[WorkerNews]]:
-        """Start the process, exchange messages with it, or reap it; return results and news."""
+        """Start the process, exchange messages with it or reap it, and return results and news."""
         now_ns = self._clock.now_ns()
         try:
             if self.process is None:
                 if now_ns < self._due_ns:
-                    # The job was accepted while the process died.
+                    # This job was accepted while the process was dying.
                     return self._lose("died", "the worker is not running", now_ns), []
                 self._begun_ns = now_ns
                 self.process = WorkerProcess(self.worker, self._cores)
@@ -278,12 +281,12 @@ class _Kept:
         self._due_ns = self._clock.now_ns() + wait_ns
         news = [WorkerNews(self.worker.name, WorkerChange.DIED, f"{text}; starts in {wait_ns * 1e-9:g} s")]
         if self._attempts.is_spent:
-            spent = f"died {self._attempts.deaths} times in a row; rests for {REST_NS * 1e-9:g} s"
+            spent = f"died {self._attempts.deaths} times in a row; not restarted for {REST_NS * 1e-9:g} s"
             news.append(WorkerNews(self.worker.name, WorkerChange.SPENT, spent))
         return results, news
 
     def _lose(self, outcome: Outcome, text: str, now_ns: int) -> list[JobResult]:
-        """Return failed results for the lost jobs, which are the running job and the waiting jobs."""
+        """Return failed results for all lost jobs: the running job and the waiting ones."""
         lost = [self.submitted_ns] if self.submitted_ns >= 0 else []
         while self.inbox:
             lost.append(self.inbox.popleft()[1])
@@ -292,7 +295,7 @@ class _Kept:
 
 
 class ProcessRunner:
-    """A JobRunner whose workers are processes. Only the control thread may call its methods."""
+    """A JobRunner whose workers are processes. Only the control thread may call the methods of this class."""
 
     borrowed_ns = 0
 
@@ -309,7 +312,7 @@ class ProcessRunner:
         self._thread.start()
 
     def submit(self, worker: str, argument: Any) -> bool:
-        """Submit a job; return False if the worker is busy, or was restarted and is not ready yet."""
+        """Submit a job, and return False if the worker is busy or not yet ready after a restart."""
         kept = self._kept[worker]
         if worker in self._busy or not kept.accepts:
             return False
@@ -319,7 +322,7 @@ class ProcessRunner:
         return True
 
     def collect(self) -> list[JobResult]:
-        """Return the results that have arrived. Never waits."""
+        """Return the results that have arrived since the last call. Never waits."""
         results = []
         while self._results:
             results.append(self._results.popleft())
@@ -327,7 +330,7 @@ class ProcessRunner:
         return results
 
     def news(self) -> list[WorkerNews]:
-        """Return the deaths and restarts since the last call. Never waits."""
+        """Return the deaths and restarts of workers since the last call. Never waits."""
         return [self._news.popleft() for _ in range(len(self._news))]
 
     def close(self) -> None:
@@ -346,7 +349,7 @@ class ProcessRunner:
         return {name: process.process_id for name, process in running if process is not None}
 
     def _supervise(self) -> None:
-        """Serve the workers until `close`.
+        """Serve the workers until `close` is called.
 
         The kernel kills the workers when the thread that started them ends.
         """
@@ -361,7 +364,7 @@ class ProcessRunner:
                 kept.process.end()
 
     def _wait(self) -> None:
-        """Wait for a job, an answer or the next due time."""
+        """Wait for a job, an answer, or the next time at which a worker is due."""
         poll = select.poll()
         poll.register(self._bell, select.POLLIN)
         for kept in self._kept.values():

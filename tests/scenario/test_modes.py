@@ -219,7 +219,7 @@ def test_what_led_to_safe_and_is_latched_bars_the_way_out_until_it_is_cleared(tm
     )
     assert modes_of(run) == [Mode.BOOT, Mode.TESTBED_DEMO, Mode.SAFE, Mode.HOLD]
     assert run["command"]["obeyed"].tolist() == [0, 1, 1]
-    assert to_text(run["command"][0]["text"]).endswith("not before it is cleared: task-failing")
+    assert to_text(run["command"][0]["text"]).endswith("refused until cleared: task-failing")
 
 
 @pytest.mark.parametrize("initial", ["testbed-demo", "hold", "detumble"])

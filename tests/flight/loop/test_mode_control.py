@@ -262,7 +262,7 @@ def test_a_latched_fault_bars_the_way_out_of_safe_until_it_is_cleared() -> None:
     for _ in range(2):
         bench.facts.update(facts.TOO_HOT, True, bench.now_ns, "hot")
     assert bench.mode() is Mode.SAFE
-    assert bench.control.command(Mode.HOLD, bench.now_ns) == "not before it is cleared: too-hot"
+    assert bench.control.command(Mode.HOLD, bench.now_ns) == "refused until cleared: too-hot"
     bench.facts.clear("too-hot")
     assert bench.control.command(Mode.HOLD, bench.now_ns) == ""
     assert bench.mode() is Mode.HOLD

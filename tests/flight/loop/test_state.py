@@ -190,7 +190,7 @@ def test_what_may_have_changed_widens_the_start_and_what_is_known_stays_known() 
     [
         (PLANT, [0.0, 0.0, 1.45], "not within 4 sigma"),
         (GYRO_BIAS, [0.0, -0.02, 0.0], "not within 4 sigma"),
-        (GYRO_BIAS, [0.0], "3 values are wanted"),
+        (GYRO_BIAS, [0.0], "3 values are required"),
     ],
 )
 def test_what_cannot_be_true_is_not_taken_and_reported(name: str, values: list[float], why: str) -> None:

@@ -146,7 +146,7 @@ def test_a_copy_that_is_not_there_is_damage_unless_the_first_write_was_interrupt
         reports = Reports()
         assert StateStore(tmp_path, reports).load() == state_of(3)
         assert reports.kinds == reported
-    assert "state-b.json: is gone" in reports.texts[0]
+    assert "state-b.json: is missing" in reports.texts[0]
     (tmp_path / COPIES[0]).write_bytes(b"torn")
     assert StateStore(tmp_path, reports).load() == StoredState(running=True)
     assert reports.kinds[-1] == events.STATE_LOST
