@@ -118,9 +118,8 @@ class Verification:
     """Tracker of the stages of commands that were sent to the control process."""
 
     def __init__(self) -> None:
-        self._open: tuple[Sent, Mode, int] | None = (
-            None  # open command, its final mode, mission time of its answer (ns)
-        )
+        # The open command, its final mode, and the mission time of its answer (ns).
+        self._open: tuple[Sent, Mode, int] | None = None
 
     def answered(self, sent: Sent, answer: bytes) -> list[Report]:
         """Return the reports for an answer of the control process. Empty bytes stand for a missing answer."""
