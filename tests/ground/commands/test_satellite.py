@@ -1,0 +1,446 @@
+"""Commands, parameters and files of a satellite, on stand-ins for the socket and the link."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from flight.link.commands import ChangeMode, Ping, Point, Slew, unpack
+from flight.link.files.store import Store
+from flight.link.modes import Mode
+from flight.link.process import directives
+from flight.link.process.commanding import Report, Request, Stage
+from flight.link.process.directives import CancelFile, Deletion, Listing, Play, Scheduled, Stop
+from flight.link.process.filing import LISTING
+from flight.link.telemetry.definitions import (
+    COMMAND,
+    PARAMETER_FIELDS,
+    PARAMETER_KEYS,
+    PARAMETERS,
+    VERIFICATION,
+    Packet,
+    crc_of,
+)
+from flight.link.telemetry.packets import Packer
+from ground.commands import satellite
+from knightcube.errors import FlightError, UsageError
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal
+from tests.ground.commands.in_process import command
+
+DEFAULTS = {
+    key: (0.5 * (field.valid[0] + min(field.valid[1], field.valid[0] + 1.0)) if field.valid else 0.0)
+    for key, field in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True)
+}
+
+
+def packed(packet: Packet, **values: Any) -> bytes:
+    """Return a packet with zeros and empty texts except for given values."""
+    plain: dict[str, Any] = {}
+    for field in packet.fields:
+        zero: Any = "" if field.kind.startswith("S") else 0
+        plain[field.name] = [zero] * field.count if field.count > 1 else zero
+    return Packer().pack(packet, 0, {**plain, **values})
+
+
+def answer(obeyed: bool, mode: Mode = Mode.HOLD, text: str = "done") -> bytes:
+    """Return the answer of a flight to a command."""
+    return packed(COMMAND, obeyed=int(obeyed), mode=int(mode), text=text, count=4)
+
+
+def table(values: dict[str, float], **changes: Any) -> bytes:
+    """Return a packet of parameters."""
+    numbers = [values[key] for key in PARAMETER_KEYS]
+    fields = {field.name: value for field, value in zip(PARAMETER_FIELDS, numbers, strict=True)}
+    known = {"crc": crc_of(numbers), "loads": 2, "table": 1, "kept": 1}
+    return packed(PARAMETERS, **{**known, **fields, **changes})
+
+
+class Flight:
+    """A flight behind a socket: answers from a list, and keeps what it receives."""
+
+    def __init__(self, *answers: bytes) -> None:
+        self.answers = list(answers)
+        self.packets: list[bytes] = []
+
+    def exchange(self, to: str, data: bytes, timeout: float) -> bytes:
+        self.packets.append(data)
+        return self.answers.pop(0)
+
+
+@pytest.fixture
+def flight(monkeypatch: pytest.MonkeyPatch) -> Flight:
+    """Return a flight that the commands reach instead of a socket."""
+    found = Flight()
+    monkeypatch.setattr(satellite, "exchange", found.exchange)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("obeyed", "status", "line"),
+    [(True, 0, "obeyed: done; mode hold\n"), (False, 1, "refused: done; mode hold\n")],
+)
+def test_a_command_is_sent_and_its_answer_printed(
+    flight: Flight, obeyed: bool, status: int, line: str
+) -> None:
+    flight.answers = [answer(obeyed)] * 2
+    done = command("command", "--to", "socket", "slew", "0.2")
+    assert (done.returncode, done.stdout) == (status, line)
+    assert unpack(flight.packets[-1]) == Slew(0.2)
+    facts = json.loads(command("command", "--to", "socket", "--json", "mode", "hold").stdout)
+    assert facts == {"obeyed": obeyed, "mode": "hold", "text": "done", "count": 4}
+
+
+def test_an_invalid_answer_is_an_error(flight: Flight) -> None:
+    flight.answers = [b"xyz"]
+    done = command("command", "--to", "socket", "ping")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "3 bytes" in done.stderr
+
+
+def test_directives_of_the_link_need_the_link(flight: Flight) -> None:
+    done = command("command", "--to", "socket", "stop-playback")
+    assert done.returncode == 2
+    assert "--link" in done.stderr
+    assert flight.packets == []
+
+
+def words(*arguments: str) -> Any:
+    """Return the options of a typed command."""
+    parser = argparse.ArgumentParser()
+    satellite.configure_command(parser)
+    return parser.parse_args(["--to", "socket", *arguments])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "directive"),
+    [
+        (("play", "1.5", "9", "--run", "3"), Play(3, 1.5, 9.0)),
+        (("stop-playback",), Stop()),
+        (("schedule", "2026-11-23T21:00:00", "slew", "0.2"), Scheduled("2026-11-23T21:00:00", "slew 0.2")),
+        (("unschedule", "7"), Deletion(7)),
+        (("list-schedule",), Listing()),
+    ],
+)
+def test_the_directives_are_packed_as_typed(arguments: tuple[str, ...], directive: Any) -> None:
+    assert directives.unpack(satellite.packet_of(words(*arguments))) == directive
+
+
+def test_angles_are_typed_in_degrees_and_quaternions_as_they_are() -> None:
+    made = satellite._command_of(words("point", "ground", "30", "60", "--roll", "90"))
+    assert isinstance(made, Point)
+    target = made.target
+    assert target.goal is Goal.GROUND
+    assert target.roll == pytest.approx(0.5 * math.pi)
+    assert target.numbers == pytest.approx((math.pi / 6.0, math.pi / 3.0))
+    made = satellite._command_of(words("point", "inertial", "0.6", "0", "0", "0.8"))
+    assert isinstance(made, Point)
+    assert (made.target.numbers, made.target.roll) == ((0.6, 0.0, 0.0, 0.8), None)
+    assert isinstance(satellite._command_of(words("ping")), Ping)
+    assert satellite._command_of(words("mode", "hold")) == ChangeMode(Mode.HOLD)
+
+
+def report(stage: Stage, text: str = "text", counter: int = 1, spi: int = 1) -> Report:
+    """Return a report on a command."""
+    return Report(spi, counter, stage, "ping", text, Request(0, 0))
+
+
+class Link:
+    """A terminal with telemetry from a list."""
+
+    def __init__(self, *packets: bytes) -> None:
+        self.received = list(packets)
+        self.sent: list[bytes] = []
+        self.closed = 0
+
+    def send(self, packet: bytes, spi: int = 1) -> int:
+        self.sent.append(packet)
+        return len(self.sent)
+
+    def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:
+        while self.received:
+            yield 0, self.received.pop(0)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+@pytest.fixture
+def link(monkeypatch: pytest.MonkeyPatch) -> Link:
+    """Return a terminal that the commands open instead of a link."""
+    found = Link()
+    monkeypatch.setattr(satellite, "terminal_of", lambda _: found)
+    return found
+
+
+LINK = ("--link", "127.0.0.1:9", "--keys", "keys")
+
+
+@pytest.mark.parametrize(("last", "status"), [(Stage.COMPLETED, 0), (Stage.FAILED, 1)])
+def test_each_stage_of_a_command_by_the_link_is_printed(
+    link: Link, monkeypatch: pytest.MonkeyPatch, last: Stage, status: int
+) -> None:
+    reports = [report(Stage.ACCEPTED, "a"), report(last, "b", counter=8)]
+
+    def send(_terminal: Any, _packet: bytes, spi: int, seconds: float, show: Any) -> list[Report]:
+        assert (spi, seconds) == (2, 3.0)
+        for one in reports:
+            show(one)
+        return reports
+
+    monkeypatch.setattr(satellite, "send", send)
+    options = ("--spi", "2", "--timeout", "3")
+    done = command("command", *LINK, *options, "ping")
+    assert (done.returncode, done.stdout) == (status, f"accepted: a\n{last.name.lower()}: b\n")
+    facts = json.loads(command("command", *LINK, *options, "--json", "ping").stdout)
+    assert facts == {
+        "obeyed": status == 0,
+        "counter": 8,
+        "stages": [{"stage": "accepted", "text": "a"}, {"stage": last.name.lower(), "text": "b"}],
+    }
+    assert link.closed == 2
+
+
+def test_the_table_of_parameters_is_shown_with_its_bounds(flight: Flight) -> None:
+    flight.answers = [answer(True) + table(DEFAULTS)] * 2
+    done = command("parameters", "--to", "socket")
+    assert done.returncode == 0
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(PARAMETER_KEYS) + 1
+    first, field = lines[0].split(), PARAMETER_FIELDS[0]
+    assert field.valid is not None
+    assert first == [PARAMETER_KEYS[0], f"{DEFAULTS[PARAMETER_KEYS[0]]:g}", field.unit,
+                     f"{field.valid[0]:g}", "to", f"{field.valid[1]:g}"]  # fmt: skip
+    crc = crc_of([DEFAULTS[key] for key in PARAMETER_KEYS])
+    assert f"table {crc:08x}" in lines[-1]
+    assert "2 loads" in lines[-1]
+    facts = json.loads(command("parameters", "--to", "socket", "--json").stdout)
+    assert (facts["crc"], facts["loads"], facts["kept"], facts["refused"]) == (f"{crc:08x}", 2, True, "")
+    assert facts["values"] == pytest.approx(DEFAULTS)
+
+
+def test_a_changed_table_is_sent_whole_and_checked(flight: Flight, tmp_path: Path) -> None:
+    key, other = PARAMETER_KEYS[3], {**DEFAULTS, PARAMETER_KEYS[3]: 77.0}
+    flight.answers = [answer(True) + table(DEFAULTS), answer(True), answer(True) + table(other, kept=0)]
+    done = command("parameters", "--to", "socket", f"{key}=77", "--save", tmp_path / "t.yaml")
+    assert (done.returncode, len(flight.packets)) == (0, 3)
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith(key)]
+    assert line.endswith(f"was {DEFAULTS[key]:g}")
+    assert "not kept" in done.stdout
+    flight.answers = [answer(True) + table(DEFAULTS), answer(True), answer(True) + table(other)]
+    again = command("parameters", "--to", "socket", "--load", tmp_path / "t.yaml")
+    assert again.returncode == 0
+    assert f"was {DEFAULTS[key]:g}" in again.stdout
+    flight.answers = [answer(True) + table(other)]
+    same = command("parameters", "--to", "socket", f"{key}=77")
+    assert (same.returncode, flight.answers) == (0, []), "nothing is sent for the table in use"
+
+
+def test_a_refused_table_is_reported(flight: Flight) -> None:
+    flight.answers = [answer(True) + table(DEFAULTS), answer(False, text="too late")]
+    done = command("parameters", "--to", "socket", f"{PARAMETER_KEYS[3]}=77")
+    assert done.returncode == 1
+    assert "too late" in done.stderr
+    flight.answers = [answer(True) + table(DEFAULTS), answer(True), answer(True) + table(DEFAULTS)]
+    done = command("parameters", "--to", "socket", f"{PARAMETER_KEYS[3]}=77")
+    assert done.returncode == 1, "another table is in use"
+    flight.answers = [answer(True)]
+    assert command("parameters", "--to", "socket").returncode == 1, "no table was sent"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("modes.nothing=1",), "modes.nothing"),
+        ((f"{PARAMETER_KEYS[0]}=much",), "much"),
+        (("--timeout", "0"), "--timeout"),
+        ((f"{PARAMETER_KEYS[0]}=1e9",), PARAMETER_KEYS[0]),
+    ],
+)
+def test_wrong_parameters_are_refused(flight: Flight, arguments: tuple[str, ...], complaint: str) -> None:
+    flight.answers = [answer(True) + table(DEFAULTS)]
+    done = command("parameters", "--to", "socket", *arguments)
+    assert done.returncode == 2
+    assert complaint in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("modes: 3\n", "modes"),
+        ("modes: {slew_limit: yes}\n", "slew_limit"),
+        ("modes: {slew_limit: 5}\n", "missing"),
+    ],
+)
+def test_a_file_of_parameters_is_checked(tmp_path: Path, text: str, complaint: str) -> None:
+    (tmp_path / "t.yaml").write_text(text)
+    done = command("parameters", "--to", "socket", "--load", tmp_path / "t.yaml")
+    assert done.returncode == 2
+    assert complaint in done.stderr
+
+
+def verified(stage: Stage, counter: int = 1, spi: int = 1, text: str = "why") -> bytes:
+    """Return a verification packet."""
+    return packed(VERIFICATION, stage=int(stage), counter=counter, spi=spi, text=text)
+
+
+def by_link(options: Any, wants_table: bool = True) -> Any:
+    """Return what is received for a request over the link."""
+    return satellite._ask_by_link(options, b"packet", wants_table)
+
+
+def test_the_table_arrives_before_or_after_its_verification(link: Link) -> None:
+    options = SimpleNamespace(spi=1, timeout=0.5, link="here")
+    for packets in (
+        [verified(Stage.ACCEPTED), table(DEFAULTS), verified(Stage.COMPLETED)],
+        [verified(Stage.COMPLETED), table(DEFAULTS)],
+    ):
+        link.received, link.sent = list(packets), []
+        found, refused = by_link(options)
+        assert (found.crc, refused, link.received) == (
+            crc_of([DEFAULTS[key] for key in PARAMETER_KEYS]),
+            "",
+            [],
+        )
+    link.received, link.sent = [verified(Stage.COMPLETED), table(DEFAULTS)], []
+    assert by_link(options, wants_table=False) == (None, "")
+    assert len(link.received) == 1, "a load needs no table"
+    link.received, link.sent = [verified(Stage.FAILED), table(DEFAULTS)], []
+    assert by_link(options) == (None, "why")
+    for other in ([], [verified(Stage.COMPLETED, counter=2)], [verified(Stage.COMPLETED, spi=2)]):
+        link.received, link.sent = list(other), []
+        with pytest.raises(FlightError, match=r"within 0\.5 s"):
+            by_link(options)
+
+
+class Session:
+    """A file session whose reports and endings are given turn by turn."""
+
+    def __init__(self, folder: Path, *turns: tuple[list[Report], list[Any]]) -> None:
+        self.received = folder
+        self.received_ns = 10**30
+        self.turns = list(turns)
+        self.asked: list[Any] = []
+        self._reports: list[Report] = []
+        self.ended: list[Any] = []
+        self.entity = SimpleNamespace(ended=self.ended, transfers=list)
+
+    def ask(self, directive: Any, _: int) -> None:
+        self.asked.append(directive)
+
+    def put(self, path: Path, name: str, _: int) -> Any:
+        return SimpleNamespace(number=5, size=path.stat().st_size, name=name)
+
+    def transmit(self, _: int) -> None:
+        reports, ended = self.turns.pop(0)
+        self._reports += reports
+        self.ended += ended
+
+    def take(self, *_: Any) -> None:
+        """Nothing arrives."""
+
+    def reports(self) -> list[Report]:
+        found, self._reports = self._reports, []
+        return found
+
+    def reason_of(self, _: Any) -> str:
+        return "no room"
+
+
+@pytest.fixture
+def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the line be silent without waiting."""
+    monkeypatch.setattr("ground.commands.satellite.select.select", lambda *_: ([], [], []))
+
+
+def work(session: Session, ended: bool = False) -> satellite._FileWork:
+    """Return the file work of a session."""
+    return satellite._FileWork(cast(Any, session), cast(Any, None), 1e9, lambda: ended)
+
+
+def ending(name: str, number: int = 5, condition: int = 0) -> Any:
+    """Return the end of a transfer."""
+    return SimpleNamespace(name=name, number=number, condition=condition)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_files_are_got_put_and_listed(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    session = Session(tmp_path, ([report(Stage.STARTED)], []), ([], [ending("b"), ending("a")]))
+    found = work(session).obey(cast(Any, SimpleNamespace(what="get", names=["a"])))
+    assert (found["files"][0]["name"], found["files"][0]["bytes"]) == ("a", 3)
+    done = Session(tmp_path, ([report(Stage.COMPLETED)], []))
+    work(done).obey(cast(Any, SimpleNamespace(what="get", names=["a"])))
+    assert done.turns == [], "a completed command is the end too"
+    listing = LISTING
+    (tmp_path / listing).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / listing).write_text('{"free": 9, "files": []}')
+    listed = work(Session(tmp_path, ([], [ending(listing)]))).obey(
+        cast(Any, SimpleNamespace(what="list", under="x"))
+    )
+    assert listed["free"] == 9
+    assert "9 bytes" in listed["text"]
+    put = Session(tmp_path, ([], [ending("index/a", 4)]), ([], [ending("index/a")]))
+    options = SimpleNamespace(what="put", kind="index", path=tmp_path / "a")
+    facts = work(put).obey(cast(Any, options))
+    assert (facts["name"], facts["bytes"], put.turns) == ("received/index/a", 3, [])
+
+
+@pytest.mark.usefixtures("quiet")
+def test_a_failed_transfer_is_an_error_with_its_reason(tmp_path: Path) -> None:
+    options = cast(Any, SimpleNamespace(what="get", names=["a"]))
+    with pytest.raises(FlightError, match="a: no room"):
+        work(Session(tmp_path, ([], [ending("a", condition=4)]))).obey(options)
+    with pytest.raises(FlightError, match="text"):
+        work(Session(tmp_path, ([report(Stage.FAILED)], []))).obey(options)
+    with pytest.raises(FlightError, match="signal"):
+        work(Session(tmp_path, ([], [])), ended=True).obey(options)
+    silent = Session(tmp_path, ([], []))
+    silent.received_ns = -(10**30)
+    with pytest.raises(FlightError, match="no packet"):
+        work(silent).obey(options)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_commands_on_files_end_when_they_are_completed(tmp_path: Path) -> None:
+    session = Session(tmp_path, ([report(Stage.STARTED)], []), ([report(Stage.COMPLETED)], []))
+    options = cast(Any, SimpleNamespace(what="cancel", source=1, number=7))
+    found = work(session).obey(options)
+    assert session.asked == [CancelFile(1, 7)]
+    assert found["text"].startswith("completed: ")
+    with pytest.raises(FlightError, match="text"):
+        work(Session(tmp_path, ([report(Stage.REFUSED)], []))).obey(options)
+
+
+@pytest.mark.parametrize("name", ["--rate", "--timeout"])
+@pytest.mark.parametrize("value", ["0", "-1", "inf"])
+def test_rate_and_timeout_of_files_are_positive(name: str, value: str) -> None:
+    done = command("files", *LINK, f"{name}={value}", "list")
+    assert done.returncode == 2
+    assert name in done.stderr
+
+
+def test_the_result_of_a_file_command_is_printed(
+    link: Link, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    facts = {"files": [{"bytes": 12, "name": "a"}], "text": "9 bytes"}
+    monkeypatch.setattr(satellite._FileWork, "obey", lambda *_: facts)
+    link.sealer = lambda *_: None  # type: ignore[attr-defined]  # the session's only use of the link
+    options = ("--folder", str(tmp_path / "store"))
+    done = command("files", *LINK, *options, "list")
+    assert (done.returncode, done.stdout) == (0, "          12 a\n9 bytes\n")
+    assert json.loads(command("files", *LINK, *options, "--json", "list").stdout) == facts
+    assert link.closed == 2
+    assert Store(tmp_path / "store").outgoing() == []
+
+
+def test_an_unknown_name_is_refused() -> None:
+    with pytest.raises(UsageError, match="nothing"):
+        satellite._change("nothing=1")
+    assert satellite._change(f"{PARAMETER_KEYS[0]}=0.5") == (PARAMETER_KEYS[0], 0.5)
