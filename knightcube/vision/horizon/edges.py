@@ -297,8 +297,8 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
 def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
     """Return the matrix (w, p) that converts brightness at w offsets into slopes at p offsets around 0.
 
-    The result is the w offsets, px, the matrix, and the largest of the p offsets, px. The Gaussian has the
-    standard deviation `size`, px. The slope of a sharp unit step is 1 for every `size`.
+    The result is the w offsets (w,), px, the matrix (w, p), and the largest of the p offsets, px. The
+    Gaussian has the standard deviation `size`, px. The slope of a sharp unit step is 1 for every `size`.
     """
     half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
     x: FloatArray = np.arange(-half, half + 1, dtype=float)

@@ -174,7 +174,7 @@ def limb_in_view(
 def log10_chance(
     limb: LimbInView, residuals: FloatArray, others: FloatArray, camera: CameraModel, unknowns: int
 ) -> float:
-    """Return log10 of the significance of a limb: the bound of the number of equally good chance limbs.
+    """Return log10 of the significance of a limb, a bound of the number of equally good false limbs.
 
     Args:
         limb: length of the limb in the image, and its crossings with scan lines.

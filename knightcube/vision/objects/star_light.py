@@ -35,7 +35,7 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import Background, label_pixels, line_of
 from knightcube.vision.objects.streak_ends import Regions, Segmented
 
-# Number of trial star paths per path length along a region.
+# Number of trial star paths along a region, per length of a star path.
 # Maximum length of a chain of successive star streaks in a region, in path lengths.
 _PATHS_PER_LENGTH, _LONGEST_CHAIN = 8, 5.0
 # Spacing (px) of the Gaussians whose sum models a streak.

@@ -294,7 +294,8 @@ def gaussian_kernel(sigma: float, radius: int) -> FloatArray:
 def gaussian_derivative_kernel(sigma: float, radius: int) -> FloatArray:
     """Return the correlation kernel (2 radius + 1,) of the derivative of an image smoothed by `sigma` px.
 
-    The kernel is a factor of the mirrored kernel of Sease, eq. (3.4), which is written for convolution.
+    The outer product of this kernel and `gaussian_kernel` is the kernel of Sease, eq. (3.4), mirrored from
+    convolution to correlation.
     """
     x = np.arange(-radius, radius + 1)
     return np.asarray(x / sigma**2 * gaussian_kernel(sigma, radius))

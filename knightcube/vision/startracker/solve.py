@@ -186,7 +186,7 @@ def timing_covariance(motion: MotionResult) -> FloatArray:
 _LEAST_SIGMA_PX = 0.005
 # Minimum position error (px) of a star due to its colour, for a lens whose accuracy is stated.
 _COLOUR_PX = 0.002
-# Common centroid error as a fraction of the excess of the PSF width (from the campaign `resting`).
+# Centroid error that all stars share, as a fraction of the excess PSF width (from the campaign `resting`).
 _SHAPE_DOUBT = 0.05
 # Position error (px) assumed for an uncalibrated lens in the second attempt to identify the stars.
 # The first attempt assumes smaller errors, so that fewer stars agree by chance.

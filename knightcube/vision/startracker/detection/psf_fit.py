@@ -317,7 +317,7 @@ class PsfFit:
         covariance: covariance of x, y, flux and sky, and of the width if it was fitted (n, p, p).
         chi2: chi-square of each fit (n,).
         used: number of pixels used in each fit (n,).
-        residual, leverage: residual, counts, and leverage of each pixel (n, k, k).
+        residual, leverage: residual (counts) and leverage of each pixel (n, k, k).
         variance: assumed variance of each pixel (n, k, k), counts^2; infinite for unused pixels.
         model: fitted counts of the star without sky (n, k, k).
     """

@@ -31,7 +31,7 @@ from knightcube.vision.frame import (
 )
 
 KERNEL_NORM = 6.0
-"""Noise of the smoothed frame for white noise of 1, which is the root sum square of the kernel."""
+"""Noise of the smoothed frame if each pixel has a white noise of 1 count; root sum square of the kernel."""
 LEAST_SIDE = 16
 # Noise (counts) to which a floating-point frame is scaled.
 _FLOATING_NOISE = 16.0
