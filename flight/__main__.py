@@ -1,13 +1,14 @@
-"""`python -m flight`, and the console script `knightcube`, which is the same."""
+"""The entry point of `python -m flight` and of the equivalent console script `knightcube`."""
 
 import os
 import signal
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    # Ctrl-C ends a command at once, imports too, without a traceback. A flight takes the signal over.
+    # Ctrl-C ends a command at once and without a traceback, even during imports.
+    # A flight installs a signal handler of its own.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-# Matrices here are small: multithreaded BLAS would slow them down.
+# All matrices are small, so that multithreaded BLAS would slow them down.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from flight.app.cli import main

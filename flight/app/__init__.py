@@ -1,5 +1,5 @@
-"""The composition root: opens, flies and closes a configured flight.
+"""Composition of the flight application: opens, flies and closes a configured flight.
 
-The only package of the flight application that knows the kind of hardware: Linux's, simulated in lock-step,
-or simulated in real time in a process of its own.
+Only this package of the flight application knows which hardware is used: the real devices, devices simulated
+in lock-step, or devices simulated in real time in a process of their own.
 """

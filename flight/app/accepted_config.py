@@ -1,13 +1,13 @@
-"""Chooses the configuration to fly: the accepted file or, if damaged, the last configuration that flew.
+"""Chooses the configuration to fly: the accepted file or, if it is damaged, the last configuration that flew.
 
-`deploy/install.sh` writes the SHA-256 of an accepted configuration beside the file. A flight reads its file
-once, verifies these bytes against the sum and flies them: a flipped bit on the disk makes 1.05e-3 a 1.05e-7,
-which validation would not detect. A file without a sum is flown as it stands, unless an accepted
-configuration is kept: then there was a sum.
+The script `deploy/install.sh` writes the SHA-256 checksum of an accepted configuration beside its file. A
+flight reads its file once, verifies the bytes against the checksum, and flies these bytes. A flipped bit on
+the disk can turn 1.05e-3 into 1.05e-7, which validation would not detect. A file without a checksum is flown
+as it is, unless an accepted configuration is stored, which shows that there was a checksum.
 
-A service keeps the accepted configurations that flew, the newest and two older ones, in its state folder.
-Each is one file whose name holds its number and its SHA-256, put in place by one rename: a configuration
-never stands without its sum.
+A service stores the accepted configurations that flew in its state folder: the newest one and two older ones.
+Each stored configuration is one file, created by a single rename, whose name contains a number and the
+SHA-256 checksum, so that there is never a configuration without its checksum.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from knightcube.errors import UsageError
 FOLDER = "flown"
 KEPT = 3
 GOOD_START_NS = 10_000_000_000
-"""After this flight time a configuration is kept."""
+"""Flight time (ns) after which the configuration is stored."""
 
 _NAME = re.compile(r"(\d{6,})-([0-9a-f]{64})\.yaml")
 
 
 @dataclass(frozen=True, slots=True)
 class KeptConfig:
-    """A configuration that flew."""
+    """A stored configuration that flew."""
 
     number: int
     path: Path
@@ -49,7 +49,7 @@ class KeptConfig:
 
 
 def kept_configs(folder: Path) -> list[KeptConfig]:
-    """Return the undamaged configurations kept in a state folder, the newest first. Raises OSError."""
+    """Return the undamaged configurations stored in a state folder, newest first. Raises OSError."""
     found = []
     for number, path, digest in _named(folder):
         with suppress(OSError, UnicodeDecodeError):
@@ -63,17 +63,17 @@ class FlownConfig:
     """Stores the configuration of a flight that has started well."""
 
     def __init__(self, text: str, folder: Path) -> None:
-        """Prepare the storage of `text`, the configuration as read, in a state folder."""
+        """Prepare to store `text`, the configuration as it was read, in a state folder."""
         self._data = text.encode()
         self._folder = folder
         self._kept = False
 
     def serve(self, clock: Clock) -> Ticker:
-        """Return the ticker that keeps the configuration, outside the loop, after `GOOD_START_NS`."""
+        """Return the ticker that stores the configuration, outside the loop, after `GOOD_START_NS`."""
         return clock.ticker("configuration", GOOD_START_NS, self.keep)
 
     def keep(self) -> None:
-        """Write the copy unless the newest copy is the same; a failed write is retried at the next call."""
+        """Store the configuration unless it is the newest stored one; retry a failed write later."""
         if self._kept:
             return
         with suppress(OSError):
@@ -85,7 +85,7 @@ class FlownConfig:
                 name = f"{number:06d}-{hashlib.sha256(self._data).hexdigest()}.yaml"
                 replace_file(LinuxFiles(), place / name, self._data)
                 kept = kept_configs(self._folder)
-            # The newest copies of `KEPT` different texts stay; damaged and older copies go.
+            # Keep the newest copies of `KEPT` different texts, and delete damaged and older copies.
             texts: dict[str, Path] = {}
             for copy in kept:
                 texts.setdefault(copy.text, copy.path)
@@ -97,7 +97,10 @@ class FlownConfig:
 
 
 def _named(folder: Path) -> list[tuple[int, Path, str]]:
-    """Return number, path and digest of the files named like a kept configuration. Raises OSError."""
+    """Return number, path and checksum of the files that are named like a stored configuration.
+
+    Raises OSError.
+    """
     place = folder / FOLDER
     try:
         paths = list(place.iterdir())
@@ -107,9 +110,9 @@ def _named(folder: Path) -> list[tuple[int, Path, str]]:
     return [(int(match[1]), path, match[2]) for match, path in matches if match]
 
 
-_CURE = "was it edited? Then accept it: deploy/install.sh --accept; else put back what was there"
+_CURE = "if it was edited, accept it by deploy/install.sh --accept, otherwise restore it"
 _TRIES = 3
-"""Number of attempts to read a file, because a single failed disk access is not damage."""
+"""Number of attempts to read a file, because a single failed disk access does not mean damage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +120,9 @@ class Chosen:
     """A configuration to fly.
 
     Attributes:
-        path: the file that `text` was read from.
-        problem: why `path` is not the requested file; empty if it is.
-        accepted: whether a checksum beside the requested file confirms the bytes.
+        path: file from which `text` was read.
+        problem: reason why `path` is not the requested file; empty if it is.
+        accepted: whether a checksum beside the requested file confirms its bytes.
     """
 
     path: Path
@@ -129,14 +132,14 @@ class Chosen:
 
 
 def sum_file(path: Path) -> Path:
-    """Return the path of a configuration's checksum, as written by sha256sum."""
-    return path.parent / f"{path.name}.sha256"  # `with_name` would fail on `.`
+    """Return the path of a configuration's checksum file, as written by sha256sum."""
+    return path.parent / f"{path.name}.sha256"  # unlike this, `with_name` would fail on `.`
 
 
 def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
-    """Return the configuration to fly, read once.
+    """Return the configuration to fly, which is read only once.
 
-    Raises UnreadConfigError, with the cure, when `path` is damaged and no configuration that flew is kept.
+    Raises UnreadConfigError, with the cure, if `path` is damaged and no configuration that flew is stored.
     """
     folder = service_folder(environment)
     read = _read_any if folder is None else LinuxFiles().read
@@ -149,11 +152,13 @@ def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
     for one in kept:
         try:
             configuration.parse(one.text, str(one.path))
-        except ConfigError:  # the copy flew with another version of the software
+        except ConfigError:  # the stored configuration flew with another software version
             continue
-        return Chosen(one.path, one.text, f"{path}: {problem}: the last one that flew is flown; {_CURE}")
+        return Chosen(
+            one.path, one.text, f"{path}: {problem}: the last configuration that flew is flown; {_CURE}"
+        )
     if os.path.lexists(sum_file(path)) or folder is not None:
-        problem += f", and no copy of one that flew is kept; {_CURE}"
+        problem += f", and no configuration that flew is stored; {_CURE}"
     raise UnreadConfigError(str(path), problem)
 
 
@@ -182,7 +187,7 @@ def _persistently(read: Callable[[Path], bytes | None], path: Path) -> bytes | N
 
 
 def _read_any(path: Path) -> bytes | None:
-    """Return a bounded number of bytes of any kind of file, for example a pipe."""
+    """Return a limited number of bytes of any kind of file, for example of a pipe."""
     try:
         with path.open("rb") as file:
             return file.read(4 * LARGEST_FILE + 1)
@@ -191,7 +196,7 @@ def _read_any(path: Path) -> bytes | None:
 
 
 def _text(path: Path, data: bytes) -> str:
-    """Return a configuration's text. Raises ConfigError for bytes that are not UTF-8."""
+    """Return the text of a configuration. Raises ConfigError for bytes that are not UTF-8."""
     try:
         return checked_length(data.decode("utf-8"), path)
     except UnicodeDecodeError as error:
@@ -199,15 +204,15 @@ def _text(path: Path, data: bytes) -> str:
 
 
 def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:
-    """Return the configuration as text and as values, with the request's changes in the values.
+    """Return the configuration as text and as values; only the values include the changes of the request.
 
-    `text` is the content of the file; if None, the file is read. Raises ConfigError for a mistake in the
-    file, UsageError for a mistake in the request.
+    If `text`, the content of the file, is None, the file is read. Raises ConfigError for a mistake in the
+    file, and UsageError for a mistake in the request.
     """
     text = read_text(request.config_path) if text is None else text
     config = configuration.parse(text, str(request.config_path))
     if request.faults and config.simulation is None:
-        raise UsageError("--fault: this configuration flies real devices, which break by themselves")
+        raise UsageError("--fault: this configuration flies real devices, in which no fault can be injected")
     if request.faults:
         spoiled = corrupted_text(request, text)
         if spoiled != text:

@@ -1,4 +1,4 @@
-"""Builds the body, the settings, the workers and the tasks of the loop from the configuration."""
+"""Builds body, settings, workers and tasks of the loop from the configuration."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED", "orbit": "flight.bodi
 
 
 def body_kind(config: Config) -> BodyKind:
-    """Return the configured kind of body. Raises ConfigError."""
+    """Return the kind of body that the configuration names. Raises ConfigError."""
     place = BODIES.get(config.body, config.body)
     module, colon, name = place.partition(":")
     if not (module and colon and name):
@@ -68,13 +68,13 @@ def body_kind(config: Config) -> BodyKind:
 
 
 def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> ImagingSettings:
-    """Return the settings of imaging; `frames` is the folder for frames that are kept."""
+    """Return the settings of imaging. Frames are stored in the folder `frames`."""
     model, (least, most) = camera_model(camera), camera.streak_exposure or (camera.exposure, camera.exposure)
     kept = KeptFrames(frames, camera.keep_frames) if frames is not None and camera.keep_frames else None
     return ImagingSettings(
         camera=model,
         exposures=Exposures(camera.exposure, least, most, model.focal_length),
-        # A trigger may come late and the next trigger on time.
+        # This allows for a trigger that comes late while the next one is on time.
         fine_rest_ns=round(((camera.fine_period or camera.period) - 0.5 * camera.period) * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
         late_ns=round(camera.late_after * SECOND_NS),
@@ -96,12 +96,12 @@ def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> I
 
 
 def horizon_camera_settings(cameras: Sequence[WideCamera]) -> HorizonCameraSettings:
-    """Return the times of the horizon cameras: for all cameras those of the most frequent camera."""
+    """Return the times of the horizon cameras; all cameras use those of the most frequent camera."""
     fine_ns = round(min(camera.fine_period for camera in cameras) * SECOND_NS)
     period_ns = min(round(min(camera.period for camera in cameras) * SECOND_NS), fine_ns)
     return HorizonCameraSettings(
         [round(camera.exposure * SECOND_NS) for camera in cameras],
-        period_ns - SECOND_NS // 2,  # run once a second, which may come late
+        period_ns - SECOND_NS // 2,  # the task runs once a second, possibly late
         fine_ns - SECOND_NS // 2,
         min(2 * SECOND_NS, period_ns),
         max(round(max(camera.max_age for camera in cameras) * SECOND_NS), 2 * fine_ns),
@@ -109,7 +109,7 @@ def horizon_camera_settings(cameras: Sequence[WideCamera]) -> HorizonCameraSetti
 
 
 def _tracker(camera: Camera) -> TrackerSettings | None:
-    """Return the settings of the star tracker, None without one."""
+    """Return the settings of the star tracker, or None without a star tracker."""
     section = camera.star_tracker
     if section is None:
         return None
@@ -120,7 +120,7 @@ def _tracker(camera: Camera) -> TrackerSettings | None:
     scale = (1.0 / spread, spread)
     index = Path(section.index) if section.index is not None else None
     velocity = None if section.velocity is None else np.array(section.velocity)
-    # The camera is known on board: no mirror is in its path, and its focal length is as good as configured.
+    # The camera is known: no mirror is in its light path, and its focal length is configured.
     identification = IdentificationSettings(mirror=False, hint_error=1.0)
     accuracy = camera.accuracy
     lens = CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion)
@@ -133,7 +133,10 @@ def _saturation(camera: Camera) -> float:
 
 
 def _estimator(camera: Camera, body: FlightBody) -> LikelihoodSettings | StreakEstimator:
-    """Return the configured estimator of streaks. Raises ConfigError for one that the body does not have."""
+    """Return the estimator of rates from streaks that the camera section selects.
+
+    Raises ConfigError if the body does not have this estimator.
+    """
     if camera.estimator == "likelihood":
         return replace(likelihood_settings(camera), saturation=_saturation(camera))
     if body.streak_estimator is None:
@@ -161,10 +164,10 @@ class Opened:
     """The open devices, workers and logs of a flight.
 
     Attributes:
-        log_error: returns why the flight log fails, empty while it works.
-        channels: sources of commands.
-        feed: feeds the watchdog, called about four times a second.
-        frames: folder of the frames that are kept.
+        log_error: function that returns why the flight log fails, or an empty text while it works.
+        channels: channels on which commands arrive.
+        feed: function that triggers the watchdog, called about four times a second.
+        frames: folder in which frames are stored.
     """
 
     clock: Clock
@@ -178,7 +181,7 @@ class Opened:
 
 
 def build_loop(config: Config, opened: Opened, supervisors: Supervisors) -> FlightLoop:
-    """Return the loop of a configuration. Raises ConfigError for an unknown body."""
+    """Return the flight loop of a configuration. Raises ConfigError for an unknown body."""
     events = EventLog(opened.recorder.event)
     services = Services(
         opened.clock, opened.jobs, opened.recorder, events, Facts(events), Streams(streams_of(config))
@@ -222,7 +225,7 @@ def _tasks(
     steering = Steering(body, drive, services)
     low_rate, low_for = config.detumble.low_rate, config.detumble.low_for
     modes = ModeControl(ModeSettings(config.modes, low_rate, low_for, stop), body, steering, services)
-    # A worker is stalled after twice the timeout at which the runner kills it.
+    # A worker is considered stalled after twice the time limit at which the job runner kills it.
     busy = [(PLANNER, planner.busy_since_ns, config.executive.planner_timeout)]
     if imaging is not None:
         busy.append((imaging_task.WORKER, imaging.busy_since_ns, config.executive.vision_timeout))

@@ -1,7 +1,7 @@
-"""Opens the wires (Linux's or the simulator's), and the configured devices on them.
+"""Opens the buses and ports, real or simulated, and the configured devices on them.
 
-`sim_hal.rig` is the only module of the simulator that the flight application imports, and only for a
-simulated flight: on board none of it is imported.
+The module `sim_hal.rig` is the only module of the simulator that the flight application imports, and only for
+a simulated flight.
 """
 
 from __future__ import annotations
@@ -64,21 +64,21 @@ def corrupted_text(request: RunRequest, text: str) -> str:
 
 
 def injected_faults(request: RunRequest, text: str) -> tuple[str, ...]:
-    """Return the faults of a flight as texts, beginning with the configuration's."""
+    """Return the faults of a flight as texts, first those of the configuration."""
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.injected_faults(_simulation_request(request, text))
 
 
 def simulated_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) -> Rig:
-    """Open the emulated devices of a configuration, with the request's faults. Raises UsageError."""
+    """Open the emulated devices of a configuration with the requested faults. Raises UsageError."""
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.open_rig(_simulation_request(request, text), config, stack)
 
 
 def simulated_camera(config_path: Path, text: str, config: Config, rate: FloatArray) -> PosedCamera:
-    """Return the emulated camera of a configuration, turning at `rate` (3,) rad/s in camera axes."""
+    """Return the emulated camera of a configuration, rotating at `rate` (3,), rad/s, in camera axes."""
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.open_camera(rig.SimulationRequest(config_path, text, Path()), config, rate)
@@ -100,7 +100,7 @@ def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """The open devices; a device is None or empty if the configuration does not have it."""
+    """The open devices; devices that the configuration does not have are None or empty."""
 
     unit: InertialUnit
     coils: TorqueCoils
@@ -112,9 +112,9 @@ class Devices:
 
 
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:
-    """Open the devices, the coils first, so that they are at zero before anything else happens.
+    """Open the devices, beginning with the coils, so that these are at zero before anything else happens.
 
-    Raises DeviceError for a device that does not answer; a `patient` flight retries instead.
+    Raises DeviceError for a device that does not answer, unless the flight is `patient` and retries.
     """
     coils = PwmTorqueCoils(
         Pca9685(rig.wires.i2c, config.coils.address, rig.clock), rig.clock, coil_settings(config)
@@ -140,7 +140,10 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
 
 
 def open_gps(config: Config, rig: Rig, stack: ExitStack) -> UbloxReceiver | None:
-    """Open the GPS receiver; None if it is not configured. Its first readings set it up."""
+    """Open the GPS receiver, or return None if it is not configured.
+
+    The receiver is configured when it is first read.
+    """
     if config.gps is None or rig.wires.gps is None:
         return None
     gps = UbloxReceiver(rig.wires.gps, rig.clock, round(config.gps.period * SECOND_NS))
@@ -149,7 +152,7 @@ def open_gps(config: Config, rig: Rig, stack: ExitStack) -> UbloxReceiver | None
 
 
 def open_strings(config: Config, rig: Rig, stack: ExitStack) -> AdsSolarStrings | None:
-    """Open the converters of the solar cells; None if they are not configured."""
+    """Open the converters of the solar cells, or return None if they are not configured."""
     section = config.solar_strings
     if section is None:
         return None
@@ -160,7 +163,7 @@ def open_strings(config: Config, rig: Rig, stack: ExitStack) -> AdsSolarStrings 
 
 
 def check_settings(config: Config) -> None:
-    """Raise ConfigError, with the driver's range, for a value that a driver does not accept."""
+    """Raise ConfigError, with the permitted range, for a value that a driver does not accept."""
     for section, settings in (("coils", coil_settings), ("inertial_unit", unit_settings)):
         try:
             settings(config)
@@ -181,7 +184,7 @@ def coil_settings(config: Config) -> CoilSettings:
 
 
 def unit_settings(config: Config) -> Vn100Settings:
-    """Return the settings of the inertial unit's driver; readings are in the testbed frame."""
+    """Return the settings of the inertial unit's driver, whose readings are in the testbed frame."""
     unit = config.inertial_unit
     mounting = np.array(unit.mounting)
     return Vn100Settings(
@@ -194,9 +197,9 @@ def unit_settings(config: Config) -> Vn100Settings:
 
 
 def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
-    """Open the wires, and switch the coils off before anything else can fail.
+    """Open buses and ports, and switch the coils off before anything else can fail.
 
-    Raises ConfigError, or DeviceError for missing hardware; a `patient` flight waits for it instead.
+    Raises ConfigError, and DeviceError for missing hardware unless the flight is `patient` and waits for it.
     """
     clock = SystemClock()
     i2c = LinuxI2cBus(config.coils.bus, patient=patient, exclusive=True)
@@ -224,7 +227,7 @@ def linux_camera(
 ) -> FrameSource:
     """Open the configured camera.
 
-    Raises ConfigError if none is named, or DeviceError for missing hardware; a `patient` flight waits for it.
+    Raises ConfigError without a camera, and DeviceError for missing hardware unless the flight is `patient`.
     """
     device, shape = camera.device, (camera.columns, camera.rows)
     exposure_ns = round(camera.exposure * SECOND_NS)
@@ -250,8 +253,8 @@ def linux_camera(
     else:
         raise ConfigError(
             "camera.device",
-            "real devices are flown: say which camera, `{kind: v4l2, path: ...}` or `{kind: aravis, name: "
-            "...}`, or say `camera: none`",
+            "real devices are flown: give `{kind: v4l2, path: ...}` or `{kind: aravis, name: ...}`, or give "
+            "`camera: none`",
         )
     source = ServedCamera(opened, clock, patient=patient)
     stack.callback(source.close)

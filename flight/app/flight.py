@@ -1,6 +1,8 @@
-"""A flight from its request to its result. The coils are at zero when `fly` returns or raises.
+"""A flight from request to result.
 
-`open_flight` opens logs, guardian, devices, workers and channels on a rig, in this order.
+The coils are at zero when the function `fly` returns or raises an exception.
+
+The function `open_flight` opens logs, guardian, devices, workers and channels, in this order.
 """
 
 from __future__ import annotations
@@ -53,15 +55,16 @@ def open_flight(
     patient: bool = False,
     earlier: Sequence[Path] = (),
 ) -> tuple[FlightLoop, FlightLog]:
-    """Open logs, devices and workers; return the loop, ready to run, and its log.
+    """Open logs, devices and workers, and return the loop, which is ready to run, and the flight log.
 
-    `stack` closes everything in the opposite order, the coils at zero. Raises DeviceError for a device that
-    does not answer; a `patient` flight waits in BOOT for devices and for a disk that cannot be written.
-    `earlier` are folders of earlier runs, which show an old state.
+    The stack closes everything in the opposite order, with the coils at zero. Raises DeviceError for a device
+    that does not answer, unless the flight is `patient`: then it waits in BOOT for its devices, and for a
+    disk that cannot be written. The folders `earlier` of earlier runs serve to detect that the stored state
+    is outdated.
     """
     flight_log = open_log(folder, "flight", rig, config, stack, patient)
     performance_log = open_log(folder, "performance", rig, config, stack, patient)
-    # Closed after the devices, with the coils at zero; opened last, so that a boot counts once it flies.
+    # The stored state is closed after the devices, and opened last, so that only a boot that flies counts.
     after_coils = stack.enter_context(ExitStack())
     guardian = start_guardian(rig, stack)
     devices = open_devices(config, rig, stack, patient)
@@ -117,13 +120,13 @@ def next_whole_second(clock: Clock) -> int:
 
 
 def mission_zero(clock: Clock) -> int:
-    """Return mission time zero in real time: the third next slot of the 40 Hz grid."""
+    """Return mission time zero in real time: the start of the third next slot of the 40 Hz grid."""
     return (clock.now_ns() // _GRID_NS + 3) * _GRID_NS
 
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """A request whose configuration was read from the file of `chosen`, and validated."""
+    """A request whose configuration was read from the file in `chosen`, and validated."""
 
     request: RunRequest
     chosen: Chosen
@@ -144,9 +147,11 @@ class _Opened:
 
 
 def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None = None) -> RunResult:
-    """Fly a configuration to its end. Raises UsageError for a user mistake, DeviceError for a device.
+    """Fly a configuration to its end.
 
-    On a board the start is retried until it succeeds. Raises StoppedError if a signal ends the attempts.
+    Raises UsageError for a mistake of the user, and DeviceError for a device that fails.
+
+    On a board, the start is retried until it succeeds. Raises StoppedError if a signal ends these attempts.
     """
     with EndingSignals() as signals, ExitStack() as stack:
         opened = _start(request, signals, stack)
@@ -172,7 +177,10 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
 
 
 def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Opened:
-    """Return a flight that is ready; `stack` closes it. A board, which has an archive, retries the start."""
+    """Return a flight that is ready to begin. `stack` closes it.
+
+    A board, which has an archive, retries the start until it succeeds.
+    """
     judge = partial(_judge, request)
     if request.archive is None:
         return _open(judge(), stack)
@@ -185,7 +193,10 @@ def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Op
 
 
 def _judge(request: RunRequest) -> _Judged:
-    """Read the configuration once, and judge it. Raises UnreadConfigError, UsageError for a wrong one."""
+    """Read the configuration once, and validate it.
+
+    Raises UnreadConfigError, and UsageError for an invalid configuration.
+    """
     path = request.config_path
     chosen = accepted_config(path, os.environ) if request.accepted else Chosen(path, read_text(path))
     request = replace(request, config_path=chosen.path)
@@ -196,7 +207,7 @@ def _judge(request: RunRequest) -> _Judged:
 
 
 def _open(judged: _Judged, stack: ExitStack) -> _Opened:
-    """Open a flight. The run folder in an archive is removed if the opening fails."""
+    """Open a flight. If this fails, the run folder is removed from the archive."""
     chosen, text, config = judged.chosen, judged.text, judged.config
     stack.enter_context(placing(text, str(chosen.path)))
     request, earlier = begin_folder(judged.request, text, config)
@@ -225,11 +236,11 @@ def placing(text: str, name: str) -> Iterator[None]:
 
 
 def _open_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) -> Rig:
-    """Return the configured hardware."""
+    """Return the real or simulated hardware of a configuration."""
     if config.simulation is not None:
         return simulated_rig(request, text, config, stack)
     if request.seed is not None:
-        raise UsageError("--seed: this configuration flies real devices, which draw their own noise")
+        raise UsageError("--seed: this configuration flies real devices, whose noise has no seed")
     if request.devices is not None:
         raise UsageError("--devices: this configuration flies real devices, not simulated ones")
     return linux_rig(config, stack, request.archive is not None)

@@ -1,4 +1,4 @@
-"""A run: its request, its folder with the configuration and the logs, and its result."""
+"""A run: its request, its folder with configuration and logs, and its result."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from knightcube.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """A request to fly. `duration` in s and `seed` replace the configuration's when given.
+    """A request to fly. If given, `duration` (s) and `seed` replace those of the configuration.
 
-    `devices` is the file of a running server of simulated devices; without it, a server is started.
-    `archive` holds the runs of a board: the flight's folder is the archive's next, instead of `out`.
-    `accepted` flies `config_path` only if it is the accepted file, else the last one that flew.
-    `faults` are injected in simulation, in addition to the configuration's, see `sim_hal.faults.schedule`.
+    The file `devices` belongs to a running server of simulated devices; without it, a server is started. The
+    folder `archive` contains the runs of a board; its next run folder is then used instead of `out`. If
+    `accepted` is true, `config_path` is flown only if it is the accepted file, otherwise the last one that
+    flew. The simulated `faults` are injected in addition to those of the configuration
+    (`sim_hal.faults.schedule`).
     """
 
     config_path: Path
@@ -38,10 +39,11 @@ class RunRequest:
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """How a flight ended; `interrupted` when by a signal.
+    """The result of a flight; `interrupted` states whether a signal ended it.
 
-    `ending` is how the loop stood. `restart` says why the process should be restarted, empty when it should
-    not. `faults` were injected.
+    The state of the loop at its end is `ending`. The text `restart` states why the process should be
+    restarted; it is empty if no restart is needed. The text of each injected fault is in `faults`. `faults`
+    were injected.
     """
 
     folder: Path
@@ -54,31 +56,31 @@ class RunResult:
 
 
 def utc_ns() -> int:
-    """Return the machine's UTC, ns since 1970."""
+    """Return the machine's UTC, in ns since 1970."""
     return SystemClock().utc_ns()
 
 
 def utc_text() -> str:
-    """Return the machine's UTC as text, for names of folders."""
+    """Return the machine's UTC as text for names of folders."""
     return f"{datetime.fromtimestamp(utc_ns() * 1e-9, UTC):%Y%m%d-%H%M%S}"
 
 
 _NEWEST = 4
-"""Runs that are asked for the number of their boot."""
+"""Number of newest runs in which the number of the last boot is searched."""
 
 
 def default_folder(config_path: Path) -> Path:
-    """Return the default folder of a run, named after its configuration and the time."""
+    """Return the default folder of a run, which is named after its configuration and the time."""
     return Path("runs") / f"{config_path.stem}-{utc_text()}"
 
 
 def begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunRequest, list[Path]]:
-    """Create the run's folder, the archive's next if there is an archive.
+    """Create the folder of the run, which is the next folder of the archive if there is an archive.
 
-    Return the request with its path, and the folders of the archive's newest runs before.
+    Return the request with the path of this folder, and the folders of the newest earlier runs.
 
-    Raises UsageError for a folder that holds a run, and for a folder that cannot be written; a board with an
-    archive flies on in spite of disk trouble, and its logs wait for the disk.
+    Raises UsageError for a folder that already contains a run, and for a folder that cannot be written. A
+    board with an archive flies in spite of disk trouble, and its logs wait for the disk.
     """
     earlier: list[Path] = []
     if request.archive is not None:
@@ -88,7 +90,7 @@ def begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunReq
         request = replace(request, out=run.folder)
     out = request.out
     if any(out.glob("*.ccsds")):
-        raise UsageError(f"{out} holds a run already: give another folder, or remove this one")
+        raise UsageError(f"{out} already contains a run: give another folder, or remove this one")
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "config.yaml").write_text(text, encoding="utf-8")
@@ -100,7 +102,7 @@ def begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunReq
 
 
 def open_log(folder: Path, stem: str, rig: Rig, config: Config, stack: ExitStack, patient: bool) -> FlightLog:
-    """Open one log of the run, synchronised to disk once a second in real time."""
+    """Open a log of the run, which is synchronised to disk once a second in real time."""
     log = FlightLog(
         folder,
         stem,

@@ -1,24 +1,27 @@
-"""The flight as a service: retries of its start, signals, the release that it proves, and its supervisors.
+"""The flight as a service: retries of its start, signals, proof of its software release, and supervisors.
 
-On a board nobody can restart a flight or the link, so the start is retried until it succeeds. An invalid
-configuration ends the start, because waiting would not help. Other problems may pass: an error of a disk, a
-missing address or folder, a bus that another flight holds. After each failure everything that was opened is
-closed, with the coils at zero; the start is retried after 0.2 s, and after twice as long each time, up to 30
-s. An unexpected exception ends the process, and the service manager starts a new one.
+Nobody can restart a flight or the link on a board, so the start is retried until it succeeds. An invalid
+configuration ends the start, because waiting would not help. Other problems may pass: a disk error, a missing
+address or folder, or a bus that another flight uses. After each failed attempt, everything that was opened is
+closed, with the coils at zero. The first pause before the next attempt is 0.2 s, and each later pause is
+twice as long, up to 30 s. An unexpected exception ends the process, and the service manager starts a new
+process.
 
-The signals that end a flight are SIGINT of Ctrl-C, SIGTERM, and the SIGHUP of a terminal that closes.
+The signals that end a flight are SIGINT (Ctrl-C), SIGTERM, and SIGHUP when a terminal closes.
 
-`deploy/releases.py` chooses the release before any of this runs, counts its starts in the same file of the
-state folder, and passes its name and its reasons in the environment. A flight proves its release after a
-minute, and reports why another release was left.
+The script `deploy/releases.py` runs before the flight. It chooses the software release, counts its starts in
+a file of the state folder, and passes its name and the reasons of the choice in the environment. After a
+minute of flight, the release is recorded as proven, and the flight reports why another release was abandoned.
 
-The external supervisors are the guardian of the coils and the service manager. The loop calls `beat` at the
-end of every control cycle without an error, and `feed` while nothing is stalled. A running loop does not
-prove that commands reach the coils, so heartbeats are passed on only while the coil driver's job runs. The
-first heartbeat also reports READY, because the devices are open and the loop runs.
+The external supervisors of the flight are the guardian of the coils and the service manager. The loop calls
+`beat` at the end of every control cycle without an error, and `feed` while nothing is stalled. A running loop
+does not prove that commands reach the coils, so heartbeats are passed to the guardian only while the job of
+the coil driver runs. With the first heartbeat, READY is reported to the service manager, because the devices
+are open and the loop runs.
 
-When large blocks are freed, glibc raises its mmap threshold (mallopt(3)). Frames are then allocated on the
-heap, small blocks fragment the heap, and it grows. Fixed thresholds prevent this; another libc ignores them.
+When large memory blocks are freed, glibc raises its threshold for mapping blocks separately (mallopt(3)).
+Later frames are then allocated on the heap, where small blocks cause fragmentation, so that the heap grows.
+Fixed thresholds prevent this growth; a C library other than glibc ignores them.
 """
 
 from __future__ import annotations
@@ -63,14 +66,14 @@ T = TypeVar("T")
 
 
 class StoppedError(FlightError):
-    """A signal came before the flight, or the link, could begin."""
+    """A signal arrived before the flight or the link had begun."""
 
 
 class StartRetry:
-    """Waits between the attempts of a start, reports their problems, and feeds the watchdog."""
+    """Waits between the attempts of a start, reports their problems, and triggers the watchdog."""
 
     def __init__(self, interrupted: Callable[[], bool], clock: Clock | None = None) -> None:
-        """`interrupted` returns whether a signal has arrived."""
+        """`interrupted` is a function that returns whether a signal has arrived."""
         self._interrupted = interrupted
         self._clock = clock or SystemClock()
         self._overseer = ServiceManager(os.environ, os.getpid())
@@ -79,19 +82,19 @@ class StartRetry:
         self._problem = ""
 
     def summary(self) -> str:
-        """Return the number and the duration of the attempts; empty if the first attempt succeeded."""
-        begun = f"begun at try {self._failed + 1} after {self._waited:.1f} s"
+        """Return number and duration of the attempts; empty if the first attempt succeeded."""
+        begun = f"begun at attempt {self._failed + 1} after {self._waited:.1f} s"
         return f"{begun}: {self._problem}" if self._failed else ""
 
     def wait(self, problem: str, pause: float) -> None:
-        """Wait `pause` (s) because of a problem. Raises StoppedError if a signal arrives."""
+        """Wait for `pause` s because of a problem. Raises StoppedError if a signal arrives."""
         self._failed += 1
         self._waited += pause
         self._problem = problem
         with suppress(OSError):
             sys.stderr.write(f"flight: cannot begin yet: {problem}; tried again in {pause:g} s\n")
             sys.stderr.flush()
-        self._overseer.status(f"waiting to begin, {self._failed} tries: {problem}")
+        self._overseer.status(f"waiting to begin, {self._failed} attempts: {problem}")
         until_ns = self._clock.now_ns() + round(pause * SECOND_NS)
         while not self._interrupted() and (now_ns := self._clock.now_ns()) < until_ns:
             self._overseer.feed_watchdog()
@@ -101,17 +104,17 @@ class StartRetry:
             raise StoppedError(f"stopped before it could begin: {problem}")
 
     def close(self) -> None:
-        """Close the line to the service manager. Safe to call twice."""
+        """Close the connection to the service manager. Safe to call twice."""
         self._overseer.close()
 
 
 def retried_start(
     judge: Callable[[], J], attempt: Callable[[J, ExitStack], T], stack: ExitStack, retry: StartRetry
 ) -> T:
-    """Return the result of the first attempt that succeeds; `stack` closes what it opened.
+    """Return the result of the first attempt that succeeds; `stack` closes what this attempt opened.
 
-    Each attempt reads and validates a configuration by `judge`, and opens it by `attempt`. Raises UsageError
-    for an invalid configuration, StoppedError after a signal.
+    Each attempt reads and validates a configuration with `judge`, and opens it with `attempt`. Raises
+    UsageError for an invalid configuration, and StoppedError after a signal.
     """
     for pause in pauses():
         try:
@@ -131,7 +134,7 @@ def retried_start(
 
 
 def pauses() -> Iterator[float]:
-    """Yield the pauses between attempts, in s."""
+    """Yield the pauses (s) between the attempts of a start."""
     pause = FIRST_PAUSE_S
     while True:
         yield pause
@@ -142,10 +145,10 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class EndingSignals:
-    """A context that ends a flight after the running cycle when a signal arrives.
+    """A context in which a signal ends the flight after the running cycle.
 
-    A signal during the opening ends the flight at its first cycle, and a second signal interrupts the
-    opening. A SIGHUP that the process ignores, as under nohup, stays ignored.
+    A signal during the opening ends the flight at its first cycle; a second signal interrupts the opening. If
+    the process ignores SIGHUP, as under nohup, SIGHUP stays ignored.
     """
 
     def __init__(self) -> None:
@@ -159,13 +162,13 @@ class EndingSignals:
         return bool(self._received)
 
     def end(self, loop: FlightLoop) -> None:
-        """End this flight when a signal arrives, or at once if a signal has arrived."""
+        """End this flight when a signal arrives, or at once if a signal has already arrived."""
         self._loop = loop
         if self._received:
             self._stop(self._received[0])
 
     def __enter__(self) -> EndingSignals:
-        # Only the main thread receives signals, so they do not end a flight in another thread.
+        # Signal handlers can be set only in the main thread; a flight in another thread ignores signals.
         if threading.current_thread() is not threading.main_thread():
             return self
         for number in _ENDING:
@@ -192,15 +195,15 @@ class EndingSignals:
 NAME, NOTE = "KNIGHTCUBE_RELEASE", "KNIGHTCUBE_RELEASE_NOTE"
 TRIALS = "releases.json"
 PROVEN_NS = 60 * SECOND_NS
-"""Flight time (ns) after which a release is proven: power cuts and crashes no longer count against it."""
+"""Flight time (ns) after which a release is proven, so that later crashes no longer count against it."""
 _KEPT = 4
 
 
 class FlownRelease:
-    """The release of this flight; without a name the flight proves no release."""
+    """The software release that flies; without a name, no release is recorded as proven."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
-        """Read the release's name and note from the process's environment."""
+        """Read name and note of the release from the environment of the process."""
         self._name = environment.get(NAME, "")
         self.note = environment.get(NOTE, "")
         folder = service_folder(environment)
@@ -208,12 +211,12 @@ class FlownRelease:
         self._done = False
 
     def serve(self, clock: Clock, stack: ExitStack) -> None:
-        """Prove the release after `PROVEN_NS`, outside the loop, until `stack` is closed."""
+        """Record the release as proven after `PROVEN_NS`, outside the loop, until `stack` is closed."""
         if self._path is not None:
             stack.callback(clock.ticker("release", PROVEN_NS, self.prove).stop)
 
     def prove(self) -> None:
-        """Record that this release has flown; a failed write is retried a minute later."""
+        """Record this release as proven; a failed write is retried a minute later."""
         if self._path is None or self._done:
             return
         with suppress(OSError):
@@ -222,7 +225,7 @@ class FlownRelease:
             self._done = True
 
     def end(self) -> None:
-        """Reset the count of starts of a release that ends by itself, proven or not."""
+        """Reset the count of starts, because this release ended by itself."""
         if self._path is not None:
             with suppress(OSError):
                 self._write(_proven(self._path))
@@ -234,7 +237,7 @@ class FlownRelease:
 
 
 def _proven(path: Path) -> list[str]:
-    """Return the proven releases; an empty list if the file is missing or damaged."""
+    """Return the proven releases, or an empty list if the file is missing or damaged."""
     with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
         kept: dict[str, Any] = json.loads(LinuxFiles().read(path) or b"")
         return [str(name) for name in kept["proven"]]
@@ -242,9 +245,9 @@ def _proven(path: Path) -> list[str]:
 
 
 LARGE_BYTES = 256 * 1024
-"""Size (bytes) from which a block is mapped separately, and returned to the kernel when freed."""
+"""Size (bytes) from which a block is mapped separately, and returned to the kernel when it is freed."""
 SPARE_BYTES = 4 * 1024 * 1024
-"""Free memory (bytes) kept at the heap's top, so that cycles seldom call the kernel."""
+"""Free memory (bytes) kept at the top of the heap, so that control cycles seldom call the kernel."""
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 
@@ -252,8 +255,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 def settle_memory() -> None:
     """Set the heap's thresholds, and replace the automatic garbage collection by a `Collector`.
 
-    Call this once the flight is built. All present objects are exempt from collections, which would otherwise
-    take tens of ms of a control cycle to examine modules and tasks.
+    This function is called when the flight has been built. All present objects are exempt from garbage
+    collection, because examining all modules and tasks would take tens of ms in a control cycle.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -265,10 +268,11 @@ def settle_memory() -> None:
 
 
 class Collector:
-    """Collects the garbage since its last call, and exempts the surviving objects from later calls.
+    """Collects the garbage since its last call, and exempts the surviving objects from later collections.
 
-    Only a failure makes garbage that needs a collection. Called every few seconds, a collection examines few
-    objects and takes at most 2 ms. The first call only exempts the objects of the flight's start.
+    Only failures create garbage that needs a collection. If it is called every few seconds, a collection
+    examines few objects and takes at most 2 ms. The first call only exempts the objects that the start of the
+    flight created.
     """
 
     def __init__(self) -> None:
@@ -283,9 +287,9 @@ class Collector:
 
 
 _THROTTLE_NS = 1_000_000_000
-"""Throttle (ns) of the supervision's events; a guardian is replaced at most once per second."""
+"""Shortest time (ns) between events of one kind; a guardian is replaced at most once per second."""
 _UNSERVED_NS = 150_000_000
-"""Longest time (ns) without a run of the coil driver's job, three of its periods, before heartbeats stop."""
+"""Longest gap (ns), three periods, of the coil driver's job for which heartbeats are passed on."""
 
 _EVENTS = {
     GuardianNews.LOST: events.GUARDIAN_LOST,
@@ -296,7 +300,7 @@ _EVENTS = {
 
 
 class Supervision:
-    """Passes heartbeats to the guardian, and reports its state changes as events."""
+    """Passes heartbeats to the guardian, and reports the guardian's state changes as events."""
 
     def __init__(
         self,
@@ -308,15 +312,15 @@ class Supervision:
         coils: Ticker,
         settle: Callable[[], None] | None = None,
     ) -> None:
-        """Connect the supervisors with the coil driver's job `coils`.
+        """Connect the supervisors with `coils`, the job of the coil driver.
 
-        Once ready, the service manager shows `status`. `settle` is called once, before READY is reported,
-        when all parts of the flight exist.
+        The service manager shows the text `status` once the flight is ready. The function `settle` is called
+        once, when all parts of the flight exist, before READY is reported.
         """
         self._guardian = guardian
         self._overseer = overseer
         self._clock = clock
-        # A separate log, because events occur before there is a loop, and none of them needs a reaction.
+        # This log is separate, because events occur before the loop exists, and no event has a reaction.
         self._events = EventLog(recorder.event, _THROTTLE_NS)
         self._status = status
         self._coils = coils
@@ -325,11 +329,11 @@ class Supervision:
         self._notes: list[tuple[EventKind, str]] = []
 
     def note(self, kind: EventKind, text: str) -> None:
-        """Keep an event of the start, to be reported once the flight has begun."""
+        """Store an event of the start, which is reported when the flight has begun."""
         self._notes.append((kind, text))
 
     def beat(self) -> None:
-        """Pass a heartbeat on, unless the coil driver's job is stalled; never waits."""
+        """Pass a heartbeat to the guardian, unless the job of the coil driver is stalled."""
         if self._clock.now_ns() - self._coils.served_ns > _UNSERVED_NS:
             return
         self._guardian.beat()
@@ -344,7 +348,7 @@ class Supervision:
         self._events.flush(self._clock.now_ns())
 
     def feed(self) -> None:
-        """Feed the watchdog; restart the guardian if needed and report its state changes."""
+        """Trigger the watchdog, restart the guardian if needed, and report its state changes."""
         self._overseer.feed_watchdog()
         now_ns = self._clock.now_ns()
         notes = self._notes + [(_EVENTS[news], news.value) for news in self._guardian.tend(now_ns)]
@@ -356,12 +360,12 @@ class Supervision:
 CONTROL_PRIORITY = 50
 """SCHED_FIFO priority of the control thread and of the coil driver's thread."""
 NEXT_PRIORITY = CONTROL_PRIORITY - 10
-"""Priority of the other threads of the control process."""
+"""SCHED_FIFO priority of the other threads of the control process."""
 _COLLECT_NS = 2 * SECOND_NS
 
 
 def start_guardian(rig: Rig, stack: ExitStack) -> GuardianLine | None:
-    """Start the guardian before any coil can be energised; close the guardian last, with the coils off."""
+    """Start the guardian before any coil can be energised, and close it last, with the coils off."""
     if rig.reach is None:
         return None
     guardian = GuardianLine(rig.reach)
@@ -370,7 +374,7 @@ def start_guardian(rig: Rig, stack: ExitStack) -> GuardianLine | None:
 
 
 def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: ExitStack) -> Supervision:
-    """Connect the supervisors, and give the control loop and the coil driver priority."""
+    """Connect the supervisors, and raise the priority of the control loop and the coil driver."""
     overseer = ServiceManager(os.environ, os.getpid())
     stack.callback(overseer.close)
     first = [thread for thread in threading.enumerate() if thread.name == COILS]
@@ -396,10 +400,10 @@ def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: E
 
 
 def prioritise_other_threads() -> None:
-    """Give the other threads of this process, for log, serial line and disk, the next lower priority.
+    """Give the other threads of this process (log, serial line, disk) the next lower priority.
 
-    A thread that is preempted while it holds the interpreter's lock blocks the control thread too, for a time
-    slice or more on a busy machine.
+    A thread with a low priority could be preempted while it holds the interpreter's lock, which would block
+    the control thread for a time slice or longer on a busy machine.
     """
     for thread in threading.enumerate():
         if thread is not threading.main_thread() and thread.name != COILS:

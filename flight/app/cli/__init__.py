@@ -1,8 +1,8 @@
-"""The command line: one module a command; a mistake of the user's is one line and exit status 2.
+"""The command line: each command is a module; a user's mistake gives one line and exit status 2.
 
-Only the module of the command that was typed is imported: a board that flies has no use for the others. A
-command does its work to the end though nobody reads: its pipe may be closed (`| head`), its terminal may be
-gone, or it may have been started without one (`>&-`).
+Only the module of the requested command is imported, because a board in flight does not need the others. A
+command finishes its work even if its output is not read: if its pipe is closed (`| head`), if its terminal is
+gone, or if it was started without one (`>&-`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ class _Outlet(io.FileIO):
     _lost = False
 
     def write(self, data: Any, /) -> int:
-        """Write bytes; return how many are done with. Raises OSError once, such as for a full disk."""
+        """Write bytes, and return how many were written or discarded.
+
+        Raises OSError once for an error such as a full disk.
+        """
         try:
             if not self._lost:
                 return super().write(data)
@@ -44,11 +47,11 @@ class _Outlet(io.FileIO):
 
 
 def outlast_readers() -> None:
-    """Replace the process's two output streams; streams that a caller put there are left alone."""
+    """Make standard output and error survive a closed reader; streams replaced by a caller stay unchanged."""
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is None:
-            # The number is free: a file that is opened next would get it, and the output of others.
+            # The descriptor is closed: without a substitute, the next opened file would receive its output.
             while (held := os.open(os.devnull, os.O_WRONLY)) < number:
                 pass
             if held != number:
@@ -69,13 +72,13 @@ COMMANDS = {
     "link": "connect a flight to its ground by protected frames",
     "check": "check a configuration and the devices that it names, before it is flown",
 }
-"""What a board has; the packages of `GROUP` add theirs."""
+"""The commands of the flight application; packages with entry points in `GROUP` add more."""
 
 GROUP = "knightcube.commands"
-"""Entry points: tables with the purpose and the MODULE:FUNCTION of each command of a package."""
+"""Group of entry points: tables with the purpose and the MODULE:FUNCTION of each command of a package."""
 
 PROGRAM = "knightcube" if Path(sys.argv[0]).name == "knightcube" else "python -m flight"
-"""How this was started: by its console script or as a module."""
+"""Name by which the program was started: its console script or the module."""
 
 _EXAMPLES = f"""\
 examples:
@@ -91,10 +94,10 @@ examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return the exit status: 0 done, 1 ran and failed, 2 wrong use."""
+    """Run a command, and return the exit status: 0 success, 1 failure, 2 wrong use."""
     outlast_readers()
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # a file's name need not be a text
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names may contain bytes that are not text
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _obey(words)
@@ -103,8 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (FlightError, DeviceError) as error:
         return _complain(str(error), 1)
     except KeyboardInterrupt:
-        return _complain("interrupted", 130)  # as a shell counts what SIGINT ended
-    except OSError as error:  # a name that no file can have, a folder that may not be entered
+        return _complain("interrupted", 130)  # the exit status that shells use for SIGINT
+    except OSError as error:  # such as an invalid file name or a folder without permission
         if error.filename is None:
             return _complain(error.strerror or str(error), 1)
         return _complain(f"{error.filename}: {error.strerror}", 2)
@@ -141,14 +144,14 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
 
 def _available(words: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return purpose and MODULE:FUNCTION of each command; other packages are not searched for `own` ones."""
+    """Return purpose and MODULE:FUNCTION of each command; other packages are searched only if needed."""
     own = {name: (purpose, f"{__name__}.{name}:configure") for name, purpose in COMMANDS.items()}
     if words and words[0] in own:
         return own
     others: dict[str, tuple[str, str]] = {}
     for found in metadata.entry_points(group=GROUP):
         if importlib.util.find_spec(found.module.partition(".")[0]) is None:
-            continue  # on a board: the installer leaves the ground package out
+            continue  # a board has no ground package
         table: dict[str, tuple[str, str]] = found.load()
         others |= {name: (purpose, f"{found.module}.{target}") for name, (purpose, target) in table.items()}
     return own | others

@@ -1,8 +1,8 @@
-"""`flight check`: whether a configuration would fly, here and now.
+"""The command `flight check`, which checks whether a configuration can be flown at present.
 
-`probe` looks for the real devices that a configuration names. Nothing is set up, and no coil is driven. A
-device that does not answer is reported with the cure. A running flight holds its serial port and its camera:
-they are then reported as busy.
+The function `probe` looks for the real devices that a configuration names. No device is configured, and no
+coil is driven. A device that does not answer is reported together with the cure. The serial port and the
+camera that a running flight uses are reported as busy.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from hal.drivers.pca9685 import MODE1
 from hal.drivers.vn100.driver import Vn100
 from hal.interfaces.errors import DeviceError, NotResponding
 
-_CHIP_CURE = "is it powered, wired and at this address? `i2cdetect -y` shows who answers"
+_CHIP_CURE = "check power, wiring and address; `i2cdetect -y` lists the chips that answer"
 _LISTENED_NS = 2_500_000_000
 _LOOK_NS = 20_000_000
 
@@ -51,7 +51,7 @@ class Probed:
 
 
 def probe(config: Config) -> list[Probed]:
-    """Return each device that the configuration names, and each file or folder that a flight needs."""
+    """Return the result of each device, file and folder that the configuration needs."""
     found = list(_chips(config))
     unit = config.inertial_unit
     found.append(_probed("inertial_unit", unit.device, lambda stack: _ask_unit(config, stack)))
@@ -106,7 +106,7 @@ def _ask_unit(config: Config, stack: ExitStack) -> str:
 
 
 def _listen(device: str, baud_rate: int, stack: ExitStack) -> str:
-    """Wait for the bytes that a GPS receiver sends by itself, at least once a second."""
+    """Wait for bytes of the GPS receiver, which sends without a request at least once a second."""
     clock = SystemClock()
     port = PySerialPort(device, baud_rate, clock)
     stack.callback(port.close)
@@ -115,13 +115,13 @@ def _listen(device: str, baud_rate: int, stack: ExitStack) -> str:
         if port.receive():
             return "sends"
         clock.sleep_until_ns(clock.now_ns() + _LOOK_NS)
-    silence = f"opens, but not one byte came in {_LISTENED_NS * 1e-9:g} s"
+    silence = f"opens, but no byte arrived in {_LISTENED_NS * 1e-9:g} s"
     raise NotResponding(device, f"{silence}: check power, the cable and the baud rate")
 
 
 def _open_camera(camera: Camera | WideCamera, stack: ExitStack) -> str:
     linux_camera(camera, SystemClock(), stack)
-    return "opens; `flight camera` shows what it sees"
+    return "opens; `flight camera` shows its images"
 
 
 def _files(config: Config) -> Iterator[Probed]:
@@ -132,7 +132,7 @@ def _files(config: Config) -> Iterator[Probed]:
         yield Probed("camera.star_tracker.index", tracker.index, there, "is there" if there else cure)
     if config.commands.socket is not None:
         there = Path(config.commands.socket).parent.is_dir()
-        cure = "no such folder: systemd makes it for the service (RuntimeDirectory), else make it"
+        cure = "no such folder: systemd creates it for a service (RuntimeDirectory), otherwise create it"
         yield Probed("commands.socket", config.commands.socket, there, "has its folder" if there else cure)
 
 
@@ -141,7 +141,7 @@ FLOWN_S = 10.0
 
 @dataclass(slots=True)
 class CheckResult:
-    """The result of a check; an empty list of `problems` means ready to fly."""
+    """The result of a check; the configuration is ready to fly if the list `problems` is empty."""
 
     config: Config
     path: Path
@@ -154,10 +154,10 @@ class CheckResult:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
-        "Check a configuration before it is flown. Its values are validated. Where it names real devices, "
-        "each is looked for and asked for a sign of life; nothing is set up and no coil is driven. One that "
-        "is missing is named with the cure. Where it has a simulation, ten seconds of it are flown in "
-        "lock-step. Exit status 0: ready; 1: not ready; 2: the configuration is refused."
+        "Check a configuration before it is flown. Its values are validated. If it names real devices, each "
+        "device must answer; no device is configured and no coil is driven. A missing device is reported "
+        "with the cure. If it has a simulation, ten seconds of it are flown in lock-step. Exit status "
+        "0: ready; 1: not ready; 2: the configuration is refused."
     )
     carried = ", ".join(names())
     parser.add_argument("config", type=config_path, metavar="CONFIG", help=f"YAML file, or one of {carried}")
@@ -166,7 +166,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def check(options: argparse.Namespace) -> int:
-    """Check a configuration and print the verdict; return 1 if it is not ready to fly."""
+    """Check a configuration, print the result, and return 1 if it is not ready to fly."""
     from flight.app.accepted_config import accepted_config  # noqa: PLC0415
     from flight.app.cli.check import probe  # noqa: PLC0415
     from flight.app.composition import body_kind  # noqa: PLC0415 - the whole flight hangs on these
@@ -190,7 +190,7 @@ def check(options: argparse.Namespace) -> int:
 
 
 def _fly(verdict: CheckResult) -> None:
-    """Fly the beginning in lock-step, in a temporary folder."""
+    """Fly the first seconds in lock-step, in a temporary folder."""
     from flight.app.flight import fly  # noqa: PLC0415
 
     duration, begun = min(FLOWN_S, verdict.config.duration), time.perf_counter()
@@ -201,7 +201,7 @@ def _fly(verdict: CheckResult) -> None:
 
 
 def flight_problems(result: RunResult) -> list[str]:
-    """Return the problems of a flight. Events and alarms count only if no faults are injected."""
+    """Return the problems of a flight. Events and alarms are problems only if no faults are injected."""
     ending = result.ending
     problems = [text for text in (result.log_error, result.restart, ending.coil_error) if text]
     if result.interrupted:

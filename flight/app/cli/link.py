@@ -1,4 +1,4 @@
-"""`flight link`: the link process between a flight and its ground."""
+"""The command `flight link`, which runs the link process between a flight and its ground station."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _NICE = 10
 
 @dataclass(frozen=True, slots=True)
 class _JudgedLink:
-    """A valid configuration: its link, its command socket, and why another file was read."""
+    """A validated configuration: its link section, its command socket, and why another file was read."""
 
     link: Link
     socket: Path
@@ -53,8 +53,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
         "Connect a flight to its ground by protected frames (`link` in its configuration): live telemetry "
-        "and playback from its log, commands to its socket. A process of its own, at low priority. It waits "
-        "for what may come yet, such as keys, an address or a free port, and says so; SIGTERM ends it."
+        "and playback from its log, commands to its socket. The link is a process of its own, at low "
+        "priority. While keys, an address or a port are missing, it reports this and waits. SIGTERM ends it."
     )
     parser.add_argument("config", type=config_path, metavar="CONFIG", help="the configuration that is flown")
     parser.add_argument(
@@ -62,21 +62,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="DIR",
-        help="folder of the run, or of the archive: its newest run is followed",
+        help="folder of the run, or of an archive, whose newest run is followed",
     )
     parser.set_defaults(command=link)
 
 
 def link(options: argparse.Namespace) -> int:
-    """Open the lines, with retries until that succeeds, and run the link until a signal.
+    """Open the lines, with retries until this succeeds, and run the link until a signal arrives.
 
-    Raises ConfigError for an invalid configuration. After any other problem that ends the link, its unit
-    restarts it.
+    Raises ConfigError for an invalid configuration. Any other problem ends the process, which the service
+    manager then restarts.
     """
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    with suppress(OSError):  # the unit of a service sets the priority, and its sandbox forbids this call
+    with suppress(OSError):  # for a service, systemd sets the priority and forbids this call
         os.nice(_NICE)
     try:
         _run(options.config, options.log, ended.is_set)
@@ -90,7 +90,7 @@ def link(options: argparse.Namespace) -> int:
 
 
 def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
-    """Start the link as soon as nothing prevents it, and run it until `ended` returns true."""
+    """Start the link as soon as this is possible, and run it until `ended` returns true."""
     with ExitStack() as stack:
         retry = StartRetry(ended)
         stack.callback(retry.close)
@@ -105,8 +105,8 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
 
 
 def _judge(config_path: Path, log: Path) -> _JudgedLink:
-    """Read and validate the configuration. Raises UnreadConfigError, ConfigError."""
-    # A service keeps the last configuration that flew beside its archive.
+    """Read and validate the configuration of the link. Raises UnreadConfigError and ConfigError."""
+    # A service stores the configurations that flew in the folder that also contains its archive.
     chosen = accepted_config(config_path, {"STATE_DIRECTORY": str(log.absolute().parent)})
     config = parse(chosen.text, str(chosen.path))
     if config.link is None or config.commands.socket is None:
@@ -115,7 +115,10 @@ def _judge(config_path: Path, log: Path) -> _JudgedLink:
 
 
 def _open(log: Path, judged: _JudgedLink, stack: ExitStack) -> _OpenedLink:
-    """Open keys and lines. Raises UsageError, FlightError, DeviceError, OSError for temporary problems."""
+    """Open keys and lines.
+
+    Raises UsageError, FlightError, DeviceError or OSError for problems that may pass.
+    """
     if judged.problem:
         _say(judged.problem)
     section, clock = judged.link, SystemClock()
@@ -134,7 +137,7 @@ def _open(log: Path, judged: _JudgedLink, stack: ExitStack) -> _OpenedLink:
 
 
 def _open_lines(section: Link, clock: SystemClock, stack: ExitStack) -> list[Line]:
-    """Open the configured lines; `stack` closes each. Raises UsageError, DeviceError."""
+    """Open the configured lines, which `stack` closes. Raises UsageError and DeviceError."""
     peers, lines = peer_networks(section), list[Line]()
 
     def add(line: Line) -> None:

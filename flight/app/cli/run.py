@@ -1,4 +1,4 @@
-"""`flight run`: fly a configuration, and print the summary of the flight."""
+"""The command `flight run`, which flies a configuration and prints a summary of the flight."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from knightcube.errors import FlightError
 
 
 def summary_text(result: RunResult, elapsed: float) -> str:
-    """Return how a flight went, in lines; `elapsed` s on the machine's clock."""
+    """Return the summary of a flight as lines; `elapsed` (s) is measured by the machine's clock."""
     ending = result.ending
     lines = [
         ("flown", f"{ending.mission_time:.0f} s in {elapsed:.1f} s, {result.reason}"),
@@ -35,7 +35,7 @@ def summary_text(result: RunResult, elapsed: float) -> str:
 
 
 def summary_facts(result: RunResult, elapsed: float) -> dict[str, Any]:
-    """Return how a flight went, for `--json`."""
+    """Return the summary of a flight for the option `--json`."""
     ending = result.ending
     return {
         "folder": str(result.folder),
@@ -56,7 +56,7 @@ def summary_facts(result: RunResult, elapsed: float) -> dict[str, Any]:
 
 
 def counts_text(counts: Mapping[str, int], noun: str) -> str:
-    """Return how often each event of a kind came, in a phrase."""
+    """Return the number of events of each kind as a phrase."""
     if not counts:
         return f"no {noun}"
     return f"{noun} " + ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
@@ -79,7 +79,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", type=config_path, metavar="CONFIG", help=f"YAML file, or one of {carried}")
     place = parser.add_mutually_exclusive_group()
     place.add_argument("--out", type=Path, metavar="DIR", help="folder of the run (default runs/NAME-TIME)")
-    place.add_argument("--archive", type=Path, metavar="DIR", help="folder of a board's runs: fly the next")
+    place.add_argument(
+        "--archive", type=Path, metavar="DIR", help="folder of a board's runs, to which this run is added"
+    )
     parser.add_argument("--duration", type=float, metavar="S", help="another duration")
     parser.add_argument("--seed", type=seed_number, metavar="N", help="another seed of the simulation")
     parser.add_argument(
@@ -119,7 +121,7 @@ def _faults_help() -> str:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly, showing progress on standard error; print the summary."""
+    """Fly, show progress on standard error, and print the summary."""
     from flight.app.flight import fly  # noqa: PLC0415 - no other command needs devices
     from flight.app.run import default_folder  # noqa: PLC0415
     from flight.app.service import StoppedError  # noqa: PLC0415
@@ -136,11 +138,11 @@ def run(options: argparse.Namespace) -> int:
         accepted=True,
     )
     begun = time.perf_counter()
-    # A service writes no lines into the journal for days: its log has all of it.
+    # A service shows no progress in the journal, because its flight log contains everything.
     progress = None if options.archive and not sys.stderr.isatty() else progress_on(sys.stderr)
     try:
         result = fly(request, progress)
-    except StoppedError as error:  # by whoever started the service
+    except StoppedError as error:  # whoever started the service stopped it
         sys.stderr.write(f"flight: {error}\n")
         return 0
     except OSError as error:
@@ -156,12 +158,12 @@ def run(options: argparse.Namespace) -> int:
         sys.stdout.write(summary_text(result, elapsed))
     for problem in filter(None, (result.log_error, result.restart)):
         sys.stderr.write(f"flight: {problem}\n")
-    # A service manager restarts a service that failed.
+    # The exit status 1 makes a service manager restart the service.
     return 1 if result.log_error or result.restart else 0
 
 
 def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
-    """Return a function that shows progress: on a terminal in one line, elsewhere in a line every 10 s."""
+    """Return a function that shows progress: in one line of a terminal, or else a new line every 10 s."""
     terminal = stream.isatty()
     period, before, after = (0.2, "\r\x1b[K", "") if terminal else (10.0, "", "\n")
     last = time.perf_counter()
@@ -174,7 +176,7 @@ def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
         last = now
         of = f"/{progress.duration:.0f}"
         currents = " ".join(f"{1e3 * current:+.1f}" for current in progress.currents)
-        with suppress(OSError):  # such as a full disk: no flight suffers from that
+        with suppress(OSError):  # an error such as a full disk must not affect the flight
             stream.write(
                 f"{before}{progress.mission_time:6.0f}{of} s  {progress.attitude}  "
                 f"coils {currents} mA  {progress.state}  "
@@ -186,7 +188,10 @@ def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
 
 
 def seed_number(text: str) -> int:
-    """Return the seed that an argument gives. Raises ArgumentTypeError unless the log can hold it."""
+    """Return the seed given as an argument.
+
+    Raises ArgumentTypeError if the seed does not fit the flight log.
+    """
     try:
         value = int(text)
     except ValueError as error:

@@ -77,7 +77,7 @@ def test_a_run_is_not_written_over(tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     again = command("run", DEMO, "--duration", "1", "--out", tmp_path)
     assert again.returncode == 2
-    assert "holds a run already" in again.stderr
+    assert "already contains a run" in again.stderr
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 

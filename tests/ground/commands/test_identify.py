@@ -72,7 +72,7 @@ def test_a_mistake_is_one_line_and_exit_status_2(flown: tuple[Path, dict[str, ob
     for words, complaint in (
         (["identify", place / "run", "--seed", "3"], "--seed"),
         (["identify", DEMO, "--out", place / "plant.yaml"], "exists already"),
-        (["identify", DEMO, "--run", place / "run"], "holds a run already"),
+        (["identify", DEMO, "--run", place / "run"], "already contains a run"),
         (["identify", "nothing.yaml"], "nothing.yaml: cannot be read"),
     ):
         done = command(*words)

@@ -26,7 +26,7 @@ PLAN = "plan --from 0.1 --to 0"
         ("run step_demo --out TMP/a --seed 1e22", "'1e22' is not a whole number from 0 to 2^64 - 1"),
         ("run step_demo --out TMP/a --seed 99999999999999999999", "from 0 to 2^64 - 1"),
         ("run step_demo --out TMP/a --realtime --devices /etc/passwd", "/etc/passwd names no server"),
-        ("identify step_demo --run TMP/held --duration 5", "holds a run already: give another folder, or"),
+        ("identify step_demo --run TMP/held --duration 5", "already contains a run: give another folder, or"),
     ],
 )
 def test_wrong_use_is_status_2(words: str, complaint: str, tmp_path: Path) -> None:

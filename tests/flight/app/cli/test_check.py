@@ -156,7 +156,7 @@ def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) 
             found = {item["name"]: item for item in json.loads(done.stdout)["devices"]}
             assert found["gps"]["found"] is answer, found["gps"]
             assert {"solar_strings, 0x48", "solar_strings, 0x49", "wide_cameras[0]"} < set(found)
-            assert "not one byte came" in found["gps"]["text"] or answer
+            assert "no byte arrived" in found["gps"]["text"] or answer
     finally:
         os.close(master)
         os.close(slave)

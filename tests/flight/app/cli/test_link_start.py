@@ -101,7 +101,7 @@ def test_a_port_that_is_taken_is_waited_for_and_the_service_manager_learns_of_ea
         service.notifies("EXTEND_TIMEOUT_USEC=")
     while "link open on UDP" not in (line := service.says("")):
         assert "cannot begin yet" in line
-    assert "begun at try" in line
+    assert "begun at attempt" in line
     service.notifies("READY=1")
     for _ in range(2):
         service.notifies("WATCHDOG=1")
