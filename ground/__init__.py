@@ -1,1 +1,4 @@
-"""What a person does: report, export, calibrate, identify, look at pictures. Never on board."""
+"""Tools for people on the ground: reports, exports, calibration, identification and pictures.
+
+No module of this package runs on board a satellite.
+"""

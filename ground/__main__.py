@@ -1,4 +1,4 @@
-"""`python -m ground`: the same commands as `python -m flight`."""
+"""Command line of `python -m ground`, which has the same commands as `python -m flight`."""
 
 from flight.__main__ import main
 

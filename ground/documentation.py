@@ -1,4 +1,4 @@
-"""The definition table as Markdown for people and as JSON for ground stations.
+"""Packet definition table as Markdown for people and as JSON for ground stations.
 
 `python -m ground.documentation [--json]`
 """
@@ -40,7 +40,7 @@ bytes is UTF-8 text, padded with zeros; its last byte is always zero.
 
 
 def database() -> dict[str, Any]:
-    """Return the table with every field's offset from the packet's first byte, ready for JSON."""
+    """Return the packet definitions as JSON data, with every field's offset from the packet's first byte."""
     return {
         "byte_order": "big-endian",
         "primary_header_bytes": HEADER_BYTES,
@@ -54,12 +54,12 @@ def database() -> dict[str, Any]:
 
 
 def command_table(layouts: Mapping[str, Layout] = COMMAND_LAYOUTS) -> list[dict[str, Any]]:
-    """Return telecommands with their fields, ready for JSON."""
+    """Return the telecommands and their fields as JSON data."""
     return [_packet(layout) for layout in layouts.values()]
 
 
 def markdown() -> str:
-    """Return the table as Markdown."""
+    """Return the packet definition table as Markdown."""
     return _FOREWORD + "".join(_section(layout) for layout in LAYOUTS.values())
 
 
@@ -89,7 +89,7 @@ def _packet(layout: Layout) -> dict[str, Any]:
 
 
 def _details(field: Field) -> dict[str, Any]:
-    """Return what only some fields have: states, bits, limits, the number at which a counter wraps."""
+    """Return the optional properties of a field: states, bits, limits, and the wrap of a counter."""
     limits = field.limits
     details: dict[str, Any] = {
         "states": [list(state) for state in field.states],
@@ -104,7 +104,7 @@ def _details(field: Field) -> dict[str, Any]:
 
 
 def meaning_of(field: Field) -> str:
-    """Return the meaning of a field in words, with its states or bits, its ranges and its end."""
+    """Return a text of a field's meaning, states or bits, ranges and counter wrap."""
     parts = [field.meaning] if field.meaning else []
     levels = {number: f" ({level})" for number, level in field.alarms}
     for word, labels in (("", field.states), ("bits: ", field.bits)):

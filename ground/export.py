@@ -1,7 +1,7 @@
-"""Packets of a run as CSV files, Parquet files, or one SQLite database.
+"""Export of the packets of a run to CSV files, Parquet files, or one SQLite database.
 
-All formats have the same columns: mission time `time_s` first, and arrays as columns such as quaternion_1 to
-quaternion_4. Numbers have full precision.
+All formats have the same columns. The first column is the mission time `time_s`, and an array has one column
+per element, such as quaternion_1 to quaternion_4. Numbers are written with full precision.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from knightcube.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class PacketColumn:
-    """A column: texts as a list, or numbers as an array (n,) in native byte order."""
+    """Values of a column, as a list of texts or an array (n,) of numbers in native byte order."""
 
     name: str
     unit: str
@@ -34,7 +34,7 @@ class PacketColumn:
 
 
 def tables(run: Run) -> Iterator[tuple[str, list[PacketColumn]]]:
-    """Yield name and columns of each packet type in the run."""
+    """Yield the name and the columns of each packet type in the run."""
     for name, layout in LAYOUTS.items():
         if len(run[name]):
             yield name, list(_columns(layout, run[name]))
@@ -58,7 +58,7 @@ def _columns(layout: Layout, packets: PacketArray) -> Iterator[PacketColumn]:
 def write_csv(run: Run, folder: Path) -> list[Path]:
     """Write `<packet>.csv` for each packet type and return the files. Raises OSError.
 
-    The first row has the names of the columns, the second row begins with '#' and has the units.
+    The first row contains the names of the columns. The second row begins with '#' and contains the units.
     """
     paths = []
     for name, columns in tables(run):
@@ -75,7 +75,7 @@ def write_csv(run: Run, folder: Path) -> list[Path]:
 
 _TYPES = {"f": "REAL", "i": "INTEGER", "u": "INTEGER"}
 _MAX_INTEGER = (1 << 63) - 1
-"""Largest integer in SQLite."""
+"""Largest integer that SQLite supports."""
 
 
 def write_database(run: Run, file: Path) -> list[Path]:
@@ -122,7 +122,7 @@ def _plain(column: PacketColumn) -> list[object]:
 
 
 def _is_wide(values: npt.NDArray[Any]) -> bool:
-    """Return whether values are too large for SQLite's integers."""
+    """Return whether a value is too large for an SQLite integer."""
     return bool(values.dtype.kind == "u" and np.any(values > _MAX_INTEGER))
 
 
@@ -149,7 +149,7 @@ def write_parquet(run: Run, folder: Path) -> list[Path]:
 
 
 FORMATS = {"csv": "csv", "parquet": "parquet", "sqlite": "run.sqlite"}
-"""Default folder, or file for SQLite, of each format in the folder of a run."""
+"""Default output of each format in the folder of a run: a folder, or for SQLite a file."""
 
 
 def export(run: Run, place: Path, form: str = "csv") -> list[Path]:

@@ -1,7 +1,7 @@
 """Tracked objects as CCSDS messages.
 
 Tracking Data Messages (503.0-B-2) and Orbit Parameter Messages (502.0-B-3) are in keyword = value notation.
-First orbits are determined from the sightings and from the satellite's own positions in the `track` packets.
+Initial orbits are determined from the sightings and the satellite's positions in the `track` packets.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _SECOND_NS = 1_000_000_000
 
 
 def write_tracking_data(run: Run, path: Path) -> list[Path]:
-    """Write the measured tracks of a run to `path` and return it in a list.
+    """Write the measured tracks of a run to the file `path`, and return a list of this path.
 
-    There is one segment per object, with right ascension and declination measured in each frame, in ICRS at
-    mid-exposure. The camera's aberration is removed, the light time is not. Standard deviations are in
-    comments, because the message has no keyword for them. MAG is the mean of the last sightings. Raises
-    UsageError if no object was tracked or `path` cannot be written.
+    Each object has one segment, with right ascension and declination measured in each frame, in ICRS at
+    mid-exposure. The aberration of the camera is corrected, and the light time is not corrected. Standard
+    deviations are written as comments, because the message format has no keyword for them. MAG is the mean
+    magnitude of the last sightings. Raises UsageError if no object was tracked or `path` cannot be written.
     """
     tracks = run["track"]
     measured = tracks[np.all(np.isfinite(tracks["measured"]), axis=1)] if len(tracks) else tracks
@@ -62,16 +62,16 @@ def write_tracking_data(run: Run, path: Path) -> list[Path]:
 
 
 def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
-    """Return the lines of one object's segment."""
+    """Return the lines of the segment of one object."""
     dates = [ccsds_date(start_ns + int(time)) for time in track["middle_ns"]]
     sigma = track["measured_sigma"] * _ARCSECONDS
     lines = [
         "",
         "META_START",
         f"COMMENT Standard deviation of each angle on the sky {np.median(sigma):.2f} arcsec in the median,",
-        f"COMMENT {sigma.min():.2f} to {sigma.max():.2f} arcsec, the attitude's included.",
+        f"COMMENT {sigma.min():.2f} to {sigma.max():.2f} arcsec, including the attitude error.",
         *_of_magnitudes(track["magnitude_sigma"]),
-        "COMMENT Stellar aberration of the camera removed, light time not.",
+        "COMMENT Stellar aberration of the camera is corrected, light time is not.",
         "TIME_SYSTEM = UTC",
         f"START_TIME = {dates[0]}",
         f"STOP_TIME = {dates[-1]}",
@@ -102,7 +102,7 @@ def _of_magnitudes(sigma: FloatArray) -> list[str]:
         return []
     return [
         f"COMMENT Standard deviation of MAG {np.median(known):.3f} in the median, {known.max():.3f} at most:",
-        "COMMENT the scatter of the sightings; what colours of the stars shift all by is not in it.",
+        "COMMENT the scatter of the sightings, without the common error by star colours.",
     ]
 
 
@@ -114,15 +114,15 @@ def ccsds_date(utc_ns: int) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectOrbit:
-    """First orbit of a tracked object.
+    """Initial orbit of a tracked object.
 
     Attributes:
         number: number of the object in the flight.
         sightings: number of sightings.
         span: time between the first and the last sighting, s.
-        utc_ns: epoch of the orbit, ns since 1970; None without an orbit.
-        orbit: the orbit, or None if the sightings do not determine one.
-        reason: reason why there is no orbit; empty with one.
+        utc_ns: UTC epoch of the orbit, ns since 1970; None without an orbit.
+        orbit: initial orbit, or None if the sightings do not determine an orbit.
+        reason: reason why `orbit` is None, or an empty text.
     """
 
     number: int
@@ -140,7 +140,7 @@ class ObjectOrbit:
 
 
 def orbits_of(run: Run) -> list[ObjectOrbit]:
-    """Return the orbit of each tracked object. Raises UsageError for a run without objects."""
+    """Return the initial orbit of each tracked object. Raises UsageError for a run without objects."""
     tracks, labels = run["track"], run["run"]
     if not len(tracks) or not len(labels):
         raise _no_object(run)
@@ -185,7 +185,7 @@ _AXES = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 
 
 def write_orbit_messages(found: list[ObjectOrbit], folder: Path) -> list[Path]:
-    """Write one message per orbit into a folder and return the files.
+    """Write one Orbit Parameter Message per initial orbit into a folder, and return the files.
 
     Raises UsageError if the folder cannot be written.
     """

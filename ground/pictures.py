@@ -1,4 +1,4 @@
-"""Results drawn on pictures: streaks and objects, a solved sky, and the Earth's limb.
+"""Drawing of results on pictures: streaks and objects, a plate solution, and the Earth's limb.
 
 Constellation lines are not drawn, because no table with a clear licence was found.
 """
@@ -35,7 +35,7 @@ UNUSED: Colour = (86, 180, 233)
 OBJECT: Colour = (213, 94, 0)
 _RADIUS = 6.0
 _OUTLINE = 1.5
-"""Width of the dark outline of the marks (px in a picture of 1024 px), for contrast on a bright sky."""
+"""Width (px in a picture of 1024 px) of the dark outline of the marks, for contrast on a bright sky."""
 
 
 def draw_marks(
@@ -49,8 +49,8 @@ def draw_marks(
     Args:
         picture: the picture.
         endpoints: end points of the streaks (n, 2, 2), px.
-        used: which streaks (n,) were used; their rings are orange, the others blue.
-        objects: end points (2, 2), px, of each object, with wider rings in vermillion.
+        used: whether (n,) each streak was used; rings of used streaks are orange, other rings are blue.
+        objects: end points (2, 2), px, of each object, which get wider vermillion rings.
     """
     drawn = picture.copy()
     for ends, is_used in zip(endpoints, used, strict=True):
@@ -64,7 +64,7 @@ def draw_marks(
 
 
 def outlined(plain: npt.NDArray[np.uint8], drawn: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return the picture `drawn`, made from `plain` (rows, columns, 3), with black outlines of the marks."""
+    """Return the picture `drawn` with black outlines around the marks that `plain` does not have."""
     marks = np.any(plain != drawn, axis=2)
     width = max(1, round(_OUTLINE * max(plain.shape) / 1024.0))
     edged = drawn.copy()
@@ -73,7 +73,7 @@ def outlined(plain: npt.NDArray[np.uint8], drawn: npt.NDArray[np.uint8]) -> npt.
 
 
 def draw_ring(picture: npt.NDArray[np.uint8], centre: FloatArray, radius: float, colour: Colour) -> None:
-    """Draw a ring of one pixel's width around `centre` (x, y), clipped to the picture."""
+    """Draw a ring one pixel wide around `centre` (x, y), clipped to the picture."""
     if not np.all(np.isfinite(centre)):
         return
     rows, columns = picture.shape[:2]
@@ -92,16 +92,16 @@ _MAX_NAMES = 25
 _BRIGHTEST = 8
 """Number of brightest stars that get a label even without a proper name."""
 _ARROW = 0.06
-"""Length of the compass arrow relative to the picture."""
+"""Length of the compass's north arrow as a fraction of the picture size."""
 
 
 def draw_solution(picture: Picture, solution: FrameSolution, sky: SkyIndex) -> Picture:
-    """Return `picture` (rows, columns, 3) with the solution drawn on it.
+    """Return `picture` (rows, columns, 3) with the plate solution drawn on it.
 
-    Points matched to guide stars have orange rings, other points blue ones. Wider green rings are at the
-    expected positions of guide stars of this brightness. Names, or the HIP numbers of the brightest stars,
-    are yellow. The vermillion compass has a long arrow to the north and a short one to the east. Raises
-    UsageError without Pillow.
+    Points matched to guide stars have orange rings, and other points have blue rings. Wider green rings mark
+    the expected positions of guide stars as bright as those of the solution. Star names, or the HIP numbers
+    of the brightest stars, are yellow. The vermillion compass has a long arrow to the north and a short arrow
+    to the east. Raises UsageError if Pillow is not installed.
     """
     drawn = picture.copy()
     scale = max(1.0, max(picture.shape) / 1024.0)
@@ -147,7 +147,7 @@ def _with_text(
     font = ImageFont.load_default(size=15.0 * scale)
     taken: list[tuple[float, float, float, float]] = []
     for (x, y), text in labels:
-        # To the right of the star or, if a brighter star's name is there, to the left, or omitted.
+        # The label is right of the star, or left if a brighter star's label is on the right, or omitted.
         for place, anchor in (((x + 11.0 * scale, y), "lm"), ((x - 11.0 * scale, y), "rm")):
             box = draw.textbbox(place, text, font=font, anchor=anchor)
             if box[0] >= 0 and box[2] < picture.shape[1] and not any(_overlap(box, other) for other in taken):
@@ -172,7 +172,7 @@ def _draw_compass(
     origin = np.array([1.6 * size, shape[0] - 1.6 * size])
     assert solution.fix is not None
     roll = Pointing.of(solution.fix.quaternion).roll
-    # The position angle of up is `roll`, from north towards east, and east is to the left of north.
+    # The position angle of up is `roll`, counted from north to east, and east is left of north.
     north = np.array([np.sin(roll), -np.cos(roll)])
     east = np.array([north[1], -north[0]])
     if solution.mirrored:
@@ -185,7 +185,7 @@ def _draw_compass(
 
 _EDGE_RADIUS = 5.0
 _DOT = 0.0
-"""Radius of a ring that is a single pixel."""
+"""Ring radius (px) at which the ring is a single pixel."""
 
 
 def draw_horizon(
@@ -193,11 +193,11 @@ def draw_horizon(
 ) -> npt.NDArray[np.uint8]:
     """Return `picture` (rows, columns, 3) with the horizon drawn on it.
 
-    The fitted limb is a line; edges on it have orange rings, the others blue ones.
+    The fitted limb is a line. Edges on the limb have orange rings, and other edges have blue rings.
     """
     drawn = picture.copy()
     if solution.view is not None:
-        # The limb is rarely longer than the perimeter of the picture: the points are at most a pixel apart.
+        # The limb is rarely longer than the picture's perimeter, so the points are at most a pixel apart.
         limb = camera.project(limb_rays(solution.view, 8 * (camera.columns + camera.rows)))
         for point in limb[camera.contains(limb)]:
             draw_ring(drawn, point, _DOT, STREAK)
@@ -209,7 +209,7 @@ def draw_horizon(
 def draw_circle(
     picture: npt.NDArray[np.uint8], seen: ScannedHorizon, camera: CameraModel
 ) -> npt.NDArray[np.uint8]:
-    """Return `picture` (rows, columns, 3) with the fitted circle of Meller et al. and its edges in orange."""
+    """Return `picture` (rows, columns, 3) with the circle fit of Meller et al. and its edges in orange."""
     drawn = picture.copy()
     angle = np.arange(8 * (camera.columns + camera.rows)) * (0.25 * np.pi / (camera.columns + camera.rows))
     ring = seen.circle.centre + seen.circle.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)

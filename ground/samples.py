@@ -1,6 +1,6 @@
-"""Sample pictures for the other commands, rendered by the simulator, each with its truth.
+"""Sample pictures for other commands, which the simulator renders together with their true parameters.
 
-They are rendered on demand, because noise of 12 bits does not compress, and because stored pictures would not
+The pictures are rendered on demand, because 12-bit noise does not compress and stored pictures would not
 follow changes of the simulator. The same seed gives the same pictures.
 """
 
@@ -30,14 +30,14 @@ PIXELS, FIELD_DEG = 768, 15.0
 YEAR = 2026.5
 STILL_S, TURNING_S = 0.5, 0.4
 RATE = (0.035, -0.02, 0.015)
-"""Rate of the camera in its own axes (rad/s), which makes streaks of 47 px."""
+"""Rotation rate (rad/s) of the camera in camera axes, which makes streaks of 47 px."""
 ORION = Pointing(math.radians(83.8), math.radians(-1.2), math.radians(20.0))
 EARTH_PIXELS, EARTH_FIELD_DEG, ALTITUDE_KM = 512, 67.0, 515.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SamplePicture:
-    """A picture, its truth for JSON, and the command to try with `{}` for its file."""
+    """A sample picture, its true parameters, and a command to try, with `{}` for the picture's file."""
 
     name: str
     pixels: Image
@@ -64,7 +64,7 @@ def _stars(name: str, generator: np.random.Generator) -> SamplePicture:
 
 
 def _night(name: str, generator: np.random.Generator) -> SamplePicture:
-    """Render stars at a random attitude, for a calibration."""
+    """Render stars at a random attitude, for the calibration command."""
     attitude = generator.standard_normal(4)
     return _sky(name, generator, attitude / np.linalg.norm(attitude), np.zeros(3), STILL_S)
 
@@ -146,10 +146,10 @@ def _satellite(attitude: FloatArray) -> star_camera.SourceTrack:
 
 
 def sky_truth(rate: FloatArray, exposure: float, attitude: FloatArray, focal_length: float) -> dict[str, Any]:
-    """Return the truth of a frame as plain numbers for a JSON file.
+    """Return the true parameters of a frame as plain numbers for a JSON file.
 
     Args:
-        rate: rate (3,) in camera axes, rad/s.
+        rate: rotation rate (3,) of the camera, rad/s, camera axes.
         exposure: exposure time, s.
         attitude: attitude (4,) from ICRS to camera at mid-exposure.
         focal_length: focal length, px.

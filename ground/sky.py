@@ -1,11 +1,12 @@
-"""Contents of a solved picture: coordinates of its centre and axis, Sun, Moon and planets, and a FITS header.
+"""Contents of a solved picture: coordinates of centre and axis, Sun, Moon and planets, and a FITS header.
 
-The positions of the bodies are those seen from the Earth's centre, by the series of ERFA: plan94 (Simon et
-al. 1994: a few arcseconds, Jupiter and Saturn 80", 1800 to 2050), moon98 (Meeus 1998: 10") and epv00 for the
-Earth. They need no file of ephemerides. An observer on the ground sees the Moon up to 1 deg elsewhere.
+The positions of Sun, Moon and planets are geocentric and come from ERFA's series plan94, moon98 and epv00.
+From 1800 to 2050, plan94 (Simon et al. 1994) errs by a few arcseconds, or by 80" for Jupiter and Saturn. The
+error of moon98 (Meeus 1998) is 10". The series need no ephemeris file. For an observer on the ground the
+Moon's direction differs by up to 1 deg.
 
-The FITS header has a tangent plane with polynomials for the distortion (TAN-SIP; Calabretta & Greisen 2002,
-section 5.1.3; Shupe et al. 2005). FITS counts pixels from 1, and rows in the order of the file.
+The FITS header describes a tangent plane with distortion polynomials (TAN-SIP; Calabretta & Greisen 2002,
+section 5.1.3; Shupe et al. 2005). FITS counts pixels from 1.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, earth_from_sun
 from knightcube.vision.startracker.sky_map import SkyMap
 
 _ORDER = 5
-"""Order of the polynomials, odd because a radial distortion has no even terms."""
+"""Order of the distortion polynomials, odd because a radial distortion has no even terms."""
 _GRID = 25
-"""Points per axis at which the distortion is fitted."""
+"""Number of points per axis at which the distortion is fitted."""
 _CARD, _BLOCK = 80, 2880
 
 Card = tuple[str, str | int | float | bool]
@@ -46,13 +47,13 @@ class _TangentPlane:
         return cls(middle, east, np.cross(middle, east))
 
     def degrees(self, directions: FloatArray) -> FloatArray:
-        """Return xi, eta (n, 2) of directions (n, 3)."""
+        """Return the tangent-plane coordinates xi and eta (n, 2) of directions (n, 3)."""
         along = directions @ self.middle
         return np.degrees(directions @ np.stack([self.east, self.north], axis=1) / along[:, None])
 
 
 def world_coordinates(sky: SkyMap) -> dict[str, str | int | float | bool]:
-    """Return the values of the FITS header by key: A and B from pixels to the sky, AP and BP inverse."""
+    """Return the values of the FITS header by key; A and B map pixels to the sky, AP and BP the reverse."""
     camera = sky.camera
     centre = np.array(camera.centre)
     middle = sky.directions(centre[None])[0]
@@ -91,7 +92,10 @@ def world_coordinates(sky: SkyMap) -> dict[str, str | int | float | bool]:
 def _polynomials(
     names: tuple[str, str], places: FloatArray, shift: FloatArray, least: int
 ) -> dict[str, str | int | float | bool]:
-    """Return the coefficients of `shift` (n, 2) as polynomials of `places` (n, 2), px, from order `least`."""
+    """Return the coefficients of polynomials in `places` (n, 2), px, that fit `shift` (n, 2).
+
+    The lowest order of the polynomials is `least`.
+    """
     powers = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i) if least <= i + j]
     size = float(np.abs(places).max())
     x, y = (places / size).T
@@ -127,7 +131,7 @@ _LIGHT_DAY_PER_UNIT = ASTRONOMICAL_UNIT / 299_792_458.0 / DAY
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkyBody:
-    """A body in a picture: its direction (3,), ICRS without aberration, and its position (2,), px."""
+    """A body in a picture, with its direction (3,), ICRS without aberration, and its position (2,), px."""
 
     name: str
     direction: FloatArray
@@ -135,7 +139,7 @@ class SkyBody:
 
 
 def bodies_in(sky: SkyMap, julian_date: float) -> list[SkyBody]:
-    """Return the bodies in a picture at a Julian date TT."""
+    """Return the Sun, Moon and planets in a picture at a Julian date (TT)."""
     names, directions = zip(*directions_of_bodies(julian_date).items(), strict=True)
     places = sky.pixels(np.array(directions))
     inside = np.isfinite(places).all(axis=1) & sky.camera.contains(places)
@@ -159,11 +163,11 @@ def directions_of_bodies(julian_date: float) -> dict[str, FloatArray]:
 
 
 _SAME_PX = 0.1
-"""Distance (px) above which axis and centre of the picture are stated separately."""
+"""Distance (px) between optical axis and image centre above which the report states both."""
 
 
 def sky_facts(sky: SkyMap | None, bodies: Sequence[SkyBody]) -> dict[str, Any]:
-    """Return the directions of image centre and axis, the bodies and the world coordinates, for `--json`."""
+    """Return image centre, optical axis, bodies and world coordinates as JSON data."""
     if sky is None:
         return {}
     camera = sky.camera
@@ -190,12 +194,12 @@ def _coordinates(direction: FloatArray) -> dict[str, float]:
 
 
 def sky_text(sky: SkyMap | None, bodies: Sequence[SkyBody]) -> str:
-    """Return axis, image centre and bodies as lines of text; empty without a solution."""
+    """Return lines of text about the axis, the image centre and the bodies, empty without a solution."""
     if sky is None:
         return ""
     values, lines = sky_facts(sky, bodies), []
     if math.dist(values["axis"]["point_px"], values["image_centre"]["point_px"]) > _SAME_PX:
-        # Right ascension and declination above are those of the axis.
+        # The solution's text above states the right ascension and declination of the axis.
         centre, (x, y) = values["image_centre"], values["axis"]["point_px"]
         lines.append(f"axis:             at pixel {x:.1f}, {y:.1f}")
         place = f"{centre['right_ascension_deg']:.4f} {centre['declination_deg']:+.4f} deg"

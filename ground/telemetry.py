@@ -1,4 +1,4 @@
-"""Reads recorded packets: from bytes, of which all are accounted for, and from the folder of a run."""
+"""Reader of recorded packets, from bytes or from the folder of a run, which accounts for every byte."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ from knightcube.errors import UsageError
 
 @dataclass(frozen=True)
 class ScanResult:
-    """Packets found in a sequence of bytes, and the account of its bytes.
+    """Packets found in a sequence of bytes, and the numbers of bytes in and outside packets.
 
     Attributes:
-        packets: structured array of each packet type of the table in order of arrival, which may be empty.
+        packets: structured array of each packet type in order of arrival, which may be empty.
         total_bytes: number of bytes scanned.
-        skipped_bytes: bytes that belong to no valid packet, without those of a truncated last packet.
-        truncated_bytes: bytes at the end that look like the beginning of a packet.
-        missing: number of packets of each type that are missing according to the sequence counts. A gap of
-            16,384 packets or more counts modulo 16,384.
-        other_versions: valid packets in another version than that of the table, which are not decoded.
+        skipped_bytes: number of bytes that belong to no valid packet, without a truncated last packet.
+        truncated_bytes: number of bytes at the end that look like the beginning of a packet.
+        missing: number of missing packets of each type according to the sequence counts. A gap is counted
+            modulo 16,384.
+        other_versions: number of valid packets of another version than that of the table, which are not
+            decoded.
     """
 
     packets: dict[str, PacketArray]
@@ -44,18 +45,18 @@ class ScanResult:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of packets by name, without the types that have none."""
+        """Number of packets by name, without packet types that were not found."""
         return {name: len(array) for name, array in self.packets.items() if len(array)}
 
     @property
     def intact(self) -> bool:
-        """Whether every byte and every sequence count is accounted for."""
+        """Whether every byte belongs to a packet and no packet is missing."""
         damage = self.skipped_bytes + self.truncated_bytes + self.other_versions
         return damage + sum(self.missing.values()) == 0
 
 
 def scan(data: bytes) -> ScanResult:
-    """Return the packets in `data` and the account of all its bytes."""
+    """Return the packets in `data` and the account of all bytes."""
     found: dict[str, list[bytes]] = {name: [] for name in LAYOUTS}
     claimed = other_versions = last = 0
     for layout, begin, end in walk(data):
@@ -78,15 +79,15 @@ def scan(data: bytes) -> ScanResult:
 
 
 def _missing(layout: Layout, packets: bytes) -> int:
-    """Return the number of packets missing between those found, according to their sequence counts."""
-    if len(packets) <= layout.length:  # most datagrams contain few packet types
+    """Return the number of packets missing between the found packets, according to their sequence counts."""
+    if len(packets) <= layout.length:  # a shortcut, because most datagrams contain few packet types
         return 0
     steps = np.diff(layout.sequence_counts(packets))
     return int(np.sum((steps - 1) % SEQUENCE_MODULUS))
 
 
 def decode(data: bytes) -> dict[str, PacketArray]:
-    """Return the packets of `data` by name.
+    """Return arrays of the packets in `data` by packet name.
 
     Raises TelemetryError if a byte belongs to no valid packet or a packet is of another version.
     """
@@ -100,7 +101,10 @@ def decode(data: bytes) -> dict[str, PacketArray]:
 
 @dataclass(frozen=True)
 class Run:
-    """The logs in the folder of a run. `truth` and `performance` are empty if the run has no such log."""
+    """The packets of the logs in the folder of a run.
+
+    `truth` and `performance` are empty if the run has no such log.
+    """
 
     folder: Path
     flight: ScanResult
@@ -109,16 +113,16 @@ class Run:
 
     @property
     def logs(self) -> dict[str, ScanResult]:
-        """The three logs by the stems of their files."""
+        """The three logs by the stems of their file names."""
         return {"flight": self.flight, "truth": self.truth, "performance": self.performance}
 
     def dropped_segments(self, stem: str) -> int:
-        """Return how many of a log's oldest segments were deleted to keep its size budget."""
+        """Return the number of a log's oldest segments that were deleted to keep its size budget."""
         names = [path.stem for path in find_segments(self.folder, stem)]
         return int(names[0].rpartition("-")[2]) - 1 if names else 0
 
     def __getitem__(self, name: str) -> PacketArray:
-        """Return the packets of a type from the log that has them, or an empty array."""
+        """Return the packets of a type from the log that contains them, or an empty array."""
         for log in self.logs.values():
             if len(log.packets[name]):
                 return log.packets[name]

@@ -1,4 +1,4 @@
-"""State of a flight from its log or its command socket, as lines for the terminal."""
+"""State of a flight from its log or its command socket, written as lines of text."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from knightcube.errors import FlightError, UsageError
 STREAMS = ("imu", "field", "coils", "power", "camera")
 _KEPT_EVENTS = 200
 _MAX_TIME = 1e15
-"""Mission time (s) above which a time comes from a damaged log."""
+"""Mission time (s) above which a packet is assumed to come from a damaged log."""
 _TIMEOUT_S = 2.0
-"""Time to wait for the answer to a ping (s)."""
+"""Longest time (s) to wait for the answer to a ping."""
 
 
 class LogTail:
     """Reader of a flight log that may still grow and end in an incomplete packet."""
 
     def __init__(self, folder: Path) -> None:
-        """Begin at the log's oldest segment. Raises UsageError for a folder without a flight log."""
+        """Start at the oldest segment of the log. Raises UsageError for a folder without a flight log."""
         if not folder.is_dir():
             raise UsageError(f"{folder}: no such folder; give the folder of a run, or a flight's socket")
         segments = find_segments(folder, "flight")
@@ -54,14 +54,14 @@ class LogTail:
 
     @property
     def silence(self) -> float:
-        """Time since the log last grew, s; at first by the modification time of its file."""
+        """Time (s) since the log last grew, initially from the modification time of its file."""
         return time.monotonic() - self._grew
 
     def new(self) -> dict[str, PacketArray]:
-        """Return the packets by name that were written since the last call. Raises UsageError."""
+        """Return the packets that were written since the last call, by name. Raises UsageError."""
         data = self._rest + self._read()
         while (following := self._following()) is not None:
-            # The segment is complete: its last packets may have been written since it was read.
+            # The segment is complete, but its last packets may have been written after it was read.
             data += self._read()
             self._path, self._offset = following, 0
             data += self._read()
@@ -74,7 +74,7 @@ class LogTail:
             with self._path.open("rb") as file:
                 file.seek(self._offset)
                 data = file.read()
-        except FileNotFoundError:  # deleted to keep the log's size budget
+        except FileNotFoundError:  # the segment was deleted to keep the log's size budget
             data = b""
         except OSError as error:
             raise UsageError(f"{self._path}: cannot be read: {error.strerror or error}") from error
@@ -84,7 +84,7 @@ class LogTail:
         return data
 
     def _following(self) -> Path | None:
-        """Return the next segment, or None for the last one."""
+        """Return the segment after the present one, or None."""
 
         def number(path: Path) -> int:
             return int(path.stem.rpartition("-")[2])
@@ -98,9 +98,9 @@ class PingAnswer:
     """Answer of a flight to a ping.
 
     Attributes:
-        packets: packets by name; the events are those that no earlier answer contained.
-        count: number of commands since the start of the flight.
-        delay: time until the answer, s.
+        packets: packets by name, with only the events that no earlier answer contained.
+        count: number of commands that the flight has received since its start.
+        delay: time from the ping to the answer, s.
     """
 
     packets: Mapping[str, PacketArray]
@@ -109,7 +109,7 @@ class PingAnswer:
 
 
 def answers(to: str, patience: float, ended: threading.Event) -> Iterator[PingAnswer]:
-    """Yield the answers to pings until none has been received for `patience` s. Raises UsageError."""
+    """Yield the answers to pings until no answer has been received for `patience` s. Raises UsageError."""
     packer, answered, shown_ns = CommandPacker(), time.monotonic(), -1
     while not ended.is_set():
         asked = time.monotonic()
@@ -132,7 +132,7 @@ def answers(to: str, patience: float, ended: threading.Event) -> Iterator[PingAn
 
 @dataclass(frozen=True, slots=True)
 class LoggedEvent:
-    """An event of the log, at mission time `time` s."""
+    """An event of the flight log at mission time `time` (s)."""
 
     time: float
     severity: int
@@ -142,14 +142,14 @@ class LoggedEvent:
 
 @dataclass(slots=True)
 class FlightState:
-    """The newest packet of each type, and the newest events.
+    """State of a flight: the newest packet of each type, and the newest events.
 
     Attributes:
         time: mission time of the newest packet, s.
         mode: label of the mode, empty until it is known.
-        ended: reason for the end of the flight, empty before it.
+        ended: reason for the end of the flight, empty before the end.
         events: newest events.
-        faults: number of events of severity fault.
+        faults: number of events whose severity is fault.
         newest: newest packets by name.
     """
 
@@ -186,7 +186,7 @@ class FlightState:
         return found
 
     def value(self, packet: str, name: str) -> Any:
-        """Return a field of the newest packet of a type, or None before the first one."""
+        """Return a field of the newest packet of a type, or None before the first packet."""
         row = self.newest.get(packet)
         return None if row is None else row[name]
 
@@ -203,27 +203,27 @@ class FlightState:
 
 
 def named(states: States, number: Any) -> str:
-    """Return the name of a number in a packet, or the number if it has no name."""
+    """Return the name of an enumerated value in a packet, or the number if it has no name."""
     return dict(states).get(int(number), str(int(number)))
 
 
 def printable(text: str) -> str:
-    """Return a text without control characters, with which a damaged log could control the terminal."""
+    """Return a text without control characters, so that a damaged log cannot control the terminal."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 class PlainLines:
-    """Writes the events as lines, and the state once per period of mission time."""
+    """Writer of events as lines, and of the state once per period of mission time."""
 
     def __init__(self, state: FlightState, every: float, write: Callable[[str], object]) -> None:
-        """Update `state` with the packets and write it about every `every` s of mission time."""
+        """Create a writer of the events and, about every `every` s of mission time, of `state`."""
         self._state = state
         self._every = every
         self._write = write
         self._written = -1
 
     def feed(self, packets: Mapping[str, PacketArray]) -> None:
-        """Process new packets, oldest first, and write their lines."""
+        """Process new packets in the order of their times, and write their lines."""
         slots = {}
         for name, rows in packets.items():
             seconds = np.clip(rows["time_ns"] * 1e-9, -_MAX_TIME, _MAX_TIME)
@@ -243,7 +243,7 @@ def event_line(event: LoggedEvent) -> str:
 
 
 def state_line(state: FlightState) -> str:
-    """Return the state of a flight as a line: time, mode, attitude, coils, slips and faults."""
+    """Return a line with time, mode, attitude, coils, cycle slips and faults of a flight."""
     parts = [f"{state.time:9.3f} s ", state.mode or "mode not known", attitude_text(state)]
     written, dipole = state.value("control", "current_written"), state.value("attitude", "dipole")
     if written is not None:
@@ -260,7 +260,7 @@ def state_line(state: FlightState) -> str:
 
 
 def attitude_text(state: FlightState) -> str:
-    """Return the attitude and the rate; empty without an estimate."""
+    """Return a text of attitude and rate, empty without an estimate."""
     rate = state.value("attitude", "rate")
     parts = []
     if (q2 := state.value("control", "q2")) is not None and np.isfinite(q2):

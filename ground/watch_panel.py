@@ -1,4 +1,4 @@
-"""State of a flight as a panel of the terminal; needs rich."""
+"""State of a flight as a terminal panel, for which the package rich is needed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ground.watch import STREAMS, FlightState, attitude_text, named, printable
 
 LISTED_EVENTS = 12
 _BAR = 20
-"""Length of a current's bar (characters)."""
+"""Length (characters) of the bar that shows a coil current."""
 _MODE_COLOURS = {
     "safe": "bold white on red",
     "boot": "bold black on yellow",
@@ -82,12 +82,12 @@ def _facts(state: FlightState) -> list[tuple[str, RenderableType]]:
 
 
 def _figure(value: float, digits: int) -> str:
-    """Return a number as text, or "-" if it is not known."""
+    """Return a number as text, or "-" if it is unknown."""
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def _bars(state: FlightState) -> list[Text]:
-    """Return a bar of each coil's current relative to its limit."""
+    """Return a bar for each coil that shows the current relative to its limit."""
     written, limit = state.value("control", "current_written"), state.value("run", "current_limit")
     bars = []
     for current in () if written is None else written:

@@ -1,10 +1,11 @@
-"""The definition tables as XTCE (OMG, XTCE 1.2), for ground stations that we did not write.
+"""Packet and telecommand definitions as XTCE (OMG, XTCE 1.2), for third-party ground stations.
 
 `python -m ground.xtce [--epoch UTC] [--verified] > knightcube.xml`
 
-The form keeps to what the clients read: one flat space system, arrays spread out (`rate_1`), names without
-`. / : [ ]`, texts with a terminating zero, telecommand headers of fixed values in each command. A parameter
-is named `<packet>_<field>`. Yamcs counts mission time from the epoch that stands in the file.
+The document uses only features that the known clients read. It has one flat space system, one parameter per
+array element (`rate_1`), names without `. / : [ ]`, zero-terminated texts, and a header of fixed values in
+each telecommand. A parameter is named `<packet>_<field>`. Yamcs counts mission time from the epoch in the
+document.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layo
 
 SPACE = "KnightCube"
 TELECOMMANDS = {**COMMANDS, **{name: layout for name, layout in DIRECTIVES.items() if name != NEW_KEY.name}}
-"""The commands that a ground station may make; new keys are made by our own tool alone."""
+"""Commands that a third-party ground station may send; only `flight` can send new keys."""
 _XTCE = "http://www.omg.org/spec/XTCE/20180204"
 EPOCH = "2000-01-01T00:00:00"
 _BITS_OF = {"u1": 8, "u2": 16, "u4": 32, "u8": 64, "i8": 64, "f4": 32, "f8": 64}
@@ -36,16 +37,16 @@ _PRIMARY = (
     ("SRC_SEQ_CTR", 14),
     ("PKT_LEN", 16),
 )
-"""The primary header in the order of its bits; clients look for these names."""
+"""Fields of the primary header in the order of their bits, with the names that clients expect."""
 _VERIFIERS = (
     ("Accepted", "PT20S", (Stage.ACCEPTED,)),
     ("Execution", "PT20S", (Stage.STARTED,)),
     ("Complete", "PT1H", (Stage.COMPLETED,)),
     ("Failed", "PT1H", (Stage.REFUSED, Stage.FAILED)),
 )
-"""Stages of a command: name in XTCE, how long Yamcs waits for each from the release, ours."""
+"""Stages of a command, with XTCE name, Yamcs's timeout after the release, and name in this software."""
 _SENT_SEQUENCE = "/yamcs/cmdHist/ccsds-seqcount"
-"""What Yamcs calls the sequence count of a command that it has sent."""
+"""Yamcs's name for the sequence count of a sent command."""
 
 
 def document(
@@ -56,7 +57,8 @@ def document(
 ) -> str:
     """Return the tables as one XTCE document; `epoch` is the UTC of mission time zero, in ISO 8601.
 
-    `verified` adds to each command how Yamcs follows it: by a name of Yamcs that others do not know.
+    `verified` adds to each command the verification by Yamcs, with a parameter name that other clients do not
+    know.
     """
     root = Element("SpaceSystem", {"xmlns": _XTCE, "name": SPACE})
     meta = SubElement(root, "TelemetryMetaData")
@@ -77,14 +79,14 @@ def document(
 
 
 def spread(layout: Layout) -> Iterator[tuple[str, Field]]:
-    """Give the name and the field of each parameter of a packet, in order, arrays spread out from 1."""
+    """Yield the name and the field of each parameter of a packet, with array elements numbered from 1."""
     for field in layout.packet.fields:
         base = f"{layout.packet.name}_{field.name}"
         yield from ((base if field.count == 1 else f"{base}_{i + 1}", field) for i in range(field.count))
 
 
 def _add_headers(types: Element, parameters: Element, epoch: str) -> None:
-    """Add the types and parameters that all packets share."""
+    """Add the types and parameters that all packets contain."""
     for name, bits in (*_PRIMARY, ("definition_version", 8), ("error_control", 16)):
         _add_integer(types, f"{name}_Type", "u", bits)
         SubElement(parameters, "Parameter", {"name": name, "parameterTypeRef": f"{name}_Type"})
@@ -96,7 +98,7 @@ def _add_headers(types: Element, parameters: Element, epoch: str) -> None:
 
 
 def _add_primary_container(containers: Element) -> None:
-    """Add the abstract container that holds both headers."""
+    """Add the abstract container of the primary and secondary headers."""
     header = SubElement(containers, "SequenceContainer", {"name": "CCSDSPacket", "abstract": "true"})
     entries = SubElement(header, "EntryList")
     for name in (*(name for name, _ in _PRIMARY), "definition_version", "time_ns"):
@@ -130,7 +132,7 @@ def _describe(element: Element, text: str) -> None:
 
 
 def _add_type(types: Element, name: str, field: Field, role: str) -> None:
-    """Add the type of a parameter or, where `role` is "Argument", of an argument."""
+    """Add the type of a parameter, or of an argument if `role` is "Argument"."""
     kind = field.kind
     if kind.startswith("S"):
         text = SubElement(types, f"String{role}Type", {"name": name})
@@ -232,7 +234,7 @@ def _add_command(layout: Layout, types: Element, listed: Element) -> Element:
 
 
 def _add_verifiers(command: Element, layout: Layout) -> None:
-    """Add the stages of a command: packets `verification` with its identifier and its sequence count."""
+    """Add the stages of a command, which `verification` packets report."""
     verifiers = SubElement(command, "VerifierSet")
     for kind, window, stages in _VERIFIERS:
         verifier = SubElement(verifiers, f"{kind}Verifier")
@@ -248,7 +250,7 @@ def _add_verifiers(command: Element, layout: Layout) -> None:
 
 
 def _add_condition(parent: Element, name: str, value: int | str) -> None:
-    """Add that a parameter equals a number, a label, or another parameter, whose name begins with /."""
+    """Add the comparison of a parameter with a number, a label, or another parameter ("/NAME")."""
     condition = SubElement(parent, "Condition")
     SubElement(condition, "ParameterInstanceRef", {"parameterRef": name})
     SubElement(condition, "ComparisonOperator").text = "=="
@@ -259,7 +261,7 @@ def _add_condition(parent: Element, name: str, value: int | str) -> None:
 
 
 def _add_fixed(entries: Element, name: str, value: str) -> None:
-    """Add fixed bytes; the link that sends a command writes sequence count, time and CRC over them."""
+    """Add fixed bytes, which the sending link overwrites with sequence count, time and CRC."""
     size = {"sizeInBits": str(4 * len(value)), "binaryValue": value}
     SubElement(entries, "FixedValueEntry", {"name": name, **size})
 
@@ -268,7 +270,7 @@ def main() -> None:
     """Print the document."""
     parser = argparse.ArgumentParser(prog="python -m ground.xtce", description=__doc__)
     parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=f"mission time zero (default {EPOCH})")
-    parser.add_argument("--verified", action="store_true", help="commands say how Yamcs follows them")
+    parser.add_argument("--verified", action="store_true", help="add the verification of commands by Yamcs")
     options = parser.parse_args()
     sys.stdout.write(document(epoch=options.epoch, verified=options.verified))
 

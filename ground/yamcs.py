@@ -1,13 +1,14 @@
-"""A configuration of Yamcs 5.12 for this satellite: `python -m ground.yamcs FOLDER [--epoch UTC]`.
+"""Writer of a Yamcs 5.12 configuration, started by `python -m ground.yamcs FOLDER [--epoch UTC]`.
 
-Yamcs connects to `flight gateway`, which holds the keys and hands plain packets over (`ground.link.gateway`).
-Both listen on loopback alone. No data link of Yamcs can send the gateway's token when it connects, so the
-folder holds the source of one that can, `GatewayLink.java`, to be compiled once. Packets are archived by
-mission time and sequence count; commands are verified by the packet `verification`, whose packet identifier
-and sequence count are those of the command. Files come and go by Yamcs's own CFDP service.
+Yamcs connects to `flight gateway`, which holds the keys and exchanges unprotected packets with Yamcs
+(`ground.link.gateway`). Yamcs and the gateway listen on the loopback interface only. None of Yamcs's own data
+links can send the gateway's token when it connects, so the folder contains the source of a link that can,
+`GatewayLink.java`, which must be compiled once. Packets are archived by mission time and sequence count. A
+command is verified by `verification` packets that contain the packet identifier and the sequence count of the
+command. Files are transferred by Yamcs's own CFDP service.
 
-Yamcs asks for a password, because without one it obeys the request of any web page in a browser on the same
-machine.
+Yamcs requires a password, because otherwise any web page in a browser on the same machine could send requests
+to Yamcs.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ INSTANCE = SPACE.lower()
 HTTP_PORT = 8090
 KEYS = Path("keys/ground")
 CFDP, DOWN_BUCKET, UP_BUCKET = "files", "down", "up"
-"""Yamcs's service for files, and its buckets, which are folders: of those that came and of those that go."""
+"""Yamcs's file transfer service, and the buckets (folders) of received files and of files to send."""
 _LOOPBACK = "127.0.0.1"
 _SECRET_BYTES = 16
 
@@ -50,7 +51,7 @@ enabled: true
 authModules: [{class: org.yamcs.security.YamlAuthModule}]
 """
 USERS, USER = "etc/users.yaml", "admin"
-"""File with the password, and the user, whom Yamcs gives a password known to all if the file has none."""
+"""File of the password, and the user, who has Yamcs's public default password if the file is missing."""
 
 _INSTANCE = """\
 services:
@@ -179,7 +180,7 @@ ArchiveRetrieval: *replay
 
 
 def files(folder: Path, gateway: str, http_port: int, epoch: str, keys: Path = KEYS) -> Mapping[str, str]:
-    """Return the content of each file by its name below `folder`; `keys` are those of the gateway."""
+    """Return the content of each file by its name below `folder`; `keys` is the gateway's folder of keys."""
     host, port = host_port(gateway)
     buckets = {"down": DOWN_BUCKET, "up": UP_BUCKET}
     server = _SERVER.format(
@@ -245,7 +246,7 @@ def write(
 
 
 def main() -> None:
-    """Write the configuration that the words ask for."""
+    """Write the configuration that the command line `words` describes."""
     parser = argparse.ArgumentParser(prog="python -m ground.yamcs", description=__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the configuration and the archive")
     parser.add_argument("--gateway", default=ADDRESS, metavar="HOST:PORT", help=f"default {ADDRESS}")

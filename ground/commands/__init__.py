@@ -1,4 +1,4 @@
-"""Commands of the ground, which `python -m flight` finds by the entry point of this table."""
+"""Table of the ground commands, which `python -m flight` finds by an entry point."""
 
 COMMANDS = {
     "command": ("send a command to a flight", "satellite:configure_command"),
@@ -30,4 +30,4 @@ COMMANDS = {
     "horizon": ("find the nadir in a picture of the Earth's limb", "horizon:configure"),
     "calibrate": ("calibrate a camera's lens from pictures of the sky", "calibrate:configure"),
 }
-"""Purpose of each command, and its module with the function that adds its arguments to a parser."""
+"""Purpose of each command, and the module and function that add the command's arguments to a parser."""

@@ -1,4 +1,4 @@
-"""`flight calibrate`: the lens of a camera from pictures of the night sky."""
+"""Command `flight calibrate`, which calibrates the lens of a camera from pictures of the night sky."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Calibrate, print and write the camera; exit status 1 if no picture is solved or stars are too few."""
+    """Calibrate, print and write the camera. The exit status is 1 if the pictures do not suffice."""
     if options.out is not None and options.out.exists():
         raise UsageError(f"{options.out}: exists already: name another file")
     frames = _read(options.images)
@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _read(paths: Sequence[Path]) -> list[tuple[Path, Image]]:
-    """Return the pictures, which must be of one size."""
+    """Return the pictures, which must have the same size."""
     frames = [(path, read_image(path)) for path in paths]
     first = frames[0]
     for path, pixels in frames:

@@ -1,4 +1,4 @@
-"""`flight camera`: take frames from the camera of a configuration, without opening its other devices."""
+"""Command `flight camera`, which takes frames from a configured camera without opening other devices."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from knightcube.vision.camera.images import write_picture
 _POLL_NS = 5_000_000
 _PATIENCE_NS = 10_000_000_000
 _MAX_ROTATION = 0.5
-"""Largest rotation in one exposure (rad), beyond which streaks leave any field of view."""
+"""Largest rotation (rad) in one exposure, beyond which streaks leave any field of view."""
 _MAX_EXPOSURES = 8
-"""Exposure times to wait for a frame, because a free-running camera delivers the next complete one."""
+"""Number of exposure times to wait, because a free-running camera delivers its next complete frame."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -71,7 +71,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Take, print and write the frames; exit status 1 if the camera is frozen."""
+    """Take, print and write the frames. The exit status is 1 if the camera is frozen."""
     if options.count < 1:
         raise UsageError(f"--count {options.count}: give a number of frames, 1 or more")
     if options.exposure is not None and not 0.0 < options.exposure <= 10.0:
@@ -162,7 +162,7 @@ def _truth(frame: Frame, lone: OpenCamera, rate: FloatArray) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class OpenCamera:
-    """An open camera, its clock and section, and the attitude (4,) by time, ns, of a simulated one."""
+    """An open camera with its clock, its section, and if simulated its attitude (4,) by time (ns)."""
 
     clock: Clock
     frames: FrameSource
@@ -174,8 +174,8 @@ class OpenCamera:
 def opened_camera(config_path: Path, rate: FloatArray | None = None) -> Iterator[OpenCamera]:
     """Open only the camera of a configuration, simulated if it has a section `simulation`.
 
-    A simulated camera rotates at `rate` (3,), rad/s, in camera axes. Raises ConfigError without a camera in
-    the configuration, UsageError for a real camera with a rate, DeviceError.
+    A simulated camera rotates at `rate` (3,), rad/s, in camera axes. Raises ConfigError if the configuration
+    has no camera, UsageError for a real camera with a rate, and DeviceError.
     """
     text, config = requested_config(RunRequest(config_path, Path()))
     if config.camera is None:

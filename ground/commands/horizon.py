@@ -1,4 +1,4 @@
-"""`flight horizon`: the direction to nadir from the Earth's limb in a picture."""
+"""Command `flight horizon`, which finds the direction to nadir from the Earth's limb in a picture."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find the horizon, print and draw it; exit status 1 without a horizon."""
+    """Find, print and draw the horizon. The exit status is 1 if no horizon is found."""
     _check_method(options)
     pixels = read_picture(options)
     camera = _camera(options, pixels)
@@ -128,7 +128,7 @@ def _camera(options: argparse.Namespace, pixels: Image) -> CameraModel:
 
 
 def _facts(solution: HorizonSolution, altitude_fitted: bool) -> dict[str, Any]:
-    """Return the values of a solution, for `--json`."""
+    """Return the values of a horizon solution as JSON data."""
     values: dict[str, Any] = {
         "status": solution.status.value,
         "reason": solution.reason or None,
@@ -166,7 +166,7 @@ def _text(solution: HorizonSolution, altitude_fitted: bool) -> str:
     for nadir in solution.candidates if solution.nadir is None else (solution.nadir,):
         values = _nadir_facts(nadir, altitude_fitted)
         x, y, z = nadir.direction
-        # The uncertainty differs across and along the arc from the boresight to nadir.
+        # The uncertainty across the arc from the boresight to nadir differs from that along the arc.
         sigmas = np.degrees(np.sqrt(np.linalg.eigvalsh(nadir.tangent_covariance)))
         lines += [
             f"nadir x, y, z:    {x:+.5f} {y:+.5f} {z:+.5f}",
@@ -221,14 +221,14 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PaperNadir:
-    """Nadir (3,) in camera axes, and the circle in the first picture."""
+    """Result of a method: nadir (3,) in camera axes, and the circle in the first picture."""
 
     nadir: FloatArray
     seen: ScannedHorizon
 
 
 def _check_method(options: argparse.Namespace) -> None:
-    """Raise UsageError for options that do not belong to the chosen method."""
+    """Raise UsageError for options that the chosen method does not have."""
     for name, method in (("second", "graphic or vector"), ("turned", "graphic"), ("nadir", "vector")):
         if getattr(options, name) is not None and options.method not in method.split(" or "):
             raise UsageError(f"--{name}: only with --method {method}")
@@ -251,7 +251,7 @@ def _check_method(options: argparse.Namespace) -> None:
 
 
 def _run_paper(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> int:
-    """Find nadir with a method of Meller et al., print and draw it; exit status 1 without a horizon."""
+    """Find, print and draw nadir by a method of Meller et al. The exit status is 1 without a horizon."""
     found, reason = None, ""
     try:
         found = _found(options, pixels, camera)
@@ -296,7 +296,7 @@ def _found(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> _
 def _graphic(
     turned: float, camera: CameraModel, first: ScannedHorizon, second: ScannedHorizon, altitude: float
 ) -> FloatArray:
-    """Return nadir (3,) in the axes of the first camera, whose boresight is body x and whose y is body z."""
+    """Return nadir (3,) in axes of the first camera, whose boresight is body x and whose y axis is body z."""
     angle, axis = math.radians(turned), camera.ideal.centre
     cameras = (
         LevelCamera(np.array([0.0, 1.0]), axis),

@@ -1,4 +1,4 @@
-"""`flight identify`: constants of the body from a short flight, as a section of the configuration."""
+"""Command `flight identify`, which estimates the testbed body's constants from a short flight."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class _Identified:
 
     @property
     def fragment(self) -> str:
-        """Section `plant` of the configuration."""
+        """Section `plant` of the configuration, as YAML text."""
         return plant_text(self.plant, self.config.plant.coil_turns, str(self.folder))
 
 
@@ -94,7 +94,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly unless a run is given, fit, print and write."""
+    """Fly unless a run is given, fit the constants, and print and write the results."""
     if options.out is not None and options.out.exists():
         raise UsageError(f"{options.out}: exists already: name another file")
     folder = Path(options.source)

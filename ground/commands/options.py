@@ -1,4 +1,4 @@
-"""Arguments that several commands share."""
+"""Command-line arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def add_picture(parser: argparse.ArgumentParser) -> None:
 
 
 def add_field(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
-    """Add the arguments that give the camera; where they are `required`, exactly one of them."""
+    """Add the arguments that describe the camera; if `required`, the user must give exactly one of them."""
     group = parser.add_mutually_exclusive_group(required=True) if required else parser
     group.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
     group.add_argument(
@@ -55,7 +55,7 @@ def read_picture(options: argparse.Namespace) -> Image:
 
 
 def check_size(path: Path, pixels: Image) -> None:
-    """Raise UsageError for a picture that is too small to show anything."""
+    """Raise UsageError for a picture that is too small to be analysed."""
     rows, columns = pixels.shape
     if min(rows, columns) < LEAST_SIDE:
         raise UsageError(f"{path}: {columns} x {rows} pixels: give {LEAST_SIDE} or more each way")
@@ -71,7 +71,10 @@ def raw_shape(text: str) -> tuple[int, int, int]:
 
 
 def positive(text: str) -> float:
-    """Return the number that an argument gives. Raises ArgumentTypeError unless it is finite and positive."""
+    """Return the positive number in an argument.
+
+    Raises ArgumentTypeError unless it is finite and positive.
+    """
     value = finite(text)
     if value <= 0.0:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
@@ -79,7 +82,7 @@ def positive(text: str) -> float:
 
 
 def finite(text: str) -> float:
-    """Return the number that an argument gives. Raises ArgumentTypeError unless it is finite."""
+    """Return a finite number from an argument's text. Raises ArgumentTypeError unless it is finite."""
     try:
         value = float(text)
     except ValueError as error:
@@ -90,7 +93,7 @@ def finite(text: str) -> float:
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a file that does not exist yet. Raises UsageError."""
+    """Write a new file, which must not exist. Raises UsageError."""
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)

@@ -1,4 +1,4 @@
-"""`flight plan`: one slew with its cost, of the testbed about one axis, or with --orbit in three axes."""
+"""Command `flight plan`, which plans one slew of the testbed, or with --orbit a slew in three axes."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from knightcube.gnc.guidance.three_axes.slew_plan import STRETCH, OrderedSlew, S
 
 BODIES: tuple[Literal["sun", "earth", "moon"], ...] = ("sun", "earth", "moon")
 _OFF_UNIT = 0.1
-"""Largest deviation from 1 of the length of a typed quaternion, which is then normalised."""
+"""Largest deviation from 1 of the norm of a typed quaternion, which is then normalised."""
 _DEFAULT_CONFIG = "step_demo"
 _TESTBED_ONLY = ("from_rate", "to_rate", "horizon", "cost", "config")
-"""Options of the testbed only."""
+"""Options that only testbed slews have."""
 _ORBIT_ONLY = ("at", "within", "longest", "window", "least_time", *(f"{name}_cone" for name in BODIES))
-"""Options of slews in orbit only."""
+"""Options that only slews in orbit have."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -166,7 +166,7 @@ def _text(made: StepPlan, plant: SingleAxisPlant, solved_s: float) -> str:
 
 
 def _q2(option: str, text: str) -> float:
-    """Return a q2 within the thread's range. Raises UsageError."""
+    """Return the number q2 in a text, which must be within the thread's range. Raises UsageError."""
     try:
         value = finite(text)
     except argparse.ArgumentTypeError as error:
@@ -256,7 +256,7 @@ def _draw(made: OrderedSlew, options: argparse.Namespace) -> None:
 def _planned(
     options: argparse.Namespace, config: OrbitConfig, elements: tuple[str, str], at: datetime
 ) -> OrderedSlew:
-    """Return the slew of the options. Raises UsageError."""
+    """Return the planned slew that the options describe. Raises UsageError."""
     if options.least_time and options.time_price is not None:
         raise UsageError("--least-time and --time-price: give one of them")
     longest = STRETCH * options.within if options.longest is None else options.longest
@@ -299,7 +299,7 @@ def _boresight(config: OrbitConfig) -> FloatArray:
 
 
 def _target(option: str, text: str) -> PointingTarget:
-    """Return the target of a text such as 'nadir roll 10'. Raises UsageError."""
+    """Return the pointing target that a text such as 'nadir roll 10' describes. Raises UsageError."""
     words = text.split()
     try:
         goal = Goal.named(words[0] if words else "")
@@ -345,7 +345,7 @@ def _orbit_facts(made: OrderedSlew, at: datetime, solved_s: float) -> dict[str, 
         "mean_heat_W": plan.energy / plan.horizon,
         "peak_of_limit": plan.peak,
         "turn_deg": math.degrees(float(angle_between(path.quaternion[0], path.quaternion[-1]))),
-        # The path's quaternion is continuous: past half a turn its scalar part has changed its sign.
+        # The path's quaternion is continuous, so its scalar part changes sign after half a revolution.
         "way_round": "short" if around[3] >= 0.0 else "long",
         "way_deg": math.degrees(float(np.trapezoid(speed, path.times))),
         "peak_rate_deg_s": math.degrees(float(speed.max())),

@@ -1,4 +1,4 @@
-"""`flight rate`: the body rate from a picture of streaked stars, and what moves otherwise than they."""
+"""Command `flight rate`, which estimates the body rate and moving objects from a picture of star streaks."""
 
 from __future__ import annotations
 
@@ -46,27 +46,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_picture(parser)
     add_field(parser)
     parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time")
-    parser.add_argument("--gain", type=positive, metavar="E", help="electrons a count (default 1)")
+    parser.add_argument("--gain", type=positive, metavar="E", help="electrons per count (default 1)")
     parser.add_argument("--saturation", type=positive, metavar="COUNTS", help="count at which pixels clip")
     parser.add_argument("--psf", type=positive, metavar="PX", help="point spread, standard deviation (1)")
     parser.add_argument(
         "--line-time",
         type=finite,
         metavar="S",
-        help="from one row's exposure to the next's, 0 of a global shutter (default: not known, about 0)",
+        help="time between rows, 0 for a global shutter (default: unknown, about 0)",
     )
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
         "--method",
         choices=(LIKELIHOOD, *DETECTOR_NAMES),
         default=LIKELIHOOD,
-        help="estimator (default likelihood); the others are the thesis's corner detectors",
+        help="estimator (default likelihood); the others are the corner detectors of the thesis",
     )
     add_output(parser, run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Estimate, print, draw; exit status 1 when the picture gives no rate."""
+    """Estimate, print and draw the rate. The exit status is 1 if the picture gives no rate."""
     pixels = read_picture(options)
     if not np.issubdtype(pixels.dtype, np.unsignedinteger):
         raise UsageError(f"{options.image}: pixels of {pixels.dtype}: give unsigned integers of 8 or 16 bits")
@@ -112,7 +112,7 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
 
 
 def _likelihood(options: argparse.Namespace, camera: Camera | None) -> LikelihoodSettings:
-    """Return the settings of the fit: the options, else the configuration's, else the defaults."""
+    """Return the fit settings from the options, or else from the configuration, or else the defaults."""
     settings = LikelihoodSettings() if camera is None else likelihood_settings(camera)
     if options.line_time is not None and not math.isfinite(options.line_time):
         raise UsageError(f"--line-time {options.line_time}: must be finite")
@@ -179,7 +179,7 @@ def _facts(found: FrameMotion, objects: tuple[SpaceObject, ...], method: str) ->
 
 
 def _reason(found: FrameMotion) -> str:
-    """Return in a line why there is no rate; empty with a rate."""
+    """Return a line about why the picture gives no rate, or an empty text."""
     if found.rate is not None:
         return ""
     detailed = found.reason if isinstance(found, MotionResult) else ""

@@ -58,7 +58,7 @@ def run_report(options: argparse.Namespace) -> int:
     try:
         paths = reporting.draw(run, options.figures or options.run / "figures")
     except UsageError as error:
-        # The numbers have been printed: missing figures are not a failure of the report.
+        # The numbers have been printed, so missing figures are not a failure of the report.
         sys.stderr.write(f"flight: {error}\n")
         return 0 if options.figures is None else 2
     if not options.json:
@@ -106,7 +106,7 @@ def configure_export(parser: argparse.ArgumentParser) -> None:
 
 
 def run_export(options: argparse.Namespace) -> int:
-    """Write the files and print their paths."""
+    """Write the exported files and print their paths."""
     if options.tdm is not None:
         paths = write_tracking_data(read_run(options.run), options.tdm)
     else:

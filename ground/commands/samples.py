@@ -1,4 +1,4 @@
-"""`flight samples`: pictures to try the other commands on; `flight index`: the sky index of a camera."""
+"""Commands `flight samples` (pictures for trying other commands) and `flight index` (sky index)."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def configure_index(parser: argparse.ArgumentParser) -> None:
 
 
 def run_index(options: argparse.Namespace) -> int:
-    """Build and write the index."""
+    """Build and write the sky index."""
     if not all(math.isfinite(value) for value in (options.faintest, options.epoch)):
         raise UsageError("--faintest and --epoch: give finite numbers")
     sky = build(replace(_settings(options), faintest=options.faintest, epoch=options.epoch))

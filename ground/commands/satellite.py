@@ -91,13 +91,13 @@ _ORIGINS = {field.name: dict(field.states) for field in PARAMETERS.fields if fie
 _RATE = 20_000.0
 """Default rate of frames up (bytes/s)."""
 _SILENCE_S = 60.0
-"""Default time without a packet after which a file command fails (s)."""
+"""Default time (s) without a packet after which a file command fails."""
 _TURN_S = 0.01
-"""Time to wait for packets before due units are sent (s)."""
+"""Time (s) to wait for packets before transfer units that are due are sent."""
 _SHOW_S = 1.0
-"""Time between two lines of progress (s)."""
+"""Time (s) between two lines of progress."""
 _LINGER_S = 0.5
-"""Time after a transfer (s) during which the other end may request the last answer again."""
+"""Time (s) after a transfer during which the other end may request the last answer again."""
 
 
 def _add_way(parser: argparse.ArgumentParser, timeout: float) -> None:
@@ -178,7 +178,7 @@ def _add_field(parser: argparse.ArgumentParser, field: Field, optional: bool) ->
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Send the command, wait and print the answer."""
+    """Send the command, wait for the answer and print it."""
     if options.link is not None:
         return _command_by_link(options)
     if options.what in _DIRECTIVES:
@@ -225,7 +225,7 @@ def _command_by_link(options: argparse.Namespace) -> int:
 
 
 def packet_of(options: argparse.Namespace) -> bytes:
-    """Return the packet of the typed command; its time makes it unique. Raises UsageError."""
+    """Return the packet of the typed command; the time in the packet makes it unique. Raises UsageError."""
     try:
         match options.what:
             case "play":
@@ -273,7 +273,7 @@ class ParameterTable:
 
     @classmethod
     def of(cls, row: np.void) -> ParameterTable:
-        """Return the table of a packet."""
+        """Return the parameter table in a packet."""
         values = {
             key: float(row[field.name]) for key, field in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True)
         }
@@ -297,7 +297,7 @@ def configure_parameters(parser: argparse.ArgumentParser) -> None:
 
 
 def run_parameters(options: argparse.Namespace) -> int:
-    """Request the table, change it if asked to, and print the table in use."""
+    """Request the parameter table, change it if requested, and print the table in use."""
     if not 0.0 < options.timeout < float("inf"):
         raise UsageError(f"--timeout {options.timeout}: must be a positive number of seconds")
     file = _parameters_in(options.load) if options.load is not None else None
@@ -343,7 +343,7 @@ def _ask(options: argparse.Namespace, command: Command) -> tuple[ParameterTable 
 def _ask_by_link(
     options: argparse.Namespace, packet: bytes, wants_table: bool
 ) -> tuple[ParameterTable | None, str]:
-    """Send in protected frames; the table is in the live telemetry, before or after the verification."""
+    """Send a command in protected frames, and find the parameter table in the live telemetry."""
     table: ParameterTable | None = None
     refused: str | None = None
     kinds = {TELEMETRY_LAYOUTS[kind.name].identifier: kind for kind in (PARAMETERS, VERIFICATION)}
@@ -403,7 +403,7 @@ def _change(text: str) -> tuple[str, float]:
 
 
 def _parameters_in(path: Path) -> dict[str, float]:
-    """Return the table in a file. Raises ConfigError, UsageError."""
+    """Return the parameter table in a file. Raises ConfigError, UsageError."""
     document = read_document(read_text(path), str(path))
     values: dict[str, float] = {}
     for section, entries in document.values.items():
@@ -486,7 +486,7 @@ def run_files(options: argparse.Namespace) -> int:
 
 
 class _FileWork:
-    """One file command with a session."""
+    """Execution of one file command with a session."""
 
     def __init__(
         self, session: FileSession, terminal: Terminal, patience_s: float, ended: Callable[[], bool]
@@ -496,7 +496,7 @@ class _FileWork:
         self._shown_s = 0.0
 
     def obey(self, options: argparse.Namespace) -> Object:
-        """Return the result of the command. Raises FlightError."""
+        """Return the result of the file command. Raises FlightError."""
         match options.what:
             case "list":
                 path = self._get(ListFiles(options.under), LISTING)
@@ -528,7 +528,7 @@ class _FileWork:
             for report in self._session.reports():
                 if problem := failed([report]):
                     raise FlightError(problem)
-                # The satellite completes when the file is here, which may be the work of an earlier session.
+                # The satellite completes a transfer when the ground has the file.
                 completed |= report.stage is Stage.COMPLETED
             for progress in self._new_endings(name):
                 self._check(progress)

@@ -1,4 +1,4 @@
-"""`flight solve`: where a picture of the sky points, which stars it shows, and how the camera turned."""
+"""Command `flight solve`, which finds the attitude, the stars and the rate in a picture of the sky."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from knightcube.vision.startracker.solve import SolveSettings
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
 IMAGE = "image"
-"""Name of the attitude method that fits in the image."""
+"""Name of the attitude method that fits the star positions in the image."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -62,7 +62,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_picture(parser)
     add_field(parser)
     parser.add_argument(
-        "--fov-error", type=positive, metavar="DEG", help="tolerance of --fov (default 5 %% of it)"
+        "--fov-error", type=positive, metavar="DEG", help="tolerance of --fov (default 5 %% of the field)"
     )
     parser.add_argument(
         "--exposure", type=positive, metavar="S", help="exposure time, for the rate of streaks"
@@ -72,7 +72,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--date",
         type=_date,
         metavar="UTC",
-        help="when, such as 2026-11-21: proper motion, aberration, planets",
+        help="time of the picture, such as 2026-11-21, for proper motion, aberration and planets",
     )
     parser.add_argument(
         "--wcs", type=Path, metavar="FITS", help="write a header of world coordinates (TAN-SIP) here"
@@ -106,7 +106,7 @@ def _add_methods(parser: argparse.ArgumentParser) -> None:
 
 
 def _date(text: str) -> datetime:
-    """Return the time of an argument, UTC if it has no time zone. Raises ArgumentTypeError."""
+    """Return the time in an argument, in UTC unless the text has a time zone. Raises ArgumentTypeError."""
     try:
         instant = datetime.fromisoformat(text)
     except ValueError as error:
@@ -115,7 +115,7 @@ def _date(text: str) -> datetime:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Solve, print, draw; exit status 1 when the picture is not solved."""
+    """Solve the picture, and print and draw the solution. The exit status is 1 without a solution."""
     if options.wcs is not None and options.wcs.exists():
         raise UsageError(f"{options.wcs}: exists already: name another file")
     pixels = read_picture(options)
@@ -153,7 +153,7 @@ def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, f
             )
         lens, exposure = camera_model(camera), exposure or camera.exposure
         if camera.lens is None and error is None:
-            # Only a calibrated lens has no tolerance.
+            # Only a calibrated lens has no tolerance of the field of view.
             error = FOV_TOLERANCE * math.degrees(field_of_view(lens))
         settings = SolveSettings(
             detection=DetectionSettings(saturation=camera.saturation), likelihood=likelihood_settings(camera)
@@ -170,7 +170,7 @@ def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, f
 
 
 def facts(solution: StarSolution, seconds: float) -> dict[str, Any]:
-    """Return the values of a solution, for `--json`."""
+    """Return the values of a solution as JSON data."""
     values: dict[str, Any] = {
         "status": solution.status,
         "reason": solution.reason or None,

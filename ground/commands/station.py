@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 
 PORT = 8040
 _READ_S = 0.5
-"""Time between two reads of a growing log (s)."""
+"""Time (s) between two reads of a growing log."""
 _PING_S = 2.0
-"""Time between two pings of a watched flight (s)."""
+"""Time (s) between two pings of a watched flight."""
 
 
 def configure_keys(parser: argparse.ArgumentParser) -> None:
@@ -143,7 +143,7 @@ def run_watch(options: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def _ending() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C or SIGTERM sets; a second signal kills."""
+    """Yield an event that Ctrl-C or SIGTERM sets; a second signal kills the process."""
     ended = threading.Event()
 
     def end(number: int, _: FrameType | None) -> None:
@@ -309,7 +309,7 @@ def _print(text: str) -> None:
 
 
 def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
-    """Return the console for the options; `stack` closes its resources."""
+    """Return the console that the options describe; `stack` closes the console's resources."""
     from ground.console.commanding import CommandForms, LinkFeed, by_socket, flying  # noqa: PLC0415
     from ground.console.history import History  # noqa: PLC0415
     from ground.console.server import Console  # noqa: PLC0415

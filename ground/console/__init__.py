@@ -1,1 +1,1 @@
-"""A flight in the browser: the same page shows a live flight and the replay of a run."""
+"""Browser console of a flight, which shows a live flight or the replay of a run on the same page."""

@@ -1,4 +1,4 @@
-"""Commands of the console: from the page's forms, over a socket or a link, or to a flight of its own."""
+"""Commands from the console's forms to a flight, over a socket or a link."""
 
 from __future__ import annotations
 
@@ -39,27 +39,28 @@ from knightcube.errors import FlightError, UsageError
 
 Object = dict[str, Any]
 Send = Callable[[bytes], Object]
-"""Sends a command packet and returns the answer with `obeyed` and `text`. Raises FlightError."""
+"""Function that sends a command packet and returns the answer with `obeyed` and `text`. Raises
+FlightError."""
 _TIMEOUT_S = 3.0
-"""Time to wait for the answer of a socket (s)."""
+"""Longest time (s) to wait for an answer from a socket."""
 _LISTEN_S = 0.02
-"""Time for which a link is read at once (s)."""
+"""Longest time (s) of one read of a link."""
 _PING_AFTER_S = 2.0
 """Time without telemetry (s) before a ping, because the link forgets a UDP sender after a minute."""
 _ANSWER_S = 5.0
-"""Time to wait for the report on a command over the link (s)."""
+"""Longest time (s) to wait for the report on a command over the link."""
 _KEPT_REPORTS = 64
 _SPI = 1
 _START_S, _END_S = 60.0, 15.0
-"""Time to wait for the start and the end of the console's own flight (s)."""
+"""Longest times (s) to wait for the start and the end of a flight that the console started."""
 _FRAMES = 60
-"""Camera frames that the console's own flight keeps for the page."""
+"""Number of camera frames that a flight started by the console keeps for the page."""
 _CAMERA = re.compile(r"(?m)^(camera:[^\n]*)$(?!(?:\n[ #][^\n]*)*?\n  keep_frames:)(?=\n  )")
-"""First line of a section `camera` without the key `keep_frames`."""
+"""Pattern of the first line of a section `camera` without the key `keep_frames`."""
 
 
 def by_socket(to: str) -> Send:
-    """Return a function that sends commands to a flight's own socket or to its HOST:PORT."""
+    """Return a function that sends commands to the UNIX socket or to the HOST:PORT of a flight."""
 
     def send(packet: bytes) -> Object:
         answers = decode(exchange(to, packet, _TIMEOUT_S))["command"]
@@ -71,7 +72,7 @@ def by_socket(to: str) -> Send:
 
 
 class CommandForms:
-    """Packs the values of the page's forms into commands and sends them."""
+    """Sender of commands, which packs the values of the page's forms into command packets."""
 
     def __init__(self, send: Send | None, layouts: Mapping[str, Layout] = LAYOUTS) -> None:
         """Accept the commands of `layouts`; without `send` the console is read-only."""
@@ -115,13 +116,13 @@ class CommandForms:
 
 
 def _text_of(data: bytes) -> str:
-    """Return the text of a command's packet. Raises CommandError for invalid values."""
+    """Return a text that describes a command packet. Raises CommandError for invalid values."""
     directive = directives.unpack(data)
     return commands.unpack(data).text if directive is None else str(directive)
 
 
 def _value(name: str, field: Field, given: Any) -> Any:
-    """Return a field's value. Empty numbers are NaN in fields that can hold it. Raises UsageError."""
+    """Return a field's value. An empty number is NaN in a field that can hold NaN. Raises UsageError."""
     if field.count > 1:
         items = list(given) if isinstance(given, list) else [given] if given is not None else []
         return [_number(name, field, item) for item in [*items, *[None] * field.count][: field.count]]
@@ -141,9 +142,9 @@ def _number(name: str, field: Field, given: Any) -> float | int:
 
 
 class LinkFeed:
-    """Live telemetry and commands over a link. One thread calls `new`, others may call `send`.
+    """Live telemetry and commands over a link. One thread calls `new`, and other threads may call `send`.
 
-    Playback is not shown, because its packets are older than the live ones.
+    Playback is not shown, because its packets are older than the live packets.
     """
 
     def __init__(self, terminal: Terminal) -> None:
@@ -186,7 +187,7 @@ class LinkFeed:
         while time.monotonic() < until:
             reports = list(self._reports.get(counter, ()))
             if reports and reports[-1].stage is not Stage.ACCEPTED:
-                # A list has one report per line, after that of its acceptance.
+                # The lines of a list arrive as reports after the report of acceptance.
                 listed = reports[1:] if reports[-1].name == LIST.name else reports[-1:]
                 text = "; ".join(report.text for report in listed)
                 return {"obeyed": int(obeyed(reports)), "text": text, "counter": counter}
@@ -200,7 +201,7 @@ class LinkFeed:
 
 @contextlib.contextmanager
 def flying(config: Path, out: Path) -> Iterator[str]:
-    """Fly a simulated configuration into `out` in real time and yield its command socket.
+    """Fly a simulated configuration into `out` in real time and yield the flight's command socket.
 
     The flight ends with the context. Raises FlightError if it does not start.
     """

@@ -1,7 +1,7 @@
-"""History of a flight for the page: all packets by time, and the state at the time that a reader looks at.
+"""History of a flight for the console: all packets by time, and the state at a chosen time.
 
-A flight of hours at 40 Hz does not fit into the memory of a ground computer. The packets are therefore in a
-temporary folder, and only their times are in memory, with 8 bytes each.
+A flight of hours at 40 Hz does not fit into the memory of a ground computer. The packets are therefore stored
+in a temporary folder, and only their times (8 bytes each) are in memory.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
 LISTED = ("event", "command", "verification", "streak", "stars", "sightings")
-"""Packets that the page lists one by one; of the others it shows the newest."""
+"""Packet types that the page lists one by one; of other types it shows only the newest packet."""
 MAX_SPEED = 1000.0
-"""Highest speed of a replay."""
+"""Highest speed of a replay, as multiple of real time."""
 _MAX_LISTED = 500
 _FIRST_CAPACITY = 1024
 
 
 class History:
-    """Packets of a flight by name and time. A context manager, which removes its files at the end."""
+    """Packets of a flight by name and time, as a context manager that removes its files at the end."""
 
     def __init__(self) -> None:
-        """Make a folder for the packets."""
+        """Make a temporary folder for the packets."""
         self._folder = tempfile.TemporaryDirectory(prefix="knightcube-console-")
         self._tracks = {name: _Track(layout, Path(self._folder.name)) for name, layout in LAYOUTS.items()}
 
@@ -75,8 +75,8 @@ class History:
     ) -> tuple[FloatArray, FloatArray]:
         """Return times (n,), s, and values (n,) of a field, or of one component of it, in a time span.
 
-        A series of more than `points` values is reduced to the minimum and maximum of each interval, in their
-        order, so that no peak is lost. A value is NaN only if its whole interval has no number.
+        A series of more than `points` values is reduced to the minimum and maximum of each interval, in order
+        of time, so that no peak is lost. A reduced value is NaN only if all values of its interval are NaN.
         """
         first, stop = (self.count(name, time) for time in (span_ns[0] - 1, span_ns[1]))
         rows = self.rows(name, first, stop)
@@ -98,7 +98,7 @@ class History:
 
 
 class _Track:
-    """Packets of one name: their bytes in a file, their times in memory."""
+    """Packets of one name, with their bytes in a file and their times in memory."""
 
     def __init__(self, layout: Layout, folder: Path) -> None:
         self._layout = layout
@@ -108,7 +108,7 @@ class _Track:
 
     @property
     def times(self) -> npt.NDArray[np.int64]:
-        """Times, ns, which never decrease: a search needs their order even in a damaged log."""
+        """Times (ns), which never decrease, because a search needs ordered times even for a damaged log."""
         return self._kept[: self._count]
 
     def append(self, rows: PacketArray) -> None:
@@ -135,11 +135,11 @@ class _Track:
 
 @dataclass(slots=True)
 class PageCursor:
-    """Time that one reader of the page looks at: the newest packet, or a replay.
+    """Time that one reader of the page has chosen, either the newest time or that of a replay.
 
     Attributes:
         live: whether the newest packet is shown.
-        speed: mission time per time of the reader; 0 while paused.
+        speed: mission time per real time, 0 while the replay is paused.
     """
 
     live: bool = True
@@ -182,11 +182,11 @@ class PageState:
         self._shown: dict[str, int] = {}
 
     def reset(self) -> None:
-        """Start again with a complete state, after a jump in time."""
+        """Send a complete state next, after a jump in time."""
         self._shown.clear()
 
     def at(self, time_ns: int, names: Mapping[str, Any]) -> Object:
-        """Return the new packets up to a time: the newest of each name, and lists of those in `LISTED`."""
+        """Return the new packets up to a time: the newest of each name, and lists of the `LISTED` types."""
         newest: Object = {}
         again = not self._shown
         listed: dict[str, list[Object]] = {}

@@ -1,9 +1,9 @@
-"""Server of the page: telemetry of one flight and commands from the page's forms, on loopback only.
+"""Web server of the console, with telemetry of one flight and commands from forms, on loopback only.
 
-Only the browser that opened an address with a token may use the console. A token is good for one browser: the
-first request with it gets a cookie, and the token is replaced, so that an address that another user of the
-machine finds later, for example in the list of processes, is useless. Host and Origin are checked as well,
-because a name rebound to loopback (DNS rebinding) and a page of another origin reach the console through the
+Only the browser that opened an address with a token may use the console. A token is valid for one browser.
+The first request with a token gets a cookie, and the token is replaced. An address that another user of the
+machine finds later, for example in the list of processes, is therefore useless. The headers Host and Origin
+are also checked, because DNS rebinding and pages of another origin could reach the console through the
 operator's own browser.
 """
 
@@ -36,17 +36,17 @@ PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1
 NO_ACCESS = "open the newest address that `flight console` printed: the page needs the token in it"
 _READ_S = 0.1
-"""Time between two reads of new packets (s)."""
+"""Time (s) between two reads of new packets."""
 _MAX_POINTS = 4000
 _RANDOM_BYTES = 32
 _OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?")
 _OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name})
-"""Packets of the link process, which are received even if the flight itself is silent."""
+"""Packet types of the link process, which are received even if the flight process is silent."""
 _T = TypeVar("_T")
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 _HEADERS = {
-    # No content of a log or an answer makes the browser load from elsewhere; no other page frames this one.
+    # Content security policy, which lets the browser load only from this server and forbids frames.
     "Content-Security-Policy": "default-src 'self'; connect-src 'self'; img-src 'self' data:; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
     "X-Content-Type-Options": "nosniff",
@@ -72,15 +72,15 @@ class Console:
 
     Attributes:
         name: name of the flight on the page.
-        feed: source of its packets.
+        feed: source of the flight's packets.
         history: packets received so far.
-        surroundings: orbit and devices.
-        forms: commands from the page.
+        surroundings: orbit and devices of the flight.
+        forms: sender of commands from the page.
         utc_ns: UTC at mission time zero, ns, None until it is known.
         flight_received: monotonic time of the last packet of the flight itself, s.
         frames: kept camera frames.
-        trouble: reason why the last read failed, empty if it did not.
-        settled_ns: newest time of which all packets were received, which the page shows live.
+        trouble: reason why the last read failed, or an empty text.
+        settled_ns: newest time (ns) of which all packets have been received, which the live page shows.
         sockets: open WebSockets.
     """
 
@@ -106,7 +106,7 @@ class Console:
         self.trouble = ""
         newest_ns = self.history.span_ns[1]
         self.history.append(packets)
-        # The packets of one time may be in two reads: those of the previous read are complete now.
+        # The packets of one time may be split over two reads, so only the previous read is complete now.
         more = newest_ns > 0 and any(len(rows) for rows in packets.values())
         self.settled_ns = newest_ns if more else self.history.span_ns[1]
         if any(len(rows) for name, rows in packets.items() if name not in _OF_THE_LINK):
@@ -125,7 +125,7 @@ class Access:
         self.token = secrets.token_urlsafe(_RANDOM_BYTES)
 
     def open_session(self, token: str) -> str | None:
-        """Return the cookie of a new session for the current token, or None for any other text."""
+        """Return the cookie of a new session if `token` is the current token, else None."""
         if not _equal(token, self.token):
             return None
         self._sessions.append(secrets.token_urlsafe(_RANDOM_BYTES))
@@ -143,9 +143,10 @@ def _equal(one: str, other: str) -> bool:
 
 
 def refusal(headers: Mapping[str, str], origin_required: bool) -> str:
-    """Return why a request is not from the console's own page, or an empty text if it is.
+    """Return the reason why a request is not from the console's own page, or an empty text.
 
-    Browsers state the origin of each POST and each WebSocket, so these must have one (`origin_required`).
+    Browsers state the origin of each POST and each WebSocket, so these requests must have an Origin
+    (`origin_required`).
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
     if not _OWN_HOST.fullmatch(host):
@@ -239,7 +240,7 @@ class _Pages:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        # One thread for pictures, because each thread keeps the memory of the largest one.
+        # Pictures are made in one thread, because each thread keeps the memory of its largest picture.
         self._drawing = ThreadPoolExecutor(1)
 
     async def index(self, _: web.Request) -> web.StreamResponse:
@@ -372,7 +373,7 @@ def _real(request: web.Request, name: str) -> float:
         value = float(text)
     except ValueError:
         value = float("nan")
-    if not abs(value) < 1e9:  # mission time of 30 years, s; false for NaN
+    if not abs(value) < 1e9:  # at most 30 years of mission time; false for NaN
         raise UsageError(f"{name} = {text!r}: give the mission time in seconds")
     return value
 

@@ -1,4 +1,4 @@
-"""Surroundings of a flight for the page: orbit, Sun and magnetic field, and the frames of its camera."""
+"""Surroundings of a flight for the console: orbit, Sun, magnetic field, and camera frames."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from knightcube.vision.camera.images import facts_of
 
 Object = dict[str, Any]
 _TRACK_STEP, _TRACK_HALF = 60.0, 5700.0
-"""Step of the ground track, and its time before and after now, one revolution in low orbit (s)."""
+"""Step (s) of the ground track, and the time (s) that it covers before and after the present."""
 _MAX_SIDE = 640
 """Largest side of a picture on the page (px)."""
 _DARK, _BRIGHT = 50.0, 99.9
@@ -35,9 +35,9 @@ class FlightSurroundings:
     """Orbit and devices from the configuration of a flight.
 
     Attributes:
-        elements: two-line elements; None on a testbed and if the configuration has none.
+        elements: two-line elements, or None on a testbed or without elements in the configuration.
         camera: mounting (4,) of the star camera, body into camera, and its field of view, rad.
-        coil_dipole: dipole of a coil at its current limit, A m^2.
+        coil_dipole: dipole of a coil at the coil's current limit, A m^2.
     """
 
     elements: TwoLineElements | None
@@ -60,7 +60,7 @@ class FlightSurroundings:
         return cls(TwoLineElements(*lines) if lines else None, view, dipole)
 
     def at(self, utc_ns: int) -> Object | None:
-        """Return position, ICRS directions (3,), and the points below satellite and Sun, deg."""
+        """Return position, ICRS directions (3,), and the ground points (deg) below satellite and Sun."""
         state = self._state(_julian_date(utc_ns))
         if state is None:
             return None
@@ -168,7 +168,7 @@ def pixels_of(data: bytes) -> Image:
 
 
 def binned(pixels: Image) -> Image:
-    """Return the means of squares of pixels, so that both sides fit on the page."""
+    """Return the means of square blocks of pixels, so that the picture fits on the page."""
     step = -(-max(pixels.shape) // _MAX_SIDE)
     rows, columns = (side // step for side in pixels.shape)
     squares = pixels[: rows * step, : columns * step].reshape(rows, step, columns, step)

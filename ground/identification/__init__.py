@@ -1,7 +1,9 @@
-"""Identification of the body on its thread from a short flight.
+"""Identification of the testbed body's constants from a short flight.
 
-    excitation (flown by the loop) -> flight log -> record -> fit -> absolute scale -> `plant` section
+The control loop flies an excitation, `record` reads the flight log, `fit` estimates the constants per
+inertia, and `scale` gives the absolute values of the configuration's section `plant`.
 
-Motion under a known current determines ratios to the inertia only. `scale` adds prior values from the
-configuration and the magnetometer, and states the contribution of each.
+The motion under a known current determines only the ratios of the constants to the inertia. The module
+`scale` adds prior values from the configuration and the magnetometer, and states the contribution of each
+source.
 """

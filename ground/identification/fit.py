@@ -1,21 +1,23 @@
-"""Maximum-likelihood fit of the constants of motion to a record, by Gauss-Newton, with the noise levels.
+"""Maximum-likelihood fit of the motion's constants and the noise levels to a record, by Gauss-Newton steps.
 
-The motion per inertia is theta'' = g I cos(theta) - kappa theta - delta theta' + d, with each change of the
-current delayed by tau; theta and theta' + b are measured (Sease 2013, 5.4, with the thread). The actual
-current differs from the commanded one: an active coil adds process noise, an inactive one does not. The
-predictor is therefore the extended Kalman filter of the two states (prediction-error method; Ljung 1999,
-System Identification, 7.2 and 10.2); an output-error fit would treat the accumulated noise as signal. Between
-events the state is propagated by its Taylor series with an error of a ten-thousandth of the noise. The
-derivatives follow the filter with its gains held constant, which leaves the expected gradient at zero.
+The equation of motion, divided by the inertia, is theta'' = g I cos(theta) - kappa theta - delta theta' + d
+(Sease 2013, eq. 5.4, with the thread). Each change of the current I is delayed by tau. The angle theta and
+the biased rate theta' + b are measured. The actual current differs from the commanded current, so an active
+coil adds process noise. The predictor is therefore the extended Kalman filter of angle and rate
+(prediction-error method; Ljung 1999, System Identification, sections 7.2 and 10.2). An output-error fit would
+treat the accumulated process noise as signal. Between events the state is propagated by a Taylor series whose
+error is a ten-thousandth of the noise. The derivatives by the constants treat the filter gains as constant,
+which keeps the expected gradient at zero.
 
-Constants and noise levels are estimated alternately, because their information matrices do not mix: the
-constants from the whitened innovations, the noise by Fisher scoring. The priors are wide and matter only for
-records that do not determine a value: the delay is about 20 ms, the noise levels are known to a factor of 3.
-Events that no noise explains, such as the release, a jolt or an outlier, restart the filter.
+Constants and noise levels are estimated alternately, because the information matrix has no terms between
+them. The constants are estimated from the whitened innovations, and the noise levels by Fisher scoring. The
+priors are wide and matter only for records that do not determine a value. The prior of the delay is about 20
+ms, and the prior noise levels are uncertain by a factor of 3. Events that no noise explains, such as the
+release, a jolt or an outlier, restart the filter.
 
 The covariance is the inverse of the information if the innovations are white (test of Ljung and Box 1978).
-Otherwise each standard deviation is that of the sandwich estimate (Huber 1967) over segments of the record,
-if that is larger. Causes are the attitude filter of the inertial unit, or air currents.
+Otherwise each standard deviation is at least that of the sandwich estimate (Huber 1967) over segments of the
+record. Innovations are not white because of the inertial unit's attitude filter or air currents.
 """
 
 from __future__ import annotations
@@ -33,15 +35,16 @@ from knightcube.astro.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class MotionConstants:
-    """Constants of the motion, each divided by the inertia.
+    """Constants of the motion, which are divided by the inertia.
 
     Attributes:
-        gain: g = n A B / J, rad/s^2/A.
-        torsion: kappa = k / J, 1/s^2.
-        damping: delta = c / J, 1/s.
-        disturbance: d, rad/s^2, which includes the rest angle theta_0 of the thread as kappa theta_0.
+        gain: torque per current and inertia, g = n A B / J, rad/s^2/A.
+        torsion: thread stiffness per inertia, kappa = k / J, 1/s^2.
+        damping: damping per inertia, delta = c / J, 1/s.
+        disturbance: constant angular acceleration d, rad/s^2, including kappa theta_0 for the thread's rest
+            angle theta_0.
         bias: gyro bias b, rad/s.
-        delay: tau, s, from the cycle that wrote a current to its effect.
+        delay: delay tau from the cycle that wrote a current to the current's effect, s.
     """
 
     gain: float
@@ -52,7 +55,7 @@ class MotionConstants:
     delay: float = 0.0
 
     def to_array(self) -> FloatArray:
-        """Return the constants (6,) in order of the fields."""
+        """Return the constants as an array (6,) in the order of the fields."""
         return np.array([getattr(self, name) for name in NAMES])
 
     @classmethod
@@ -71,39 +74,39 @@ _NOISE_PRIOR = math.log(3.0)
 """Prior standard deviation of the logarithms of the noise levels."""
 _MAX_DELAY = 0.1
 _CONVERGED = 0.01
-"""Largest step, in standard deviations, at which the fit has converged."""
+"""Step size (standard deviations) below which the fit has converged."""
 _MAX_ROUNDS = 25
 _NOISE_STEP = 0.02
 _NOISE_CONVERGED = 0.01
 _GATES = (30.0, 8.0)
-"""Gates of the innovations: in assumed, then in estimated standard deviations."""
+"""Outlier gates of the innovations, first in assumed and later in estimated standard deviations."""
 _MAX_RESTARTS = 0.02
 """Largest fraction of samples at which the filter may restart."""
 _LAGS = 20
-"""Lags of the whiteness test."""
+"""Number of lags of the whiteness test."""
 _SEGMENTS = 40
-"""Segments of the record for the sandwich estimate."""
+"""Number of segments of the record for the sandwich estimate."""
 _MIN_PROBABILITY = 1e-3
 """Probability below which the innovations are not white."""
 _MAX_GAIN_ERROR = 0.25
-"""Largest relative standard deviation of the gain."""
+"""Largest accepted relative standard deviation of the gain."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionNoise:
-    """Standard deviations of the current in an active coil, A, of the angle, rad, and of the rate, rad/s."""
+    """Standard deviations of an active coil's current (A), of the angle (rad) and of the rate (rad/s)."""
 
     current: float
     angle: float
     rate: float
 
     def to_logarithms(self) -> FloatArray:
-        """Return the logarithms (3,)."""
+        """Return the logarithms (3,) of the noise levels."""
         return np.log([self.current, self.angle, self.rate])
 
     @classmethod
     def of_logarithms(cls, values: FloatArray) -> MotionNoise:
-        """Return the noise from its logarithms (3,)."""
+        """Return the noise levels from their logarithms (3,)."""
         return cls(*(float(value) for value in np.exp(values)))
 
 
@@ -113,10 +116,10 @@ class Innovations:
 
     Attributes:
         error: measured minus predicted angle and rate (n - 1, 2).
-        covariance: their covariances (n - 1, 2, 2).
-        gradient: derivatives (n - 1, 2, 6) of the prediction by the constants; (0, 2, 6) without gradient.
-        taken: indices (n - 1,) of the samples.
-        restarts: indices of the samples at which the filter restarted, which have no innovation.
+        covariance: covariances (n - 1, 2, 2) of the errors.
+        gradient: derivatives (n - 1, 2, 6) of the prediction by the constants, or an empty array (0, 2, 6).
+        taken: indices (n - 1,) of the samples that have an innovation.
+        restarts: indices of the samples at which the filter restarted and which have no innovation.
     """
 
     error: FloatArray
@@ -145,7 +148,8 @@ def innovations(
 ) -> Innovations:
     """Run the filter over a record and return the innovations.
 
-    The filter restarts at the samples `restarts` and if an innovation exceeds `gate` standard deviations.
+    The filter restarts at the samples `restarts`, and after an innovation that exceeds `gate` standard
+    deviations.
     """
     angle, rate = record.angle.tolist(), record.rate.tolist()
     predictor = _Predictor(constants, noise, record.period, with_gradient)
@@ -190,13 +194,13 @@ class _Predictor:
         self._bias_row[_BIAS] = 1.0
 
     def start(self, angle: float, rate: float) -> None:
-        """Start, or restart, from a sample."""
+        """Start or restart the filter from a sample."""
         self._angle, self._rate = angle, rate - self._constants.bias
         self._paa, self._pab, self._pbb = self._r_angle, 0.0, self._r_rate
         self._by_angle, self._by_rate = np.zeros(len(NAMES)), -self._bias_row
 
     def distance(self, angle: float, rate: float) -> float:
-        """Return the larger of the normalised innovations of angle and rate."""
+        """Return the larger normalised innovation of angle and rate."""
         by_angle = (angle - self._angle) ** 2 / (self._paa + self._r_angle)
         by_rate = (rate - self._rate - self._constants.bias) ** 2 / (self._pbb + self._r_rate)
         return math.sqrt(max(by_angle, by_rate))
@@ -252,7 +256,7 @@ class _Predictor:
         return error, (saa, pab, pab, sbb)
 
     def note_switch(self, jump: float) -> None:
-        """Add the derivative by the delay: a later switch would have let the old current act longer."""
+        """Add the derivative by the delay, with which the old current would act longer before a switch."""
         self._by_rate = self._by_rate.copy()
         self._by_rate[_DELAY] -= self._constants.gain * math.cos(self._angle) * jump
 
@@ -263,7 +267,7 @@ class Whiteness:
 
     Attributes:
         variance: variance of the whitened innovations.
-        probability: probability of an equally strong correlation over 20 lags of white innovations.
+        probability: probability that white innovations have an equally strong correlation over 20 lags.
     """
 
     variance: tuple[float, float]
@@ -271,7 +275,7 @@ class Whiteness:
 
     @property
     def passed(self) -> bool:
-        """Whether the innovations may be white."""
+        """Whether the test does not reject white innovations."""
         return min(self.probability) > _MIN_PROBABILITY
 
 
@@ -306,7 +310,7 @@ def fit(record: Record, noise: MotionNoise, progress: Callable[[int, float], Non
     try:
         return _fitted(record, noise, progress)
     except (ValueError, OverflowError) as error:
-        # A diverging prediction ends in the cosine of infinity or an indefinite covariance.
+        # A diverging prediction raises an error for the cosine of infinity or an indefinite covariance.
         raise IdentificationError("no constants explain this flight: the prediction diverges") from error
 
 
@@ -317,7 +321,7 @@ def _fitted(record: Record, noise: MotionNoise, progress: Callable[[int, float],
     for count in range(_MAX_ROUNDS):
         passed = innovations(record, constants, noise, restarts)
         step, information = _step(passed, constants)
-        # The likelihood has a kink in the delay at each sample: steps that reverse are halved.
+        # The likelihood has a kink at each sample as the delay varies, so steps that reverse are halved.
         share *= 0.5 if step @ information @ before < 0.0 and count > 3 else 1.0
         before = step
         step = share * step

@@ -1,9 +1,10 @@
 """Signals of a flight log for identification: rotation about the thread and currents, without the truth log.
 
 Attitude and rate are the samples of the inertial unit at the times of its own clock, because a busy host
-timestamps some samples late. The currents are the commanded ones, limited and quantised, each from the cycle
-that requested it until the next; a coil driver with its own thread reports them a cycle later. The field is
-measured while all coils are off, because an active coil disturbs the magnetometer.
+timestamps some samples late. The currents are the commanded currents after limiting and quantisation. Each
+current is assumed to flow from the cycle that requested it until the next cycle. A coil driver with its own
+thread reports a current one cycle later. The field is measured while all coils are off, because an active
+coil disturbs the magnetometer.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ from knightcube.errors import FlightError, UsageError
 
 MIN_SAMPLES = 200
 MAX_STEP = 0.025
-"""Longest step between two events of a timeline (s)."""
+"""Longest step (s) between two events of a timeline."""
 _AT_LIMIT = 0.97
-"""Fraction of a coil's limit from which the actual current may differ from the commanded one."""
+"""Fraction of a coil's current limit above which the actual current may differ from the commanded current."""
 _RESOLUTION = 1.0e-4
 """Difference (A) above which two currents are different; one count of the PWM chip is about 4e-5 A."""
 _SETTLED_FIELD = 0.5
-"""Time after the coils were switched off before the field is measured (s)."""
+"""Time (s) from the switching-off of the coils to the measurement of the field."""
 _MAX_GAP = 60.0
-"""Longest time between two samples (s)."""
+"""Longest allowed time (s) between two samples."""
 _CLIPPED_VARIANCE = 100.0
-"""Factor of the current's variance at the limit, where its mean is not known."""
+"""Factor on the variance of a current at the coil's limit, where the mean current is unknown."""
 _MAX_VALUES = {
     "imu": {"quaternion": 1.001, "rate": 50.0, "field": 0.1},
     "control": {"current_command": 10.0, "current_written": 10.0},
@@ -38,7 +39,7 @@ _MAX_VALUES = {
 
 
 class IdentificationError(FlightError):
-    """A record that does not determine the constants; the message says what is missing."""
+    """Error for a record that does not determine the constants; the message says what is missing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,10 +77,10 @@ class Record:
 
 
 def read_record(run: Run, stale_after: float) -> Record:
-    """Return the record of a run.
+    """Return the identification record of a run.
 
-    Without commands for `stale_after` s the driver lets the coils fall to zero. Raises UsageError for a run
-    in which another coil was driven too, IdentificationError for a run that is too short or whose log is
+    After `stale_after` s without a command the driver sets the coil currents to zero. Raises UsageError for a
+    run in which another coil was driven too, IdentificationError for a run that is too short or whose log is
     damaged.
     """
     control, imu, label = run["control"], run["imu"], run["run"]
@@ -135,7 +136,7 @@ def _refuse_impossible(run: Run, label: PacketArray) -> None:
 
 
 def _sample_times(imu: PacketArray) -> FloatArray:
-    """Return the times (n,), s, of the samples: the unit's clock, fitted to the earliest host timestamps.
+    """Return the times (n,), s, of the samples, from the unit's clock fitted to the earliest host timestamps.
 
     The host timestamps are used if the unit's clock was restarted.
     """
@@ -157,7 +158,7 @@ def _currents(
     requested, written = (
         control[name][:, 0].astype(float) for name in ("current_command", "current_written")
     )
-    late = np.append(written[1:], written[-1])  # a driver with its own thread reports a cycle later
+    late = np.append(written[1:], written[-1])  # a driver with its own thread reports one cycle later
     is_late = (np.abs(written - requested) > _RESOLUTION) & (np.abs(late - requested) <= _RESOLUTION)
     current = np.asarray(np.where(is_late, late, written))
     clipped = np.abs(current) > _AT_LIMIT * limit
@@ -196,7 +197,7 @@ class Timeline:
     Attributes:
         span: time (k,) since the previous event, s.
         current: current (k,) during that time, A.
-        variance: its variance (k,) relative to that of an active coil; zero while the coil is off.
+        variance: variance (k,) of the current relative to that of an active coil, zero while the coil is off.
         sample: index (k,) of the sample at the event, -1 for none.
         jump: change (k,) of the current at the event, A.
     """
@@ -226,9 +227,10 @@ class Timeline:
         sample = np.append(np.arange(1, samples + 1), np.full(len(times) - samples, -1))
         jump = np.zeros(len(times))
         jump[samples : len(times) - len(divided)] = np.diff(record.current, prepend=0.0)[inside]
-        order = np.lexsort((sample < 0, times))  # at one instant first the sample, then the switch
+        order = np.lexsort((sample < 0, times))  # at equal times the sample comes before the switch
         times = times[order]
-        flowing = np.searchsorted(switch, times, side="left")  # the switch at the event itself comes after
+        # A switch at the time of an event follows the event.
+        flowing = np.searchsorted(switch, times, side="left")
         current = np.append(0.0, record.current)[flowing]
         clipped = np.append(False, record.clipped)[flowing]
         variance = np.where(current == 0.0, 0.0, np.where(clipped, _CLIPPED_VARIANCE, 1.0))

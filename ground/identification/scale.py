@@ -1,10 +1,11 @@
 """Inertia, torque constant, stiffness and damping from the constants per inertia.
 
-Motion under a known current determines g = n A B / J, k / J and c / J, but not J itself: a body with twice
-the inertia in twice the field on a thread twice as stiff moves alike. The scale comes from prior values of
-the inertia and of the dipole per ampere, n A, and from the field by its prior and the magnetometer. The prior
-is Gaussian in the logarithms. The gain ties the three together as a measurement without error of ln n A + ln
-B - ln J - ln g = 0, which corrects each of them by what the other two imply.
+Motion under a known current determines g = n A B / J, k / J and c / J, but not the inertia J itself. For
+example, a body with twice the inertia in twice the field on a thread of twice the stiffness has the same
+motion. The scale comes from prior values of the inertia and of the dipole per ampere, n A, and from the field
+by its prior and the magnetometer. The prior is Gaussian in the logarithms. The measured gain g relates
+inertia, dipole and field by the constraint ln n A + ln B - ln J - ln g = 0, which is applied as an error-free
+measurement and corrects each of the three values.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ FIELD_ERROR = 0.1
 MAGNETOMETER_ERROR = 0.02
 """Prior relative errors of inertia, dipole per ampere, field, and the magnetometer's scale factor."""
 DURATION = 200.0
-"""Usual duration of the flight (s): each manoeuvre once in either direction, with pauses."""
+"""Usual duration (s) of the flight, which has each manoeuvre once in either direction, with pauses."""
 _MOTION = tuple(NAMES.index(name) for name in ("gain", "torsion", "damping"))
 _TIE = np.array([-1.0, 1.0, 1.0, -1.0, 0.0, 0.0])
 """Coefficients of ln J, ln n A, ln B, ln g, kappa and delta in the constraint."""
@@ -61,10 +62,10 @@ class PlantPrior:
 
 @dataclass(frozen=True, slots=True)
 class ScaledValue:
-    """A value, its standard deviation, and the contribution of its own prior.
+    """An estimated value, its standard deviation, and the contribution of its own prior.
 
-    `own_prior` is the derivative of the value's logarithm by the logarithm of its prior: 1 if the motion
-    added nothing. None if the value has no prior.
+    `own_prior` is the derivative of the value's logarithm by the logarithm of its prior, which is 1 if the
+    motion added no information. None if the value has no prior.
     """
 
     value: float
@@ -78,9 +79,9 @@ class AbsolutePlant:
 
     Attributes:
         inertia: kg m^2.
-        dipole: n A per commanded ampere, m^2.
+        dipole: dipole per commanded ampere, n A, m^2.
         field: T.
-        torque_constant: n A B, N m/A.
+        torque_constant: torque per current, n A B, N m/A.
         stiffness: N m/rad.
         damping: N m s/rad.
         field_measured: whether the magnetometer contributed to the field.
@@ -98,7 +99,7 @@ class AbsolutePlant:
     covariance: FloatArray
 
     def sources(self) -> dict[str, str]:
-        """Return the sources of each constant, by its name."""
+        """Return a text about the sources of each constant, by the name of the constant."""
         ratio = "from the motion, multiplied by the inertia"
         found = {"torque_constant": ratio, "stiffness": ratio, "damping": ratio}
         prior = "magnetometer and prior" if self.field_measured else "prior"

@@ -1,1 +1,1 @@
-"""The ground's end of the link: keys, commands with their verification, telemetry."""
+"""Ground end of the link to a satellite: keys, verified commands and telemetry."""

@@ -1,4 +1,4 @@
-"""Commands to a flight, over its socket or its link: verification, key changes and file transfers."""
+"""Commands to a flight over its socket or link, with verification, key changes and file transfers."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from knightcube.errors import FlightError, UsageError
 
 Show = Callable[[Report], object]
 _BLOCK = 64
-"""Counters reserved at once; a command of another process in between discards the remaining ones."""
+"""Number of frame counters reserved at once; a command of another process discards the remaining counters."""
 _REPEAT_NS = 5_000_000_000
-"""Time after which an unanswered command is sent again (ns)."""
+"""Time (ns) after which an unanswered command is sent again."""
 _BURST_S = 0.05
-"""Time over which unused transmission rate accumulates (s)."""
+"""Time (s) over which unused transmission capacity accumulates."""
 _FRAME_BYTES = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + CRC_BYTES
 _VERIFICATION = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
 _TRANSFER = LAYOUTS[TRANSFER.name]
@@ -49,7 +49,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
     if host and port.isdigit() and not Path(to).exists():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             return _ask(line, (host, int(port)), data, timeout, to)
-    # A service (`deploy/knightcube.service`) has its own temporary files: our socket must be beside its own.
+    # The service `deploy/knightcube.service` has a private /tmp, so this socket is beside the flight's.
     beside = Path(to).absolute().parent
     place = beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
     with (
@@ -57,7 +57,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line,
     ):
         own = os.path.join(folder, "answer")
-        os.chmod(folder, 0o711)  # the flight, which is another user, must reach our socket to answer
+        os.chmod(folder, 0o711)  # lets the flight, which may be another user, send its answer to this socket
         line.bind(own)
         os.chmod(own, 0o777)
         return _ask(line, to, data, timeout, to)
@@ -78,7 +78,7 @@ def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeo
 
 
 def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExclusiveGroup) -> None:
-    """Add `--link` to the ways to a flight, and its settings to the parser."""
+    """Add the option `--link` to the group of flight addresses, and the link's settings to the parser."""
     way.add_argument(
         "--link",
         metavar="ADDRESS",
@@ -110,12 +110,12 @@ def terminal_of(options: argparse.Namespace) -> Terminal:
 
 
 def obeyed(reports: list[Report]) -> bool:
-    """Return whether a command with these reports was obeyed, as far as they show."""
+    """Return whether the reports on a command show that the flight obeyed it."""
     return bool(reports) and reports[-1].stage in {Stage.STARTED, Stage.COMPLETED}
 
 
 def failed(reports: list[Report]) -> str:
-    """Return the reason why a command failed; empty if it has not failed."""
+    """Return the reason why a command failed, or an empty text."""
     bad = (report.text for report in reports if report.stage in {Stage.REFUSED, Stage.FAILED})
     return next(bad, "")
 
@@ -136,9 +136,9 @@ def change_key(
 ) -> list[Report]:
     """Change the key of SPI `changed` with a command under the key of `spi`.
 
-    The new key is stored on the ground before it is sent, and replaces the old one when the satellite has it.
-    If the result of an earlier change is unknown, a ping under its new key is sent first. Raises FlightError
-    without an answer.
+    The new key is stored on the ground before it is sent, and replaces the old key when the satellite has
+    confirmed it. If the result of an earlier change is unknown, a ping under that change's new key is sent
+    first. Raises FlightError without an answer.
     """
     old, name = vault.read(changed), f"{changed}-{NEXT}"
     if old is None:
@@ -159,7 +159,7 @@ def change_key(
     reports = command(terminal, packet, spi, seconds, show)
     if obeyed(reports) and changed in COMMAND_SPIS:
         _promote(vault, changed)
-    return reports  # a new telemetry key replaces the old one with the first frame under it
+    return reports  # a new telemetry key replaces the old key at the first frame that uses it
 
 
 def _promote(vault: Vault, spi: int) -> None:
@@ -172,12 +172,12 @@ def _promote(vault: Vault, spi: int) -> None:
 
 
 class FileSession:
-    """File commands and transfers over one terminal, for use by one thread.
+    """Session of file commands and transfers over one terminal, for use by one thread.
 
-    Received data is on disk at any moment, so that the next session continues an interrupted transfer.
+    Received data is written to disk at once, so that the next session can continue an interrupted transfer.
 
     Attributes:
-        entity: the ground's CFDP entity.
+        entity: CFDP entity of the ground.
         received: folder of the received files.
         received_ns: time of the last received packet, ns.
     """
@@ -198,12 +198,12 @@ class FileSession:
         self._credit, self._credit_ns = 0.0, now_ns
 
     def ask(self, directive: Directive, now_ns: int) -> None:
-        """Send a command, and repeat it until it is answered."""
+        """Send a command, and repeat it until the satellite answers."""
         self._asked = (directive, now_ns + _REPEAT_NS)
         self._counters.add(self._terminal.send_by(self._sealer, directives.pack(directive, utc_ns())))
 
     def put(self, path: Path, name: str, now_ns: int) -> Progress:
-        """Begin to send a file up, or continue it. Raises FlightError."""
+        """Start or continue the transfer of a file to the satellite. Raises FlightError."""
         return self.entity.send(path, name, SATELLITE, CRC32, utc_ns(), now_ns, NOBODY)
 
     def take(self, packets: Iterable[tuple[int, bytes]], now_ns: int) -> None:
@@ -213,7 +213,7 @@ class FileSession:
             if is_unit(packet, DOWN):
                 try:
                     self.entity.take(unit_of(packet), now_ns)
-                except PduError:  # of a satellite with another release, whose units are not known here
+                except PduError:  # from a satellite of another release with unknown transfer units
                     continue
             elif packet[:2] == _VERIFICATION:
                 report = report_of(packet)
@@ -226,7 +226,7 @@ class FileSession:
                 self._texts[int(row["source"]), int(row["number"])] = to_text(row["text"])
 
     def transmit(self, now_ns: int) -> None:
-        """Send due commands and units within the rate. Raises FlightError."""
+        """Send the commands and transfer units that are due, within the rate limit. Raises FlightError."""
         if self._asked is not None and now_ns >= self._asked[1]:
             self.ask(self._asked[0], now_ns)
         self._credit += self._rate * (now_ns - self._credit_ns) * 1e-9
@@ -245,7 +245,7 @@ class FileSession:
         return found
 
     def reason_of(self, progress: Progress) -> str:
-        """Return the reason why a transfer ended, as reported by the satellite if it refused it."""
+        """Return the reason why a transfer ended, which is the satellite's reason after a refusal."""
         return self._texts.get((progress.source, progress.number), "") or progress.said
 
     def close(self, now_ns: int) -> None:

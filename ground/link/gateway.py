@@ -1,10 +1,10 @@
-"""Plain packets for a ground station without keys: the gateway adds and removes the protection.
+"""Gateway between a ground station without keys and a protected link.
 
-A connection must begin with the token of the gateway, which a web page, although it can connect to loopback,
-does not know. After the token the connection receives every telemetry packet, live and played back, as a
-stream. A command packet that it sends, or a packet with a unit of a file transfer, gets its time and CRC and
-is sent in a protected frame. Its sequence count is kept, because the packets `verification` identify a
-command by it.
+A connection must begin with the token of the gateway. A web page can connect to loopback but does not know
+the token. After the token the connection receives every telemetry packet, live and played back, as a stream.
+The gateway adds time and CRC to each command packet or file transfer packet from the connection and sends it
+in a protected frame. The sequence count of a command packet is not changed, because `verification` packets
+identify a command by this count.
 """
 
 from __future__ import annotations
@@ -40,16 +40,17 @@ _VERIFIED = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
 _TIME = struct.Struct(">q")
 _TIME_AT = HEADER_BYTES + 1
 _MAX_UNSENT = 1 << 22
-"""Unsent bytes above which a connection is closed."""
+"""Number of unsent bytes above which a connection is closed."""
 _SPI, _BLOCK = 1, 64
-"""Counters reserved at once: a reservation takes two disk writes, and a file thousands of frames."""
+"""Number of frame counters reserved at once; a reservation takes two disk writes, and a file thousands of
+frames."""
 _READ_BYTES = 1 << 16
 _PING_PERIOD_S = 20.0
-"""Time between the gateway's own pings (s), because the link forgets a UDP sender after a minute."""
+"""Time (s) between the gateway's own pings, because the link forgets a UDP sender after a minute."""
 _TOKEN_S = 5.0
 """Time (s) after which a connection without the token is closed."""
 _MOST_WITHOUT_TOKEN = 16
-"""Maximum number of connections without the token; one more closes the oldest of them."""
+"""Maximum number of connections that have not sent the token; a further connection closes the oldest one."""
 _REPORT_S = 1.0
 """Minimum time (s) between two reports about connections without the token."""
 _TOKEN_CHARACTERS = b"0123456789abcdef"
@@ -62,7 +63,7 @@ _SHORTEST_UNIT = HEADER_BYTES + SECONDARY_BYTES + 1 + CRC_BYTES
 
 
 class StreamError(FlightError):
-    """A byte that is neither of the token nor of a command packet."""
+    """Error for a byte that belongs neither to the token nor to a command packet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,25 +104,25 @@ def new_token() -> str:
 
 
 class CommandStream:
-    """Splits the bytes of a connection into command packets and checks each byte as it arrives.
+    """Decoder that splits the bytes of a connection into command packets and checks each byte as it arrives.
 
     The first byte that cannot belong to the token or a command packet at its position ends the connection, so
     that another protocol, such as HTTP from a web page, is refused at its first byte. The token is compared
-    in constant time when all of it has arrived: a connection that was closed at the first wrong character
-    would reveal the token one character after another.
+    in constant time after the whole token has arrived. Closing a connection at the first wrong character
+    would reveal the token character by character.
 
     Attributes:
-        authenticated: whether the token has arrived.
+        authenticated: whether the correct token has arrived.
     """
 
     def __init__(self, token: str) -> None:
-        """Expect a line with the token before the packets."""
+        """Create a decoder that expects a line with the token before the packets."""
         self._line = token.encode("ascii") + b"\n"
         self._arrived = bytearray()
         self.authenticated = False
 
     def packets(self, data: bytes) -> Iterator[bytes]:
-        """Yield the command packets completed by `data`. Raises StreamError at a wrong byte."""
+        """Yield the command packets that are complete after `data`. Raises StreamError at a wrong byte."""
         self._arrived += data
         if not self.authenticated and not self._take_token():
             return
@@ -156,7 +157,7 @@ class CommandStream:
 
 
 def token_path(keys: Path, port: int) -> Path:
-    """Return the file with the token of the gateway with these keys and this port, for local programs."""
+    """Return the path of the token file of a gateway with the given keys and port, for local programs."""
     return keys / f"gateway-{port}.token"
 
 
@@ -192,7 +193,7 @@ class _StationConnection:
 
 
 class Gateway:
-    """Relays packets between a terminal and the connections of a listener, for use by one thread.
+    """Relay of packets between a terminal and the connections of a listener, for use by one thread.
 
     Attributes:
         down: number of telemetry packets relayed.
@@ -229,12 +230,15 @@ class Gateway:
         return int(self._listener.getsockname()[1])
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Relay until `ended` returns true. Raises FlightError if the line to the satellite was closed."""
+        """Relay packets until `ended` returns true.
+
+        Raises FlightError if the line to the satellite was closed.
+        """
         while not ended():
             self.turn(0.2)
 
     def turn(self, seconds: float) -> None:
-        """Relay what is received within `seconds`."""
+        """Relay the packets that are received within `seconds` s."""
         if self._asked_at is None or time.monotonic() - self._asked_at > _PING_PERIOD_S:
             self._asked_at = time.monotonic()
             self._own.add(self._terminal.send_by(self._sealer, self._packer.pack(Ping(), utc_ns())))
@@ -262,7 +266,7 @@ class Gateway:
 
     def _hand_over(self, packet: bytes) -> None:
         if packet[:2] == _VERIFIED and report_of(packet).counter in self._own:
-            return  # the report on a ping of the gateway itself
+            return  # a report on one of the gateway's own pings
         self.down += 1
         for line, connection in list(self._connections.items()):
             if connection.stream.authenticated:
@@ -314,7 +318,10 @@ class Gateway:
         return [(line, one) for line, one in self._connections.items() if not one.stream.authenticated]
 
     def _refuse(self, line: socket.socket, reason: str) -> None:
-        """Close and count a connection and report why; connections without token at most once a second."""
+        """Close and count a connection, and report the reason.
+
+        Reasons for connections without the token are reported at most once a second.
+        """
         self.refused += 1
         now = time.monotonic()
         if self._connections[line].stream.authenticated or now - self._reported > _REPORT_S:
@@ -328,6 +335,6 @@ class Gateway:
 
 
 def finished(packet: bytes, now_ns: int) -> bytes:
-    """Return a command packet with its time and its CRC, which a ground station leaves at 0."""
+    """Return a command packet with the time and CRC set, which a ground station leaves at 0."""
     body = packet[:_TIME_AT] + _TIME.pack(now_ns) + packet[_TIME_AT + _TIME.size : -CRC_BYTES]
     return body + crc16(body).to_bytes(CRC_BYTES, "big")

@@ -1,4 +1,4 @@
-"""The ground's end of a link: keys, protected commands up, telemetry and the reports on commands down."""
+"""Ground end of a link, with keys, protected commands, telemetry, and reports on commands."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ DEFAULTS = Link(keys="-")
 """Default spacecraft identifier and frame length."""
 
 _STORE_EVERY = 256
-"""Telemetry frames between two writes of the anti-replay counters."""
+"""Number of telemetry frames between two writes of the anti-replay counters."""
 _ANY_AHEAD = 2**63
 """Width of the anti-replay window, which accepts any gap after lost telemetry."""
 _READ_BYTES = 1 << 16
 
 
 def make_keys(folder: Path) -> list[Path]:
-    """Make new keys in a new folder and return its subfolders for the satellite and the ground.
+    """Make new keys in a new folder, and return the subfolders for the satellite and the ground.
 
     Raises UsageError if the folder exists or cannot be written.
     """
@@ -79,7 +79,7 @@ def make_keys(folder: Path) -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class TerminalSettings:
-    """Spacecraft identifier and length of telemetry frames, which must be the same at both ends."""
+    """Spacecraft identifier and length of telemetry frames, which must be equal at both ends of a link."""
 
     spacecraft: int = DEFAULTS.spacecraft
     frame_bytes: int = DEFAULTS.frame_bytes
@@ -102,14 +102,14 @@ class GroundLine(Protocol):
 
 
 class Terminal:
-    """The ground's end of a link, for use by one thread.
+    """The ground end of a link, for use by one thread.
 
     Attributes:
-        gate: authentication of the telemetry frames, with the counts of refused ones.
+        gate: authentication of the telemetry frames, with the numbers of refused frames.
     """
 
     def __init__(self, line: GroundLine, vault: Vault, settings: TerminalSettings) -> None:
-        """Use an open line and the ground's keys."""
+        """Create a terminal with an open line and the ground's keys."""
         self._line = line
         self._vault = vault
         self._settings = settings
@@ -133,7 +133,7 @@ class Terminal:
         return self.send_by(sealer, packet)
 
     def sealer(self, spi: int, block: int) -> Sealer:
-        """Return a sealer for `send_by`, which reserves `block` counters at once."""
+        """Return a frame sealer for `send_by`, which reserves `block` counters at once."""
         return Sealer(self._vault, spi, TELECOMMAND_MASK, block)
 
     def send_by(self, sealer: Sealer, packet: bytes) -> int:
@@ -146,7 +146,7 @@ class Terminal:
         return counter
 
     def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:
-        """Yield virtual channel and packet of all telemetry received within `seconds`."""
+        """Yield virtual channel and packet of all telemetry received within `seconds` s."""
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
             if select.select([self._line], [], [], left)[0]:
@@ -165,7 +165,7 @@ class Terminal:
                 yield channel, packet
 
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
-        """Yield the reports on a command until the final one, for at most `seconds`."""
+        """Yield the reports on a command until the final report, for at most `seconds` s."""
         identifier = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
         for _, packet in self.packets(seconds):
             if packet[:2] != identifier:
@@ -199,7 +199,7 @@ class UdpGround:
     """UDP line with one frame per datagram."""
 
     def __init__(self, address: str) -> None:
-        """Send to HOST:PORT and receive at any free port. Raises FlightError."""
+        """Open a socket that sends to HOST:PORT and receives at any free port. Raises FlightError."""
         self._address = host_port(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
@@ -233,7 +233,7 @@ class StreamGround:
     """Stream of frames with sync markers, over TCP or a serial line."""
 
     def __init__(self, name: str, file: int, frame_bytes: int, close: Callable[[], object]) -> None:
-        """Use an open file descriptor."""
+        """Create a stream on an open file descriptor."""
         self._name = name
         self._file = file
         self._stream: FrameStream = telemetry_stream(frame_bytes)
@@ -264,7 +264,7 @@ class StreamGround:
 
 
 def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = None) -> Terminal:
-    """Open HOST:PORT (UDP), tcp:HOST:PORT, or /dev/FILE@BAUD. Raises UsageError, FlightError."""
+    """Open the line to HOST:PORT (UDP), tcp:HOST:PORT, or /dev/FILE@BAUD. Raises UsageError, FlightError."""
     settings = settings or TerminalSettings()
     vault = Vault(keys)
     line: GroundLine

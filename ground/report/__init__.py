@@ -1,4 +1,4 @@
-"""The report of a run: figures of merit of the thesis, tables and pictures, from packets only."""
+"""Report of a run from its packets: the figures of merit of the thesis, tables and pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["draw", "draw_both", "draw_fit", "draw_path", "draw_slew", "format_re
 def draw(run: Run, folder: Path) -> list[Path]:
     """Draw the pictures of a run into `folder` and return the files.
 
-    Raises UsageError if matplotlib is not installed or the folder cannot be written, as all functions here.
+    Raises UsageError if matplotlib is not installed or the folder cannot be written.
     """
     with _drawing(folder):
         from ground.report.figures import draw_figures  # noqa: PLC0415
@@ -70,7 +70,7 @@ def draw_fit(record: Record, found: PlantFit, file: Path) -> None:
 
 @contextmanager
 def _drawing(place: Path) -> Iterator[None]:
-    """Report a missing matplotlib, or a place that cannot be written, in one line."""
+    """Raise UsageError with one line if matplotlib is missing or a file cannot be written."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -20,7 +20,7 @@ _MISSING = object()
 
 
 def compare(first: Object, second: Object) -> Object:
-    """Return the comparison of two summaries (`ground.report.summarise`), ready for JSON.
+    """Return the comparison of two summaries (`ground.report.summarise`) as JSON data.
 
     Differences are the second value minus the first, or None if either is unknown or not applicable.
     """
@@ -121,7 +121,7 @@ def _scaled(value: float | None, scale: float) -> float | None:
 
 
 def format_comparison(compared: Object) -> str:
-    """Return the comparison as text, ending in a newline."""
+    """Return the comparison as text that ends in a newline."""
     lines = []
     for letter, run in zip("AB", compared["runs"], strict=True):
         origin = provenance(run)
@@ -165,7 +165,7 @@ def _difference(row: Object) -> str:
 
 
 def summarise_archive(archive: Path) -> Object:
-    """Return configuration, duration, integrity and end of each run of an archive, ready for JSON.
+    """Return configuration, duration, integrity and end of each run of an archive as JSON data.
 
     Only one run is in memory at a time.
     """
@@ -202,7 +202,7 @@ def _archived(folder: Path) -> Object:
 
 
 def _end(run: Run) -> str:
-    """Return the reason for the end of a run that the loop recorded."""
+    """Return the reason for the end of a run, as recorded by the control loop."""
     recorded = run["event"]
     stops = recorded["text"][recorded["code"] == events.STOPPED.code]
     return to_text(stops[-1]) if len(stops) else "unclean: the log has no stop event"
@@ -216,7 +216,7 @@ def _label(utc_ns: int) -> str | None:
 
 
 def format_archive(summary: Object) -> str:
-    """Return the table of an archive, ending in a newline."""
+    """Return the table of an archive as text that ends in a newline."""
     head = ["run", "configuration", "UTC (label)", "s", "packets", "bad bytes", "missing", "end"]
     rows = [
         [

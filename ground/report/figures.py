@@ -19,7 +19,7 @@ from ground.report.panels import RunSignals
 from ground.report.signals import seconds
 from ground.telemetry import Run
 
-if TYPE_CHECKING:  # these bring the optimiser with them, which a picture does not need
+if TYPE_CHECKING:  # only for types, because these modules import the optimiser
     from ground.identification.fit import PlantFit
     from ground.identification.record import Record
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
@@ -30,11 +30,11 @@ WIDE = (11.0, 5.2)
 TALL = (11.0, 7.6)
 OVERVIEW = (10.9, 12.7)
 PATH_WINDOW_S = 20.0
-"""Time after a step command that the picture of the paths shows (s)."""
+"""Time (s) after a step command that the picture of the paths shows."""
 _MIN_FIELD_ROTATION = np.radians(20.0)
 """Smallest rotation (rad) of the field in a run for which the picture of the cage is drawn."""
 _FIELD_STRIDE = 40
-"""Interval, in magnetometer readings, between the drawn ones: one second."""
+"""Number of magnetometer readings per drawn reading, one second."""
 
 
 def save(figure: Figure, file: Path) -> None:
@@ -163,7 +163,7 @@ def _rate(signals: RunSignals) -> Figure | None:
 
 
 def _overview(signals: RunSignals) -> Figure | None:
-    """Draw attitude, current, power and rate below each other, as shown in the README."""
+    """Draw attitude, current, power and rate in panels below each other, as shown in the README."""
     if not len(signals.flown.time):
         return None
     drawn = [panels.attitude, panels.current, *([panels.power] if signals.power else []), panels.rate]
@@ -207,7 +207,7 @@ def cage_figure(signals: RunSignals) -> Figure | None:
 
 def path_figure(plan: StepPlan, plant: SingleAxisPlant) -> Figure:
     """Return the picture of a planned path: q2, rate and current, with its nodes (Sease, Fig. 5.4 to 5.6)."""
-    last = plan.horizon * (1.0 - 1e-12)  # at the horizon itself the path already holds
+    last = plan.horizon * (1.0 - 1e-12)  # at the end of the horizon the path already holds its target
     time, nodes = np.linspace(0.0, last, 401), np.minimum(plan.node_times, last)
     figure = Figure(figsize=(OVERVIEW[0], 0.75 * OVERVIEW[1]), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)
@@ -230,7 +230,7 @@ def path_figure(plan: StepPlan, plant: SingleAxisPlant) -> Figure:
 
 
 def fit_figure(record: Record, found: PlantFit) -> Figure:
-    """Return the picture of an identification: angle, current, normalised innovations of angle and rate."""
+    """Return the picture of an identification with angle, current and normalised innovations."""
     figure = Figure(figsize=(OVERVIEW[0], 0.85 * OVERVIEW[1]), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     passed = found.innovations

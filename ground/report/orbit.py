@@ -27,9 +27,9 @@ WITH_STARS_S = 10.0
 SUNLIT = 0.99
 """Visible fraction of the solar disc above which the satellite is in sunlight."""
 JUDGED = 600
-"""Navigation packets, one per second, over which the residual dipole is judged."""
+"""Number of navigation packets, one per second, over which the residual dipole is judged."""
 MIN_DIPOLE = 1e-9
-"""Lower limit (A m^2) of the residual dipole by which its error is divided."""
+"""Smallest residual dipole (A m^2) by which the dipole's error is divided."""
 SETTLED_AFTER_S = 600.0
 """Time after the start of pointing at a target before its pointing error is judged (s)."""
 
@@ -46,7 +46,7 @@ def detumbling_periods(run: Run, end: float) -> list[tuple[float, float, bool]]:
 
 
 def body_speeds(run: Run) -> tuple[FloatArray, FloatArray, str]:
-    """Return times (n,), s, speeds (n,), rad/s, and their source: "truth", or "imu" without a truth log."""
+    """Return times (n,), s, rotation speeds (n,), rad/s, and their source, "truth" or "imu"."""
     name = "truth" if len(run["truth"]) else "imu"
     packets = run[name]
     return seconds(packets), np.linalg.norm(packets["rate"].astype(float), axis=1), name
@@ -125,9 +125,9 @@ def attitude_errors(run: Run) -> AttitudeErrors:
 
 
 def knowledge(run: Run) -> Object | None:
-    """Return the time share of each level of attitude knowledge, and the errors while it was fine.
+    """Return the fraction of time at each level of attitude knowledge, and the errors at the level fine.
 
-    An error counts as one with stars within `WITH_STARS_S` s of an accepted star attitude. Returns None
+    An error counts as "with stars" for `WITH_STARS_S` s after an accepted star attitude. Returns None
     without navigation packets.
     """
     packets = run["navigation"]
@@ -161,7 +161,8 @@ def knowledge(run: Run) -> Object | None:
 def dipole_errors(run: Run) -> dict[str, float]:
     """Return the rms error of the residual dipole divided by its size, in sunlight and in shadow.
 
-    The last ten minutes in each are judged. The values are NaN without an estimate or a truth log.
+    Only the last ten minutes in sunlight and in shadow are judged. The two values are NaN without an estimate
+    or a truth log.
     """
     packets, truth = run["navigation"], run["orbit_truth"]
     packets = packets[np.isfinite(packets["residual_dipole"][:, 0])]
@@ -205,8 +206,8 @@ def pointing_errors(run: Run) -> AttitudeErrors:
 def pointing(run: Run, axis: npt.ArrayLike, power: PowerHistory | None) -> Object | None:
     """Return the figures of each target, or None for a run without pointing.
 
-    A target is judged `SETTLED_AFTER_S` s after its first pointing cycle, or from the end of its first slew
-    if that is later. `axis` (3,) is the pointing axis in the body frame.
+    A target's error is judged from `SETTLED_AFTER_S` s after the target's first pointing cycle, or from the
+    end of its first slew if that is later. `axis` (3,) is the pointing axis in the body frame.
     """
     found = pointing_errors(run)
     if not len(found.times):
@@ -272,7 +273,7 @@ def objects(run: Run) -> list[Object]:
 def requirements(
     config: OrbitConfig, detumbled: Object | None, known: Object | None, pointed: Object | None
 ) -> list[Object]:
-    """Return each figure that the section `requirements` of the configuration limits, with its verdict.
+    """Return each figure that the configuration's section `requirements` limits, with a verdict.
 
     `detumbled`, `known` and `pointed` are the report's figures of detumbling, knowledge and pointing.
     """

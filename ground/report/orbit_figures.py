@@ -33,15 +33,15 @@ from knightcube.gnc.guidance.three_axes.slew_model import Cone, shown
 from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder, SlewStatus
 
 SPIN_MARGIN = 0.2
-"""Fraction of the time of detumbling that is shown before and after it."""
+"""Time shown before and after detumbling, as a fraction of the time of detumbling."""
 POWER_MEAN_S = 30.0
-"""Time over which the power is averaged, because the coils pause every second or two (s)."""
+"""Time (s) over which the power is averaged, because the coils pause every one or two seconds."""
 SHADOW = 0.5
 """Visible fraction of the solar disc below which the satellite is drawn in shadow."""
 TRACK_INTERVAL_S = 10.0
-"""Time between drawn points of the ground track (s)."""
+"""Time (s) between drawn points of the ground track."""
 TRACK_MARK_S = 600.0
-"""Time between marked points of the ground track (s)."""
+"""Time (s) between marked points of the ground track."""
 _CONES = {"Sun": panels.ORANGE, "Earth": panels.GREEN, "Moon": panels.GREY}
 _OBJECT_COLOURS = (panels.BLUE, panels.ORANGE, panels.GREEN, panels.PURPLE)
 
@@ -65,7 +65,7 @@ def spin_figure(signals: RunSignals) -> Figure | None:
 
 
 def _detumbling_rate(ax: Axes, run: Run) -> None:
-    """Draw the speed, and that from the magnetometer with its uncertainty; detumbling is shaded."""
+    """Draw the true or gyro rate and the magnetometer's rate with its uncertainty; detumbling is shaded."""
     time, speed, source = body_speeds(run)
     spin = magnetometer_rates(run)
     if len(spin):
@@ -131,7 +131,7 @@ def pointing_figure(signals: RunSignals) -> Figure | None:
     speed = np.degrees(np.linalg.norm(run[name]["rate"].astype(float), axis=1))
     rate.semilogy(seconds(run[name]), np.maximum(speed, 1e-4), color=panels.BLUE, linewidth=0.9)
     panels.style(rate, "rate, deg/s", "Body rate", "")
-    # The pauses of the coils for the magnetometer would fill the picture.
+    # Without averaging, the pauses of the coils for the magnetometer would fill the picture.
     acting = run["attitude"][run["attitude"]["dipole"].any(axis=1)]
     panels.vectors(dipole, seconds(acting), 1e3 * acting["dipole"].astype(float))
     dipole.set_yscale("symlog", linthresh=1.0)
@@ -173,7 +173,7 @@ def _mean_power(ax: Axes, signals: RunSignals) -> None:
 
 
 def _field(ax: Axes, run: Run) -> None:
-    """Draw the Earth's magnetic field in the body frame: the true one, or the measured one without it."""
+    """Draw the Earth's magnetic field in the body frame, either the true or else the measured field."""
     packets = run["orbit_truth"]
     place = true_rows(run["truth"], packets)
     if (place >= 0).any():
@@ -250,7 +250,7 @@ def track_figure(signals: RunSignals) -> Figure | None:
 
 
 def objects_figure(signals: RunSignals) -> Figure | None:
-    """Return the picture of the tracked objects' paths, rates and brightness; None for a run without them."""
+    """Return the picture of the tracked objects' paths, rates and brightness, or None without objects."""
     tracks = object_tracks(signals.run)
     if not tracks:
         return None
@@ -294,7 +294,7 @@ def slew_figure(made: OrderedSlew, order: SlewOrder) -> Figure:
     _slew_sky(sky, made, order, times)
     dipoles, limit = 1e3 * made.plan.path.dipoles(times), 1e3 * float(made.task.craft.limit.min())
     panels.vectors(dipole, times, dipoles)
-    # The line of a limit far above the curves would flatten them.
+    # A limit line far above the curves would flatten the curves.
     if np.abs(dipoles).max() > 0.3 * limit:
         panels.level(dipole, -limit, "")
         panels.level(dipole, limit, "limit")
@@ -319,7 +319,7 @@ def _slew_sky(ax: Axes, made: OrderedSlew, order: SlewOrder, times: FloatArray) 
     for name, axis, colour in axes[: 1 if np.allclose(order.axes.pointing, order.camera) else 2]:
         path = axis @ turned
         east, north = np.arctan2(path[:, 1], path[:, 0]), np.arcsin(np.clip(path[:, 2], -1.0, 1.0))
-        # A gap where the path crosses the edge of the map
+        # a gap in the line where the path crosses the edge of the map
         jumps = np.flatnonzero(np.abs(np.diff(east)) > np.pi) + 1
         ax.plot(*(np.insert(values, jumps, np.nan) for values in (east, north)), color=colour, linewidth=1.8)
         ax.plot(east[0], north[0], "o", color=colour, markersize=8, markerfacecolor="white")
@@ -339,7 +339,7 @@ def _slew_sky(ax: Axes, made: OrderedSlew, order: SlewOrder, times: FloatArray) 
 
 
 def _cones(ax: Axes, cones: tuple[Cone, ...], ends: FloatArray) -> Iterator[Patch]:
-    """Draw the cones, shaded at the first of two times and dashed at the second, and yield their legends."""
+    """Draw the keep-out cones, shaded at the first time and dashed at the second, and yield legends."""
     longitude, latitude = np.meshgrid(np.radians(np.arange(-180, 181)), np.radians(np.arange(-90, 91)))
     level = np.cos(latitude)
     grid = np.stack([level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)], axis=2)

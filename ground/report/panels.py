@@ -1,7 +1,6 @@
-"""Panels of the pictures of a run, each drawn on given axes.
+"""Panels of the pictures of a run, each of which is drawn on given axes.
 
-The colours are those of the Okabe-Ito palette, which are distinguishable with all common kinds of colour
-vision.
+The colours are from the Okabe-Ito palette, which can be distinguished with all common kinds of colour vision.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ PATH_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
 AXIS_COLOURS = {"x": BLUE, "y": ORANGE, "z": GREEN}
 DASHED = (0, (5, 2))
 _MAX_ERROR = 1e9
-"""Rate error (mrad/s) above which a value comes from a damaged log and is ignored for the scale."""
+"""Rate error (mrad/s) that only a damaged log can contain and that does not affect the scale."""
 
 
 @dataclass(frozen=True)
@@ -77,13 +76,13 @@ class RunSignals:
 
     @cached_property
     def current_limit(self) -> float:
-        """Configured limit of a coil's current, or that of the thesis if it is not known, A."""
+        """Configured limit (A) of a coil current, or that of the thesis without a configuration."""
         run = self.run["run"]
         return float(run["current_limit"][0]) if len(run) else limits.CURRENT_LIMIT_A
 
 
 def planned_path(plan: PacketArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return time (m,), s, and q2 (m,) along the path of a plan packet, then both at its nodes (n,)."""
+    """Return times (m,), s, and q2 (m,) along a plan packet's path, and times and q2 (n,) at its nodes."""
     nodes = int(plan["nodes"])
     values = plan["node_q2"][:nodes].astype(float)
     rule = lgl_rule(nodes)
@@ -96,8 +95,8 @@ def planned_path(plan: PacketArray) -> tuple[FloatArray, FloatArray, FloatArray,
 def _streak_rates(run: Run) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the mid-exposure times (n,), s, and the rates (n,) about the thread from streaks, rad/s.
 
-    The third and fourth array are the standard deviations, 0 if unknown, and the differences from the true
-    mean rates, NaN if unknown.
+    The third array holds the standard deviations (0 if unknown), and the fourth array the differences from
+    the true mean rates (NaN if unknown).
     """
     rated = with_rate(run["streak"])
     start = rated["exposure_start_ns"] / 1e9
@@ -215,7 +214,7 @@ def power(ax: Axes, signals: RunSignals) -> None:
 
 
 def compared(axes: Sequence[Axes], signals: RunSignals, name: str, colour: str) -> None:
-    """Draw q2, rate and running average of the supply power of one of two runs into three axes."""
+    """Draw q2, rate and running average of the supply power of one run on three axes."""
     flown, power = signals.flown, signals.power
     axes[0].plot(flown.time, flown.q2, color=colour, linewidth=1.4, label=name)
     axes[1].plot(flown.time, 1e3 * flown.rate, color=colour, linewidth=1.0, label=name)
@@ -304,10 +303,10 @@ def _error_bars(ax: Axes, time: FloatArray, rate: FloatArray, sigma: FloatArray,
 
 
 def exceedance(ax: Axes, values: dict[str, FloatArray], title: str, bound: float | None = None) -> None:
-    """Draw the share of values above x for each named set of times, s, and a line at `bound` s.
+    """Draw the fraction of values above x for each named set of times, s, and a line at `bound` s.
 
     Both axes are logarithmic, so that one late cycle in thousands is as visible as the median. Times of zero,
-    such as the lateness in lock-step, cannot be drawn on them and are stated in the legend.
+    such as the lateness in lock-step, cannot be drawn on logarithmic axes and are stated in the legend.
     """
     shortest = []
     for (name, times), colour in zip(values.items(), PATH_COLOURS, strict=False):

@@ -1,6 +1,6 @@
 """Signals of a run and the errors of its estimates.
 
-The signals come from the truth of the simulation if the run has it, otherwise from the flight log.
+The signals come from the simulation's truth log if the run has one, otherwise from the flight log.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ class ThreadMotion:
 
 @dataclass(frozen=True)
 class PowerHistory:
-    """Power of all coils together, as means over the intervals of a run.
+    """Total power of all coils, as means over the intervals of a run.
 
     Attributes:
-        time: beginning (n,) of each interval, s.
+        time: start times (n,) of the intervals, s.
         end: end of the last interval, s.
         supply: mean of V |I| (n,), W, which the coils draw from their supply.
-        heat: mean of R I^2 (n,), W, the heat of steady currents and the cost function of the planner.
+        heat: mean of R I^2 (n,), W, which is the heat of steady currents and the planner's cost function.
         source: "truth" for the simulated coils, "written" for the commanded currents.
     """
 
@@ -97,7 +97,7 @@ def true_attitude(run: Run) -> ThreadMotion | None:
     if not len(truth):
         return None
     quaternion = truth["quaternion"].astype(float)
-    # q and -q are the same attitude: an angle in (-pi, pi) has a positive scalar part.
+    # The quaternions q and -q are the same attitude, and an angle in (-pi, pi) has a positive scalar part.
     q2 = quaternion[:, 1] * np.where(quaternion[:, 3] < 0.0, -1.0, 1.0)
     return ThreadMotion(seconds(truth), q2, truth["rate"][:, 1].astype(float), "truth")
 
@@ -175,8 +175,8 @@ def mean_rates(truth: PacketArray, start: FloatArray, stop: FloatArray) -> Float
 def streaks(run: Run) -> Object:
     """Return the number of frames and rates from streaks, and the errors of the rates.
 
-    `normalised` is the mean of e' P^-1 e / 3 over the rates with a positive definite covariance P. It is 1 if
-    the covariances are correct.
+    `normalised` is the mean of e' P^-1 e / 3 over the rates with a positive definite covariance P. The mean
+    is 1 if the covariances are correct.
     """
     packets = run["streak"]
     rated = with_rate(packets)
@@ -203,7 +203,7 @@ def star_attitudes(run: Run) -> Object:
     covered = (middle >= time[0]) & (middle <= time[-1]) if len(time) > 1 else np.zeros(len(solved), bool)
     error = np.zeros((0, 3))
     if covered.any():
-        # Over the short steps of the truth, linear interpolation equals the great circle.
+        # Over the short steps of the truth log, linear interpolation is as good as a great circle.
         columns = [np.interp(middle[covered], time, column) for column in truth["quaternion"].T]
         true = normalise(np.stack(columns, axis=-1))
         error = to_rotation_vector(multiply(solved["quaternion"][covered], conjugate(true)))
@@ -239,7 +239,7 @@ def failed_frames(run: Run) -> list[Object]:
 def estimate_errors(run: Run) -> Object | None:
     """Return the rms errors of the estimated angle and rate about the thread, or None without a truth.
 
-    `*_normalised` is the rms of the error divided by the estimated standard deviation. It is 1 if the
+    `*_normalised` is the rms of the error divided by the estimated standard deviation. The ratio is 1 if the
     standard deviations are correct.
     """
     control, truth = run["control"], run["truth"]

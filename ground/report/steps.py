@@ -1,11 +1,11 @@
 """Figures of merit of each attitude step of the testbed (Sease 2013, Table 5.3).
 
-Time zero is the command of the step. The step runs from the previous target if the body held it, otherwise
-from the attitude of the body, to its own target. Rise time is from 10 to 90 % of the step. Overshoot is the
-excursion beyond the target, in % of the step. Settling time is the last entry into +-5 % of the step around
-the target. Steady-state error is the largest error over the last 30 s, in degrees of theta = 2 asin q2, for
-targets held for a minute or more. Crossings are interpolated between samples. A step that ends within 30 s
-without settling is interrupted and is not judged.
+Time zero is the time of the step's command. The step runs to its target from the previous target if the body
+held that target, otherwise from the attitude of the body. Rise time is from 10 to 90 % of the step. Overshoot
+is the excursion beyond the target, in % of the step. Settling time is the time of the last entry into +-5 %
+of the step around the target. Steady-state error is the largest error over the last 30 s, in degrees of theta
+= 2 asin q2, for targets held for a minute or more. Crossings are interpolated between samples. A step that
+ends within 30 s without settling is interrupted and is not judged.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ OVERSHOOT_LIMIT_PERCENT = 20.0
 RISE_LIMIT_S = 8.0
 SETTLING_LIMIT_S = 30.0
 AVERAGE_SUPPLY_POWER_LIMIT_W = 0.10
-"""Average power consumption in the thesis (ch. 5, Hardware Results), compared with V |I| at the coils (W)."""
+"""Average power consumption (W) in the thesis (chapter 5, Hardware Results), compared with V |I| at the
+coils."""
 CURRENT_LIMIT_A = 0.148
 
 
@@ -50,7 +51,7 @@ class StepCommand:
         target: commanded q2.
         duration: time until the step ends, s.
         from_target: whether the step begins at a target that the body held.
-        again: whether a step with the same index came before.
+        again: whether an earlier step has the same index.
     """
 
     index: int
@@ -63,13 +64,16 @@ class StepCommand:
 
     @property
     def rise_is_judged(self) -> bool:
-        """Whether the thesis limits the rise time, which it does for steps between targets only."""
+        """Whether the thesis limits the rise time, which is so only for steps between targets."""
         return self.index > 0 and self.from_target
 
 
 @dataclass(frozen=True, slots=True)
 class StepResponse:
-    """Figures of one step. NaN means not applicable; infinity means not reached before the step ended."""
+    """Figures of one step.
+
+    Figures of merit of a step; NaN means not applicable, and infinity means never reached.
+    """
 
     steady_state_deg: float = math.nan
     overshoot_percent: float = math.nan
@@ -83,7 +87,7 @@ def commanded_steps(
     """Return the steps between targets.
 
     Args:
-        indices: numbers of the n steps.
+        indices: numbers (n,) of the steps in the configuration.
         times: times of the commands (n,), s, ascending.
         targets: commanded q2 (n,).
         release_q2: q2 at the first command.
@@ -100,7 +104,7 @@ def commanded_steps(
 def flown_steps(
     commanded: Sequence[StepCommand], time: FloatArray, q2: FloatArray, stops: FloatArray
 ) -> list[StepCommand]:
-    """Return the steps as flown: from the attitude of the body, until a mode change ended the step.
+    """Return the steps as flown, which start at the body's attitude and end when a mode change ended them.
 
     Args:
         commanded: steps between targets.
@@ -137,7 +141,7 @@ def response(time: FloatArray, q2: FloatArray, command: StepCommand) -> StepResp
     t = np.concatenate([[0.0], time[inside] - command.time])
     y = np.concatenate([[np.interp(command.time, time, q2)], q2[inside]])
     steady = math.nan
-    if command.duration >= 2.0 * STEADY_STATE_S:  # the slew of a shorter step may last into the last 30 s
+    if command.duration >= 2.0 * STEADY_STATE_S:  # in a shorter step the slew may last into the last 30 s
         last = y[t >= command.duration - STEADY_STATE_S]
         error = _angle(last) - _angle(np.array([command.target]))
         steady = float(np.degrees(np.max(np.abs(error)))) if len(last) else math.nan
@@ -266,7 +270,10 @@ def judge(quantity: str, values: Sequence[float], limit: float, unit: str) -> Ob
 
 
 def against_thesis(steps: list[tuple[StepCommand, StepResponse | None]], power: Object) -> list[Object]:
-    """Return the worst of each figure beside the limit of the thesis. `power` is that of the report."""
+    """Return the worst value of each figure with the thesis's limit.
+
+    `power` is the report's power section.
+    """
     judged = [(command, found) for command, found in steps if found is not None]
     rise = [found.rise_s for command, found in judged if command.rise_is_judged]
     steady, overshoot, settling = (

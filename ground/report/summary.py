@@ -1,4 +1,4 @@
-"""The report of a run as one object, printed by `report --json` and written as text by `ground.report.text`.
+"""Report of a run as one object, printed by `report --json` and written as text by `ground.report.text`.
 
 `None` means that a value is unknown, not applicable or was never reached; `notes` give the reasons.
 """
@@ -38,7 +38,7 @@ from knightcube.astro.arrays import FloatArray
 Object = dict[str, Any]
 
 
-@np.errstate(all="ignore")  # a packet may contain any number: results that are not finite become None
+@np.errstate(all="ignore")  # a packet may contain any number, so results that are not finite become None
 def summarise(run: Run) -> Object:
     """Return all values of the report, made of None, bool, int, float, str, list and dict only."""
     attitude = true_attitude(run) or estimated_attitude(run)
@@ -105,7 +105,7 @@ def _orbit_config(run: Run, notes: list[str]) -> OrbitConfig | None:
 
 
 def _identity(run: Run, attitude: ThreadMotion, notes: list[str]) -> Object:
-    """Return configuration, software, seed and duration of the run."""
+    """Return configuration, software, seed and duration of a run."""
     ends = [seconds(run[name])[-1] for name in ("control", "truth", "event") if len(run[name])]
     identity: Object = {"folder": str(run.folder), "duration_s": max(ends, default=0.0), "cut_short": False}
     if attitude.source == "estimate":
@@ -171,7 +171,10 @@ def _rate_groups(packets: PacketArray) -> list[Object]:
 
 
 def _cycles(timing: PacketArray, control: PacketArray) -> Object:
-    """Return the punctuality of the control cycles. Slots without a control packet count as `skipped`."""
+    """Return the counts and the lateness of the control cycles.
+
+    Slots without a control packet count as `skipped`.
+    """
     slots = control["cycle"].astype(np.int64)
     return {
         "count": len(control),
@@ -231,7 +234,7 @@ def _modes(packets: PacketArray) -> list[Object]:
 
 
 def _health(packets: PacketArray) -> Object | None:
-    """Return the share of time with each stream good, the facts and the resources; None without packets."""
+    """Return the time fraction of each good stream, the facts and the resources; None without packets."""
     if not len(packets):
         return None
     streams = {
@@ -269,7 +272,7 @@ def _events(packets: PacketArray) -> list[Object]:
 
 
 def _logs(run: Run) -> list[Object]:
-    """Return the integrity of each log that has data."""
+    """Return the integrity counts of each log that has data."""
     return [
         {
             "log": stem,

@@ -46,7 +46,10 @@ def format_report(summary: Object) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return aligned lines, indented by two spaces. The first column is left-aligned, the others right."""
+    """Return aligned lines, indented by two spaces.
+
+    The first column is left-aligned, and the other columns are right-aligned.
+    """
     cells = [list(head), *(list(row) for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     return [
@@ -62,7 +65,7 @@ def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
 
 
 def provenance(run: Object) -> str:
-    """Return configuration, devices, pace, seed and software of a run; empty if they are not known."""
+    """Return a text of configuration, devices, pace, seed and software of a run, empty if unknown."""
     if "software" not in run:
         return ""
     devices = f"simulated devices, seed {run['seed']}" if run["simulated"] else "real devices"
@@ -333,7 +336,7 @@ def _sensing(summary: Object) -> list[str]:
 
 
 def _errors(found: Object, axes: str, unit: str, digits: int, scale: float, what: str) -> list[str]:
-    """Return the line of the rms errors against the truth, or nothing if they are not known."""
+    """Return the line of the rms errors against the truth, or nothing if the errors are unknown."""
     if found["rms_error"] is None:
         return []
     errors = ", ".join(number(error, digits, scale) for error in found["rms_error"])
