@@ -1,17 +1,24 @@
-"""Marks as slow the tests listed in tests/slow.txt, which `make slow-list` measures and writes.
+"""Marks as slow the tests listed in tests/slow.txt, and collects the files with the longest tests first.
 
-A test is listed when all its cases together take more than `LIMIT_S` of processor time, fixtures included.
-`make quick` leaves slow tests out; a listed test that was renamed is not slow until the list is made again.
+`make slow-list` measures and writes the list. A test is listed with its processor time in seconds if all its
+cases together take more than `LIMIT_S`, fixtures included. `make quick` leaves slow tests out; a listed test
+that was renamed is not slow until the list is made again. With the longest files first, the cores that share
+the files of `make test` finish at nearly the same time.
 """
 
 from __future__ import annotations
 
+import os
 import resource
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# As `python -m flight` does: OpenBLAS's waiting threads would take a third of the tests' processor time.
+# No test imports numpy before this file is read, and started programs inherit the setting.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # No test may fail because the machine is busy.
 settings.register_profile("any-machine", deadline=None)
@@ -28,11 +35,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark what the list names."""
-    listed = set(LIST.read_text(encoding="utf-8").split()) if LIST.exists() else set()
+    """Mark what the list names, and order the files by their listed processor time."""
+    lines = LIST.read_text(encoding="utf-8").splitlines() if LIST.exists() else []
+    listed = {name: float(spent) for name, _, spent in (line.rpartition(" ") for line in lines)}
+    of_file: dict[str, float] = {}
+    for name, spent in listed.items():
+        file = name.partition("::")[0]
+        of_file[file] = of_file.get(file, 0.0) + spent
     for item in items:
         if _function(item) in listed:
             item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: -of_file.get(item.nodeid.partition("::")[0], 0.0))
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -47,7 +60,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Write the list when asked to."""
     if session.config.getoption("--write-slow-list"):
-        slow = sorted(name for name, spent in _spent.items() if spent > LIMIT_S)
+        slow = sorted(f"{name} {spent:.1f}" for name, spent in _spent.items() if spent > LIMIT_S)
         LIST.write_text("\n".join(slow) + "\n", encoding="utf-8")
 
 
