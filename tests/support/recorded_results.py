@@ -1,0 +1,114 @@
+"""Results of estimators and planners, compared with a record of their numbers.
+
+A test module with the records has a function for each case. `check(__file__, name, result)` compares a result
+with the file `recorded_results.json` beside the module. `KNIGHTCUBE_RECORD=1 python -m pytest -n 0 MODULE`
+writes the record again, after a change of the results that is intended.
+
+Of an array its shape, the number of its finite values, and their mean, root mean square and weighted mean are
+kept; of a text its length is not kept, because wording may change.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TOLERANCE = 1e-5
+"""Relative difference from the record that rounding in another order may cause."""
+_DEPTH = 6
+
+
+def figures_of(value: Any, depth: int = 0) -> Any:
+    """Return the numbers of a result as JSON: dataclasses and mappings by name, arrays as figures."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, bool | int | float | str | Enum):
+        return _plain(value)
+    if isinstance(value, np.ndarray):
+        return _array(value)
+    found: Any = type(value).__name__
+    if depth < _DEPTH:
+        if is_dataclass(value) and not isinstance(value, type):
+            value = {field.name: getattr(value, field.name) for field in fields(value)}
+        if isinstance(value, Mapping):
+            found = {str(key): figures_of(item, depth + 1) for key, item in value.items()}
+        elif isinstance(value, list | tuple):
+            found = [figures_of(item, depth + 1) for item in value]
+    return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Enum):
+        return f"{type(value).__name__}.{value.name}"
+    if isinstance(value, str):
+        return bool(value)
+    return _number(value) if isinstance(value, float) else value
+
+
+def _number(value: float) -> Any:
+    return float(f"{value:.8g}") if math.isfinite(value) else str(value)
+
+
+def _array(value: Any) -> Any:
+    if value.dtype == object or value.dtype.kind in "USV":
+        return [str(value.dtype.kind), len(value)]
+    numbers = np.asarray(value, complex if value.dtype.kind == "c" else float).ravel()
+    numbers = np.abs(numbers) if value.dtype.kind == "c" else numbers
+    finite = np.isfinite(numbers)
+    if not finite.any():
+        return {"shape": list(value.shape), "finite": 0}
+    weights = np.cos(1.0 + np.flatnonzero(finite) % 997)
+    known = numbers[finite]
+    sums = known.mean(), np.sqrt(np.mean(known**2)), np.mean(weights * known)
+    return {
+        "shape": list(value.shape),
+        "finite": int(finite.sum()),
+        "mean": _number(float(sums[0])),
+        "rms": _number(float(sums[1])),
+        "weighted": _number(float(sums[2])),
+    }
+
+
+def differences(record: Any, found: Any, tolerance: float, place: str = "") -> list[str]:
+    """Return the places at which figures differ from their record, one per line."""
+    if isinstance(record, dict) and isinstance(found, dict):
+        lines = [f"{place}.{key}: in one of them only" for key in sorted(record.keys() ^ found.keys())]
+        scale = abs(record["rms"]) if isinstance(record.get("rms"), float) else None
+        for key in sorted(record.keys() & found.keys()):
+            if scale is not None and key in {"mean", "weighted"}:
+                alike = abs(record[key] - found[key]) <= tolerance * scale
+                lines += [] if alike else [f"{place}.{key}: {found[key]}, recorded {record[key]}"]
+            else:
+                lines += differences(record[key], found[key], tolerance, f"{place}.{key}")
+        return lines
+    if isinstance(record, list) and isinstance(found, list):
+        if len(record) != len(found):
+            return [f"{place}: {len(found)} entries, recorded {len(record)}"]
+        pairs = enumerate(zip(record, found, strict=True))
+        return [line for k, (a, b) in pairs for line in differences(a, b, tolerance, f"{place}.{k}")]
+    if isinstance(record, float) and isinstance(found, float):
+        alike = math.isclose(record, found, rel_tol=tolerance, abs_tol=1e-12)
+    else:
+        alike = record == found
+    return [] if alike else [f"{place}: {found}, recorded {record}"]
+
+
+def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE) -> None:
+    """Fail unless a result has the figures of its record, beside a test module."""
+    path = Path(module).with_name("recorded_results.json")
+    records: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    found = json.loads(json.dumps(figures_of(result)))
+    if os.environ.get("KNIGHTCUBE_RECORD"):
+        records[name] = found
+        lines = [f"{json.dumps(key)}: {json.dumps(records[key])}" for key in sorted(records)]
+        path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+        return
+    assert differences(records[name], found, tolerance) == []
