@@ -1,0 +1,114 @@
+"""Slews on few nodes, their first guesses and the attitude laws are those of the record, to five digits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from knightcube.astro.quaternion import normalise
+from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, law_of, references
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.slew_model import (
+    AttitudeEnd,
+    BoresightEnd,
+    Cone,
+    EndConditions,
+    SlewTask,
+)
+from knightcube.gnc.guidance.three_axes.slew_plan import plan_task
+from knightcube.gnc.guidance.three_axes.slew_search import SlewSolver, guesses
+from tests.support.random_slews import orbit, slews
+from tests.support.recorded_results import check
+from tests.support.recorded_slews import matrix, problem, task_of
+
+SLEW = "E-cube-3u-sso-y90-300"
+
+
+def task(nodes: int = 8, **changes: Any) -> SlewTask:
+    """Return a slew of 90 deg."""
+    case = problem(SLEW)
+    return replace(task_of(case, case["T"], nodes=nodes), **changes)
+
+
+def test_a_slew_of_a_large_satellite_is_as_recorded() -> None:
+    check(__file__, "3U", plan_task(task()), 1e-4)
+
+
+def test_a_slew_of_a_small_satellite_is_as_recorded() -> None:
+    case = problem("E-knightcube-1u-sso-y90-300")
+    check(__file__, "1U", plan_task(task_of(case, case["T"], nodes=8)), 1e-4)
+
+
+def test_a_slew_to_a_boresight_is_as_recorded() -> None:
+    axis = np.array([0.0, 0.0, 1.0])
+    direction = matrix(np.array(problem(SLEW)["qf"])).T @ axis
+    end = BoresightEnd(axis, direction, np.zeros(3))
+    check(__file__, "boresight", plan_task(task(end=lambda _: end)), 1e-4)
+
+
+def test_a_slew_beside_a_cone_is_as_recorded() -> None:
+    towards = normalise(np.array([0.3, -0.6, 0.7]))
+    cone = Cone("Sun", np.array([0.0, -1.0, 0.0]), lambda times: np.tile(towards, (len(times), 1)), 0.3)
+    check(__file__, "cone", plan_task(task(cones=(cone,))), 1e-4)
+
+
+def test_a_random_slew_is_as_recorded() -> None:
+    *_, (_, random) = slews(3, 5, False)
+    check(__file__, "random", plan_task(replace(random, nodes=10)), 1e-4)
+
+
+def test_the_first_guesses_of_a_slew_are_as_recorded() -> None:
+    (_, random), *_ = slews(1, 43, True)
+    solver = SlewSolver(random)
+    equations = solver.equations(random.horizon, 10)
+    surroundings = equations.start, equations.end, equations.around
+    kept = solver.kept(equations)
+    found = guesses(equations.motion, random.craft, *surroundings, kept, random.horizon)
+    check(__file__, "guesses", found)
+    trajectory = found[0]
+    check(
+        __file__,
+        "equations",
+        [
+            equations.cost(trajectory),
+            equations.remainders(trajectory),
+            equations.ends_missed(trajectory),
+            equations.linear(trajectory),
+            kept.values(trajectory.states[1:, :4]),
+            kept.slopes(trajectory.states[1:, :4]),
+        ],
+    )
+
+
+def test_the_conditions_at_the_end_are_as_recorded() -> None:
+    rng = np.random.default_rng(31)
+    x, pull = rng.normal(size=7), rng.normal(size=6)
+    ends = (
+        AttitudeEnd(normalise(rng.normal(size=4)), 1e-3 * rng.normal(size=3)),
+        BoresightEnd(np.array([0.6, 0.0, 0.8]), normalise(rng.normal(size=3)), 1e-3 * rng.normal(size=3)),
+    )
+    found = []
+    for end in ends:
+        conditions = EndConditions(end, 120.0)
+        missed = conditions.miss(x)
+        found.append([missed, conditions.slope(x), conditions.curvature(pull[: len(missed)]), end.misses()])
+    check(__file__, "ends", found)
+
+
+def test_the_attitude_of_each_goal_is_as_recorded() -> None:
+    axes, path = BodyAxes(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])), orbit("SSO")
+    times = np.linspace(100.0, 4000.0, 9)
+    targets = {
+        "nadir": PointingTarget(Goal.NADIR, roll=0.2),
+        "velocity": PointingTarget(Goal.VELOCITY),
+        "sun": PointingTarget(Goal.SUN, roll=-0.4),
+        "inertial": PointingTarget(Goal.INERTIAL, (0.5, -0.5, 0.5, 0.5)),
+        "ground": PointingTarget(Goal.GROUND, (0.8, 0.2), 0.1),
+    }
+    found: dict[str, Any] = {}
+    for name, target in targets.items():
+        law = law_of(target, axes, normalise(np.array([0.1, -0.3, 0.2, 0.9])), path, 100.0)
+        found[name] = [references(law, path, times), target.text]
+    check(__file__, "laws", found)
