@@ -74,7 +74,7 @@ def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> I
     return ImagingSettings(
         camera=model,
         exposures=Exposures(camera.exposure, least, most, model.focal_length),
-        # This allows for a trigger that comes late while the next one is on time.
+        # The difference allows for a trigger that comes late while the next trigger is on time.
         fine_rest_ns=round(((camera.fine_period or camera.period) - 0.5 * camera.period) * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
         late_ns=round(camera.late_after * SECOND_NS),
@@ -135,7 +135,7 @@ def _saturation(camera: Camera) -> float:
 def _estimator(camera: Camera, body: FlightBody) -> LikelihoodSettings | StreakEstimator:
     """Return the estimator of rates from streaks that the camera section selects.
 
-    Raises ConfigError if the body does not have this estimator.
+    Raises ConfigError if the body does not have the selected estimator.
     """
     if camera.estimator == "likelihood":
         return replace(likelihood_settings(camera), saturation=_saturation(camera))

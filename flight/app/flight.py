@@ -151,7 +151,8 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
 
     Raises UsageError for a mistake of the user, and DeviceError for a device that fails.
 
-    On a board, the start is retried until it succeeds. Raises StoppedError if a signal ends these attempts.
+    On a board, the start is retried until it succeeds. Raises StoppedError if a signal ends the attempts to
+    start.
     """
     with EndingSignals() as signals, ExitStack() as stack:
         opened = _start(request, signals, stack)
@@ -207,7 +208,7 @@ def _judge(request: RunRequest) -> _Judged:
 
 
 def _open(judged: _Judged, stack: ExitStack) -> _Opened:
-    """Open a flight. If this fails, the run folder is removed from the archive."""
+    """Open a flight. The run folder is removed from the archive if the opening fails."""
     chosen, text, config = judged.chosen, judged.text, judged.config
     stack.enter_context(placing(text, str(chosen.path)))
     request, earlier = begin_folder(judged.request, text, config)

@@ -77,7 +77,7 @@ def default_folder(config_path: Path) -> Path:
 def begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunRequest, list[Path]]:
     """Create the folder of the run, which is the next folder of the archive if there is an archive.
 
-    Return the request with the path of this folder, and the folders of the newest earlier runs.
+    Return the request with the path of the new folder, and the folders of the newest earlier runs.
 
     Raises UsageError for a folder that already contains a run, and for a folder that cannot be written. A
     board with an archive flies in spite of disk trouble, and its logs wait for the disk.

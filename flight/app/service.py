@@ -9,9 +9,10 @@ process.
 
 The signals that end a flight are SIGINT (Ctrl-C), SIGTERM, and SIGHUP when a terminal closes.
 
-The script `deploy/releases.py` runs before the flight. It chooses the software release, counts its starts in
-a file of the state folder, and passes its name and the reasons of the choice in the environment. After a
-minute of flight, the release is recorded as proven, and the flight reports why another release was abandoned.
+The script `deploy/releases.py` runs before the flight. The script `deploy/releases.py` chooses the software
+release, counts its starts in a file of the state folder, and passes its name and the reasons of the choice in
+the environment. After a minute of flight, the release is recorded as proven, and the flight reports why
+another release was abandoned.
 
 The external supervisors of the flight are the guardian of the coils and the service manager. The loop calls
 `beat` at the end of every control cycle without an error, and `feed` while nothing is stalled. A running loop
@@ -21,7 +22,7 @@ are open and the loop runs.
 
 When large memory blocks are freed, glibc raises its threshold for mapping blocks separately (mallopt(3)).
 Later frames are then allocated on the heap, where small blocks cause fragmentation, so that the heap grows.
-Fixed thresholds prevent this growth; a C library other than glibc ignores them.
+Fixed thresholds prevent the growth of the heap; a C library other than glibc ignores them.
 """
 
 from __future__ import annotations
@@ -225,7 +226,7 @@ class FlownRelease:
             self._done = True
 
     def end(self) -> None:
-        """Reset the count of starts, because this release ended by itself."""
+        """Reset the count of starts of the release, because it ended by itself."""
         if self._path is not None:
             with suppress(OSError):
                 self._write(_proven(self._path))
@@ -255,8 +256,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 def settle_memory() -> None:
     """Set the heap's thresholds, and replace the automatic garbage collection by a `Collector`.
 
-    This function is called when the flight has been built. All present objects are exempt from garbage
-    collection, because examining all modules and tasks would take tens of ms in a control cycle.
+    The function `settle_memory` is called when the flight has been built. All present objects are exempt from
+    garbage collection, because examining all modules and tasks would take tens of ms in a control cycle.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -320,7 +321,7 @@ class Supervision:
         self._guardian = guardian
         self._overseer = overseer
         self._clock = clock
-        # This log is separate, because events occur before the loop exists, and no event has a reaction.
+        # A separate event log is used, because the loop does not exist yet, and no event needs a reaction.
         self._events = EventLog(recorder.event, _THROTTLE_NS)
         self._status = status
         self._coils = coils

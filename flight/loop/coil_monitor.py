@@ -1,15 +1,15 @@
 """The coil monitor: detects broken coils from commands, supply current and motion, and identifies the fault.
 
 In each cycle, the loop passes the commands (`commanded`, `interrupted`), the samples of the inertial unit
-(`observe_motion`) and the newest reading of the current monitor (`measured`) to `CoilMonitor`. It then reads
-the results: `verdicts`, `available`, `resting`, `braked`, `at_rest`, `probe`, `suspicion` and
+(`observe_motion`) and the newest reading of the current monitor (`measured`) to `CoilMonitor`. Then the loop
+reads the results: `verdicts`, `available`, `resting`, `braked`, `at_rest`, `probe`, `suspicion` and
 `monitor_doubted`. No call waits. The class `CoilKnowledge` determines whether the coil currents are known:
 they are unknown while the PWM driver fails, after the loop has stalled, and while the supply current
 contradicts the commands.
 
-The current monitor measures the sum of |I| over the three H-bridges. It cannot detect a reversed coil, and it
-detects an open coil only while that coil is driven. Every reading is compared with the prediction of each
-hypothesis: all coils healthy, or one axis open, shorted, or with one leg of an input stuck
+The current monitor measures the sum of |I| over the three H-bridges. The current monitor cannot detect a
+reversed coil, and it detects an open coil only while that coil is driven. Every reading is compared with the
+prediction of each hypothesis: all coils healthy, or one axis open, shorted, or with one leg of an input stuck
 (`flight.loop.coil_response`). A verdict is given when the hypothesis `healthy` is rejected and all hypotheses
 that explain the later readings name the same axis. If the axes are not driven, a small probe current on one
 axis after another decides between them. A reversed coil is detected from the angular acceleration, which also
@@ -19,17 +19,19 @@ missing torque at currents that are too small for the current monitor.
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
 far too large or too small, all coils are commanded to zero. If current still flows at zero commands, there is
-a fault. All bridges are then braked at once. If braking stops the current, the bridges are released one by
-one, and the bridge at whose release the current returns is broken. During this search no healthy coil carries
-current, and no other verdict is given. The search ends if neither zero commands nor braking change the
-current, as with a shorted coil or a wrong current monitor. If the commands change continuously, as in the
-windows of B-dot detumbling, the command that was in force during an ADC sample is ambiguous. In this case,
-all coils are commanded to zero every few seconds as a check, even without a suspicion.
+a fault. If current still flows at zero commands, all bridges are braked at once. If braking stops the
+current, the bridges are released one by one, and the bridge at whose release the current returns is broken.
+During the search for a stuck leg, no healthy coil carries current, and no other verdict is given. The search
+ends if neither zero commands nor braking change the current, as with a shorted coil or a wrong current
+monitor. If the commands change continuously, as in the windows of B-dot detumbling, the command that was in
+force during an ADC sample is ambiguous. While commands change continuously, all coils are commanded to zero
+every few seconds as a check, even without a suspicion.
 
 A reversed coil draws the same supply current as a healthy coil, so the current monitor cannot confirm a
 verdict of reversal. In a tumble, the angular acceleration depends more on the inertia than on the coils. A
-coil that looks reversed in a tumble is therefore not isolated. Such a coil is kept at zero current, and is
-used and judged again when the body is slower than `tumble_rate`, or after ten minutes.
+coil that looks reversed in a tumble is therefore not isolated. A coil that looks reversed in a tumble is kept
+at zero current, and is used and judged again when the body is slower than `tumble_rate`, or after ten
+minutes.
 
 The error bounds are 3.5 mA for each coil's current (Sease thesis, chapter 5), the error of the resistance,
 and 18 % for a single ADC sample of the chopped current (`hal.drivers.ina219`).
@@ -713,7 +715,7 @@ class CoilMonitor:
     def _conclude(self, axis: int, fault: CoilFault, now_ns: int) -> None:
         excess = max(one.current - float(one.mean[:, 0].sum()) for one in self._evidence)
         if fault is CoilFault.SHORTED and excess < _LEAST_SHORT:
-            self._reset()  # such a small excess may be an error of the current monitor
+            self._reset()  # a small excess may be an error of the current monitor
             return
         if self._is_contradicted(axis, fault):
             why = f"{self._strangeness}; yet the motion shows no change of coil {AXES[axis]}"

@@ -11,8 +11,8 @@ over short bins. Differences of neighbouring bins are accelerations. A least squ
 estimates the gain of each coil, together with a constant disturbance, a torsion and a damping about each free
 axis. The gain is 1 for a healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the
 commands vary too little, the standard deviation of the gain is large, and the axis is not judged. A gain
-larger than `LARGEST_GAIN` is physically impossible. Such a gain shows that the model is wrong, and no axis is
-judged.
+larger than `LARGEST_GAIN` is physically impossible. A gain larger than `LARGEST_GAIN` shows that the model is
+wrong, and no axis is judged.
 
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
 that an inertia error of 2 % can make healthy coils look reversed. The fit therefore subtracts the gyroscopic
@@ -20,10 +20,10 @@ acceleration for the assumed inertia, and estimates the remaining error by nuisa
 (`knightcube.gnc.estimation.rigid_body`). If the coils' own field at the magnetometer is comparable with the
 Earth's field, the fit uses the field measured in the last pause of the coils, rotated with the body.
 
-The residual accelerations, computed for healthy coils, are stored for a longer time. If these residuals
-change together with the supply current, a coil is broken; otherwise the current monitor is wrong
-(`observed_share`). The class `MotionWitness` uses this to check verdicts that are based on the supply
-current.
+The residual accelerations, computed for healthy coils, are stored for a longer time. If the residual
+accelerations change together with the supply current, a coil is broken; otherwise the current monitor is
+wrong (`observed_share`). The class `MotionWitness` checks verdicts on broken coils by the residual
+accelerations.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class Sampling:
 
     Attributes:
         scatter: error due to chopping, as a fraction of the bridge's current or, if smaller, of the
-            difference from the full current. A current that is fully on is not chopped.
+            difference from the full current. A bridge that is fully on is not chopped.
         range_share: error of the mean, as a fraction of the current's range within the time window.
     """
 

@@ -36,9 +36,9 @@ class Worker:
 
     Attributes:
         name: short name of the worker for telemetry.
-        function: the function, which in real time runs in a process of its own. The argument of this function
-            must be picklable. The result must consist of plain values, arrays of numbers, and dataclasses and
-            enumerations from modules that the control process has imported.
+        function: function of one argument, which in real time runs in a process of its own. The argument of
+            the worker's function must be picklable. The result must consist of plain values, arrays of
+            numbers, and dataclasses and enumerations from modules that the control process has imported.
         latency_ns: time (ns) from a job's submission to its result in a lock-step simulation.
         timeout_ns: longest execution time (ns) of a job in real time, after which the job is killed.
     """

@@ -1,7 +1,7 @@
 """Events, facts and streams, by which the loop detects and reports faults, and its shared services.
 
 Events are written to the flight log and trigger their reactions. The first event of a kind is written at
-once. After that, at most one event of this kind is written in each `THROTTLE_NS`, together with the number of
+once. Later, at most one event of this kind is written in each `THROTTLE_NS`, together with the number of
 events held back. A fault in every 40 Hz cycle therefore writes only one event every few seconds.
 
 A fact is a condition whose state is updated by monitors. As in NASA's Limit Checker, a fact becomes active
@@ -156,8 +156,8 @@ FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isin
 def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]) -> None:
     """Check the fact table, and raise FlightError with the name of an invalid row.
 
-    `modes_of` is a function that returns the modes in which a reaction has an effect. A fact is invalid if it
-    is not watched in any of these modes.
+    `modes_of` is a function that returns the modes in which a reaction has an effect. A fact is invalid if
+    its reaction has no effect in any mode in which the fact is watched.
     """
     seen: set[str] = set()
     for fact in facts:

@@ -282,8 +282,8 @@ class AttitudeWatch:
     ) -> None:
         """In SAFE, detumble a body that rotates fast, and turn a slow body to the Sun.
 
-        A latched fault (`barred`) forbids both actions. The function `detumble` or `acquire_sun` is called
-        when this action begins.
+        A latched fault (`barred`) forbids detumbling and Sun acquisition. The function `detumble` or
+        `acquire_sun` is called when detumbling or Sun acquisition begins.
         """
         if self.detumbles:
             self.detumbles = not (barred or self._slow.update(rate < self._low, now_ns))
@@ -357,7 +357,7 @@ class ModeSettings:
     Attributes:
         low_rate, low_for: limits of detumbling, which ends when the rate has been below `low_rate` (rad/s)
             for `low_for` (s).
-        stop: function of a reason that ends the flight after the running cycle.
+        stop: function that ends the flight after the running cycle; its argument is the reason.
     """
 
     modes: Modes

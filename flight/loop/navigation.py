@@ -124,8 +124,8 @@ class Navigation:
     def is_measured(self, now_ns: int) -> bool:
         """Return whether the estimate will be recent enough for driving the coils until the next cycle.
 
-        The newest reading that agreed with the estimate must stay within its age limit until then. An
-        estimate that is only propagated by the model is recorded, but not used for steering.
+        The newest reading that agreed with the estimate must stay within its age limit until the next cycle.
+        An estimate that is only propagated by the model is recorded, but not used for steering.
         """
         return self._filter.started and self._is_fresh(self._agreed_ns, now_ns)
 

@@ -6,8 +6,8 @@ time summed over all boots. A wrong wall clock therefore does not affect the cou
 repeatedly soon after its start does not forget its earlier crashes.
 
 The learned parameters are estimated properties of the devices, such as biases; attitude and rate are not
-stored. The next boot starts its filter from these parameters. The covariance of the learned parameters is
-increased by a fraction of the configured prior, because the devices may have changed since then. Learned
+stored. The next boot starts its filter from the learned parameters. The covariance of the learned parameters
+is increased by a fraction of the configured prior, because the devices may have changed since then. Learned
 values that are implausible under the configured prior are rejected.
 
 Each copy of the state is a file with a line of JSON and a line with the CRC-32 of the first line. Both copies
@@ -258,8 +258,7 @@ def learned_of(estimate: Estimate) -> dict[str, Learned]:
     """Return the slowly changing parameters of an estimate by name, in the estimate's units and axes.
 
     The parameters are the gyro bias, the torsion, damping and coil gain of the plant, the latency of the
-    inertial unit's samples, and the magnetometer bias. The cross-covariances of these parameters are
-    discarded.
+    inertial unit's samples, and the magnetometer bias. The cross-covariances of the parameters are discarded.
     """
     parts: dict[str, tuple[FloatArray, slice]] = {
         GYRO_BIAS: (estimate.bias, BIAS),

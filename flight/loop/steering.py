@@ -118,7 +118,10 @@ class CoilDrive:
         self._watch.tumble_rate = modes.tumble_rate
 
     def isolate(self) -> None:
-        """Exclude the axes that have a verdict. This is the reaction to the event `coil-broken`."""
+        """Exclude the axes whose coils the coil monitor considers broken.
+
+        Excluding axes is the reaction to the event `coil-broken`.
+        """
         self.available = self._watch.available
 
     def trust(self, now_ns: int) -> None:
@@ -258,7 +261,7 @@ class Steering:
         self._drive.zero()
 
     def isolate(self) -> None:
-        """Exclude the coils that have a verdict."""
+        """Exclude the coils that the coil monitor considers broken."""
         self._drive.isolate()
 
     def _release(self) -> None:

@@ -8,8 +8,9 @@ pipe. Each death of a worker is reported as `WorkerNews`.
 A worker that dies or exceeds its time limit is restarted, unless its budget of restarts is used up. The first
 restart is immediate, the second is delayed by half a second, and each later delay is twice as long as the
 previous one. The budget of restarts is reset when a worker has run for a minute. After `BUDGET` deaths in a
-row, the worker is not restarted for ten minutes. Then its budget is reset, so that it recovers on a long
-flight once the cause has disappeared. A worker is therefore started at most `BUDGET` times in 12 minutes.
+row, the worker is not restarted for ten minutes. Then the worker's budget of restarts is reset, so that it
+recovers on a long flight once the cause has disappeared. A worker is therefore started at most `BUDGET` times
+in 12 minutes.
 """
 
 from __future__ import annotations
@@ -38,7 +39,10 @@ from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError
 
 BUDGET = 10
-"""Number of deaths in a row after which restarts pause. The delays of these restarts add up to 127.5 s."""
+"""Number of deaths in a row after which restarts pause.
+
+The delays of the restarts before the pause add up to 127.5 s.
+"""
 FIRST_NS = SECOND_NS // 2
 STEADY_NS = 60 * SECOND_NS
 """Running time (ns) after which a worker's budget of restarts is reset."""
@@ -110,10 +114,10 @@ class WorkerProcess:
             [sys.executable, "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
-            # The process group of its own keeps Ctrl-C from the worker, which the control process closes.
+            # A process group of its own protects the worker from Ctrl-C; the control process ends its worker.
             # The group stays in the session of the control process.
             # If the control process dies while a worker is stopped, the group is orphaned.
-            # The kernel then ends the stopped worker by SIGHUP and SIGCONT, even before Python runs.
+            # In an orphaned group, the kernel ends a stopped worker by SIGHUP and SIGCONT at any time.
             process_group=0,
         )
 
@@ -209,7 +213,7 @@ class _Kept:
         self._deaths = 0
 
     def due_ns(self) -> int:
-        """Return the next time (ns) at which this worker must be served without a message, or -1.
+        """Return the next time (ns) at which the worker must be served without a message, or -1.
 
         -1 for no such time.
         """
@@ -224,7 +228,7 @@ class _Kept:
         try:
             if self.process is None:
                 if now_ns < self._due_ns:
-                    # This job was accepted while the process was dying.
+                    # The job was accepted while the process was dying.
                     return self._lose("died", "the worker is not running", now_ns), []
                 self._begun_ns = now_ns
                 self.process = WorkerProcess(self.worker, self._cores)

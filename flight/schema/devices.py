@@ -90,8 +90,8 @@ class CameraAccuracy(Section, frozen=True, kw_only=True):
 
     The error `focal_length` is relative, `centre` is in px along x and y, `distortion` is the displacement of
     an image corner relative to its distance from the centre, and `line_time` is in s. A zero means that the
-    value is exact, as in an emulated camera. Without a `line_time` in this section, the `line_time` of the
-    camera section is considered exact.
+    value is exact, as in an emulated camera. Without `accuracy.line_time`, the `line_time` of the camera
+    section is considered exact.
     """
 
     focal_length: NotNegative = _KNOWN.focal_length
@@ -115,7 +115,7 @@ class StarTrackerSection(Section, frozen=True, kw_only=True):
 
 
 class ObjectTracking(Section, frozen=True, kw_only=True):
-    """Search for moving objects among the stars of each frame, and tracking of these objects.
+    """Search for moving objects among the stars of each frame, and tracking of the detected objects.
 
     Detections fainter than the V magnitude `faintest` are ignored. A track begins after `needed` detections
     in `within` frames, and ends after `coast` s without a detection.

@@ -87,7 +87,7 @@ class _Dumper(yaml.SafeDumper):
     """Quotes the texts that the core schema of YAML 1.2 would otherwise read as numbers, booleans or null."""
 
 
-# The following patterns replace those of PyYAML, which resolve plain scalars by YAML 1.1.
+# PyYAML would resolve plain scalars by YAML 1.1, so its patterns are replaced by those of YAML 1.2.
 _Loader.yaml_implicit_resolvers = _Dumper.yaml_implicit_resolvers = {}
 for _kind, _pattern in (
     ("null", r"(?:null|Null|NULL|~|)$"),
@@ -158,7 +158,7 @@ def read_document(text: str, name: str) -> Document:
         values = None if node is None else loader.construct_document(node)
     except RecursionError as error:
         raise ConfigError(name, "is nested too deeply") from error
-    # Apart from YAMLError, these exceptions come from values that do not fit their explicit tag (`!!int x`).
+    # Apart from YAMLError, the exceptions come from values that do not fit their explicit tag (`!!int x`).
     except (yaml.YAMLError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{name}:{mark.line + 1}" if mark else name

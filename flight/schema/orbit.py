@@ -55,10 +55,11 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     The value `bias_walk` is the random walk of the gyro bias, rad/s per sqrt(s), and `field_noise` is the
     noise of a magnetometer sample, T per axis. The value `torque_start` is the expected size (N m) of the
     disturbance torques before they are estimated: drag at an altitude of 500 km plus twice the solar
-    radiation pressure. The value `torque_walk` is the random walk of these torques, N m per sqrt(s). Both
-    torque values should be smaller for a light satellite, because plans extrapolate an estimated torque along
-    the field for an hour. From one boot to the next, the gyro bias may change by 10 deg/h, and the residual
-    dipole by the fraction `changed` of its initial standard deviation.
+    radiation pressure. The value `torque_walk` is the random walk of the disturbance torques, N m per
+    sqrt(s). The values `torque_start` and `torque_walk` should be smaller for a light satellite, because
+    plans extrapolate an estimated torque along the field for an hour. From one boot to the next, the gyro
+    bias may change by 10 deg/h, and the residual dipole by the fraction `changed` of its initial standard
+    deviation.
     """
 
     bias_walk: NotNegative = 2.0e-6
@@ -89,10 +90,10 @@ class PointingSection(Section, frozen=True, kw_only=True):
     The body axis `axis` points at the target; a commanded roll angle is measured from the body axis `across`,
     which is perpendicular to it. An attitude error of `turn` rad, a rate error of `rate` rad/s and a dipole
     of `dipole` A m^2 have equal cost. A roll error of `roll` rad about `axis` has the same cost; without
-    `roll`, a roll error costs as much as any other attitude error. Between pauses, which last as long as
-    those of detumbling, the coils act for `act` s. Plans are renewed every `replan_period` s. A slew to a
-    distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones` of the star
-    camera.
+    `roll`, a roll error costs as much as any other attitude error. The coils act for `act` s between pauses
+    for the magnetometer, which last as long as those of detumbling. Plans are renewed every `replan_period`
+    s. A slew to a distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones`
+    of the star camera.
     """
 
     axis: Vector = (0.0, 0.0, 1.0)

@@ -31,7 +31,7 @@ def load(path: Path) -> Config:
 
 
 def parse(text: str, name: str = "configuration") -> Config:
-    """Validate a configuration text. In messages, `name` stands for the file. Raises ConfigError."""
+    """Validate a configuration text. Error messages name the file `name`. Raises ConfigError."""
     document = read_document(text, name)
     for optional in ("camera", "power_monitor", "gps", "solar_strings"):
         if document.values.get(optional) == "none":
@@ -80,8 +80,8 @@ def placed(error: UsageError, text: str, name: str) -> UsageError:
 def simulation_section(text: str, name: str, shape: type[T]) -> T | None:
     """Return the `simulation` section of a configuration text as `shape`, or None if there is none.
 
-    The type `shape` of this section is defined by the simulator, which this package does not import. Raises
-    ConfigError.
+    The type `shape` of the `simulation` section is defined by the simulator, which this package does not
+    import. Raises ConfigError.
     """
     document = read_document(text, name)
     return None if document.values.get("simulation") is None else convert(document, shape, "simulation")

@@ -74,8 +74,8 @@ class Modes(Section, frozen=True, kw_only=True):
     After `crash_limit` recent unclean shutdowns, the flight starts in the mode safe instead of `initial`. A
     slew has arrived when its error stays within `arrived_angle` rad and `arrived_rate` rad/s for
     `arrived_for` s, and is late after `slew_limit` s. Holding fails when the error exceeds `hold_error` rad
-    for `hold_patience` s. In the demonstration, this is checked only after the end of the first path to a
-    target. A body faster than `tumble_rate` rad/s is too fast to hold an attitude or to slew. After
+    for `hold_patience` s. In the demonstration, the error is checked only after the end of the first path to
+    a target. A body faster than `tumble_rate` rad/s is too fast to hold an attitude or to slew. After
     `blind_limit` s without an estimate, the mode changes to safe. A body that acquires its attitude changes
     to the mode `acquired` when the attitude has been known for `known_for` s, and returns to acquisition when
     the attitude has been unknown for `lost_for` s.

@@ -34,8 +34,8 @@ class BdotDetumble(Detumble, frozen=True, kw_only=True):
     """Detumbling by B-dot (`knightcube.gnc.control.detumble`).
 
     Each cycle removes the fraction `share` of the rate, as far as the coils' limits permit. If the direction
-    of the field rotates at `field_turn` rad/s, this fraction is computed from that rate. On a testbed without
-    a cage, `field_turn` is zero.
+    of the field rotates at `field_turn` rad/s, the fraction `share` is computed from this rate. On a testbed
+    without a cage, `field_turn` is zero.
     """
 
     share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.3
@@ -72,9 +72,9 @@ class Control(Section, frozen=True, kw_only=True):
     """The controller.
 
     The controllers `lq` and `thesis` use the weights of the Sease thesis, eqs. 5.30-5.32: Q = state_weight I
-    and R = control_weight. The controllers `pid` and `adaptive` use `bandwidth` and the values that follow
-    it. If `gains` are given, `pid` uses them instead of the bandwidth. The controller `excitation` is used by
-    `python -m flight identify`.
+    and R = control_weight. The controllers `pid` and `adaptive` use `bandwidth`; `target_weight` belongs to
+    `pid`, and `adaptation` and `reference_bandwidth` belong to `adaptive`. If `gains` are given, `pid` uses
+    them instead of the bandwidth. The controller `excitation` is used by `python -m flight identify`.
     """
 
     tracker: Literal["lq", "thesis", "pid", "adaptive", "excitation"] = "lq"

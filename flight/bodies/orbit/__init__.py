@@ -1,1 +1,1 @@
-"""A satellite in orbit: free in three axes, turned by its coils alone."""
+"""A satellite in orbit, which rotates freely about three axes and is controlled by its coils only."""

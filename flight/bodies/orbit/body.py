@@ -319,7 +319,7 @@ def _sensor(config: OrbitConfig) -> Sensor | None:
 
 
 def fastest_rate(config: OrbitConfig) -> float:
-    """Return the rate (rad/s) at which the satellite detumbles or, if lower, the star camera pauses."""
+    """Return the rate (rad/s) above which the satellite detumbles or the star camera pauses."""
     camera = config.camera.max_rate if config.camera is not None else None
     return config.modes.tumble_rate if camera is None else min(config.modes.tumble_rate, camera)
 

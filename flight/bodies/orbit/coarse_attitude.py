@@ -1,6 +1,6 @@
 """Coarse attitude from solar cells and magnetic field, and from the horizon cameras.
 
-These measurements start the filter without a star fix, and update it until the attitude is fine.
+The measured directions start the filter without a star fix, and update it until the attitude is fine.
 
 The covariance of an attitude from magnetic field and solar cells (`FieldAndStrings`) includes every rotation
 that is possible if any one cell has failed. Errors of solar cells and cameras (lens, height of the limb) may
@@ -139,7 +139,7 @@ class CoarseSunFeed:
                 self._filter.begin(attitude, doubted=doubted)
             return
         then = self._filter.past(time_ns)
-        if then is None:  # the filter started after this reading was taken
+        if then is None:  # the filter started after the reading was taken
             return
         claim = then.covariance[ATTITUDE, ATTITUDE]
         off = to_rotation_vector(multiply(fix.quaternion, conjugate(then.quaternion)))

@@ -7,8 +7,9 @@ rotation is damped before a new path is planned (`PathRecovery` and `damping_dip
 `knightcube.gnc.control.pointing_law`).
 
 While pointing, the coils are off at the beginning of each control window, so that the magnetometer can be
-read. At the end of this pause one dipole is computed, which is held until the window ends. This dipole is
-increased, so that its mean over the window is the dipole that the law requires.
+read. At the end of the pause of a control window, one dipole is computed, which is held until the window
+ends. The dipole of a control window is increased, so that its mean over the window is the dipole that the law
+requires.
 """
 
 from __future__ import annotations
@@ -84,8 +85,8 @@ def expected_field(
 ) -> Callable[[int], FloatArray | None]:
     """Return a function that predicts the magnetic field (n, 3), T, at `instants` (n,), s, after a time.
 
-    The predicted field is given in the body axes at that time. The function returns None while attitude or
-    orbit are unknown.
+    The predicted field is given in the body axes at the time of the prediction. The returned function gives
+    None while attitude or orbit are unknown.
     """
     field = FieldAhead()
 
@@ -184,7 +185,7 @@ class PointingTracker:
         dipole = found.dipole
         if not reference.paths.led(found.rotation, rate, reference.time_ns):
             dipole = damping_dipole(self._inertia, rate, field) - residual
-        # With this factor the mean dipole over the window equals the required dipole.
+        # The factor makes the mean dipole over the window equal to the required dipole.
         dipole = dipole * (self._pauses.period_ns / self._pauses.act_ns)
         largest = float(np.abs(dipole).max())
         saturated = largest > self._limit

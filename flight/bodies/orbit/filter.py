@@ -4,16 +4,15 @@ A step holds the coil commands and the measurements between two times. A step en
 switched on or off, so that the dipole is nearly constant during a step. When a step has ended, the filter
 processes it with the mean commanded dipole and the mean of the gyro samples. Magnetometer samples are used
 only while the coils are off and their field has decayed. Within the step under way, the estimate is
-propagated by the model. A measurement of a past time, such as a star fix, is applied at its time: the filter
-returns to the beginning of the step that contains this time, and processes this step and all later steps
-again.
+propagated by the model. A measurement of a past time, such as a star fix, is applied at its own time: the
+filter returns to the beginning of the step with this time, and repeats all steps since then.
 
 The learned states are stored for the next boot in two parts, without their cross-covariance:
 `attitude-errors` holds the biases of gyro and magnetometer and the rotation of the principal axes,
 `attitude-torques` the residual dipole in shadow and in sunlight and the torques. A third entry, `learned-at`,
-is the time (UTC, s) for which these states were estimated. At the next boot, the covariance of each state
-grows by its random walk over the elapsed time, and by a fraction of its initial standard deviation, because
-switching a sensor off and on changes its bias.
+is the time (UTC, s) for which the learned states were estimated. At the next boot, the covariance of each
+state grows by its random walk over the elapsed time, and by a fraction of its initial standard deviation,
+because switching a sensor off and on changes its bias.
 """
 
 from __future__ import annotations
@@ -287,7 +286,7 @@ class StepReplay:
         return self.take_again(first)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
-        """Treat the dipoles since a time as unknown if a rejected attitude then passes; return what was used.
+        """Treat the dipoles since a time as unknown, if a rejected attitude passes as a result.
 
         Dipole errors that are too small for the gyro accumulate in the attitude.
         """
@@ -347,7 +346,7 @@ class StepReplay:
         return rotation if left_ns == 0 else None
 
     def take_again(self, first: int) -> set[int]:
-        """Return to the start of step `first`, and process this step and all later steps again.
+        """Return to the start of step `first`, and process all steps again from there.
 
         Return the identities of the late measurements used.
         """
@@ -616,7 +615,7 @@ class OrbitFilter:
 
     @property
     def refused(self) -> int:
-        """The number of measurements rejected by their gates, including those of repeated steps."""
+        """The number of measurements rejected by their gates; repeated measurements are counted again."""
         return self._free.refused
 
     @property

@@ -89,7 +89,7 @@ class PointingPaths:
         self.astray = PathRecovery()
 
     def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
-        """Follow a new table, or its slow enough part; return why it is rejected, or "" if it is followed."""
+        """Follow a new path table, or its part with permitted rates; return why it is rejected, or ""."""
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
             return "it holds values that are not finite"
@@ -112,7 +112,7 @@ class PointingPaths:
         return self.astray.since is None
 
     def is_slewing(self, now_ns: int, target: PointingTarget) -> bool:
-        """Return whether a slew to this target is under way."""
+        """Return whether a slew to a target is under way."""
         return self._arrival_ns is not None and now_ns < self._arrival_ns and target == self._target
 
     def has_arrived(self, now_ns: int) -> bool:

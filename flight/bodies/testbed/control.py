@@ -167,7 +167,7 @@ class ThreadLaw:
 
 
 def law_of(target: Target) -> ThreadLaw:
-    """Return the target law of a testbed's target."""
+    """Return the law of a target, which must be a target of the testbed."""
     law = target.law
     assert isinstance(law, ThreadLaw), "only the testbed's own targets reach its planner"
     return law
