@@ -39,7 +39,7 @@ class RunRequest:
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """The result of a flight; `interrupted` states whether a signal ended it.
+    """The result of a flight; `interrupted` states whether a signal ended the flight.
 
     The state of the loop at its end is `ending`. The text `restart` states why the process should be
     restarted; it is empty if no restart is needed. The text of each injected fault is in `faults`. `faults`

@@ -9,10 +9,9 @@ process.
 
 The signals that end a flight are SIGINT (Ctrl-C), SIGTERM, and SIGHUP when a terminal closes.
 
-The script `deploy/releases.py` runs before the flight. The script `deploy/releases.py` chooses the software
-release, counts its starts in a file of the state folder, and passes its name and the reasons of the choice in
-the environment. After a minute of flight, the release is recorded as proven, and the flight reports why
-another release was abandoned.
+Before the flight, the script `deploy/releases.py` chooses the software release, counts its starts in a file
+of the state folder, and passes its name and the reasons of the choice in the environment. After a minute of
+flight, the release is recorded as proven, and the flight reports why another release was abandoned.
 
 The external supervisors of the flight are the guardian of the coils and the service manager. The loop calls
 `beat` at the end of every control cycle without an error, and `feed` while nothing is stalled. A running loop
@@ -21,8 +20,8 @@ the coil driver runs. With the first heartbeat, READY is reported to the service
 are open and the loop runs.
 
 When large memory blocks are freed, glibc raises its threshold for mapping blocks separately (mallopt(3)).
-Later frames are then allocated on the heap, where small blocks cause fragmentation, so that the heap grows.
-Fixed thresholds prevent the growth of the heap; a C library other than glibc ignores them.
+Frames are then allocated on the heap, where small blocks cause fragmentation, so that the heap grows. Fixed
+thresholds prevent the growth of the heap; a C library other than glibc ignores them.
 """
 
 from __future__ import annotations
@@ -112,7 +111,7 @@ class StartRetry:
 def retried_start(
     judge: Callable[[], J], attempt: Callable[[J, ExitStack], T], stack: ExitStack, retry: StartRetry
 ) -> T:
-    """Return the result of the first attempt that succeeds; `stack` closes what this attempt opened.
+    """Return the result of the first attempt that succeeds; `stack` closes what it has opened.
 
     Each attempt reads and validates a configuration with `judge`, and opens it with `attempt`. Raises
     UsageError for an invalid configuration, and StoppedError after a signal.
@@ -271,9 +270,9 @@ def settle_memory() -> None:
 class Collector:
     """Collects the garbage since its last call, and exempts the surviving objects from later collections.
 
-    Only failures create garbage that needs a collection. If it is called every few seconds, a collection
-    examines few objects and takes at most 2 ms. The first call only exempts the objects that the start of the
-    flight created.
+    Only failures create garbage that needs a collection. If the collector is called every few seconds, a
+    collection examines few objects and takes at most 2 ms. The first call only exempts the objects that the
+    start of the flight created.
     """
 
     def __init__(self) -> None:

@@ -60,7 +60,7 @@ class TargetLaw(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A target with its number in packets: the number of a configured step, COMMANDED or higher, or KEPT."""
+    """A target and its number in packets: the number of a configured step, at least COMMANDED, or KEPT."""
 
     index: int
     law: TargetLaw
@@ -162,7 +162,7 @@ class Filter(Protocol):
         """Apply measurements of past times, and call `applied` with a flag for each that passed its gate."""
 
     def catch_up(self, most: int | None = None) -> None:
-        """Repeat up to `most` (or all) measurements that are newer than a late measurement."""
+        """Apply again up to `most` (or all) measurements that follow a late measurement in time."""
 
     def at(self, time_ns: int) -> Estimate:
         """Return the estimate propagated to `time_ns`, without changing the filter."""
@@ -264,7 +264,7 @@ class Planner(Protocol):
 
 
 class BodyTargets(Protocol):
-    """The targets of a body, and the body's angle from them."""
+    """The targets of a body, and the angle between body and target."""
 
     def configured(self, mission_time_ns: int) -> Target:
         """Return the configured target that is in force at a mission time."""
@@ -272,7 +272,7 @@ class BodyTargets(Protocol):
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
         """Return the target that command `number` sets.
 
-        Raises UsageError if this kind of body cannot reach it.
+        Raises UsageError if this kind of body cannot reach the target.
         """
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
@@ -327,8 +327,8 @@ class HorizonCameraUse(Protocol):
 class BodyEstimation(Protocol):
     """The estimation of a body, and the measurements that it uses.
 
-    A kind of body inherits from this class and implements all methods without a default. The defaults are
-    those of a body without an orbit.
+    Each kind of body inherits from `BodyEstimation`, and implements all methods without a default. The
+    default methods are those of a body without an orbit.
 
     Attributes:
         filter: filter that estimates attitude, rate and parameters of the body.
@@ -365,7 +365,7 @@ class BodyEstimation(Protocol):
     def velocity(self, time_ns: int) -> FloatArray | None:
         """Return the velocity (3,), m/s, relative to the Sun in reference axes, for stellar aberration.
 
-        If the result is None, the configured velocity is used.
+        If the method returns None, the configured velocity is used.
         """
         return None
 
@@ -381,7 +381,8 @@ class BodyEstimation(Protocol):
 class BodyControl(Protocol):
     """Guidance and control of a body.
 
-    A kind of body inherits from this class. The defaults are those of a body that does not follow objects.
+    Each kind of body inherits from `BodyControl`. The default methods are those of a body that does not
+    follow objects.
 
     Attributes:
         modes: modes that exist for this kind of body.
@@ -407,7 +408,7 @@ class BodyControl(Protocol):
         return False
 
     def accept_tracks(self, tracks: Sequence[Track], now_ns: int) -> None:
-        """Accept the confirmed tracks of objects after each frame that was searched."""
+        """Accept the confirmed tracks of objects after each frame that was searched for objects."""
         return
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:

@@ -12,9 +12,9 @@ reversed coil, and it detects an open coil only while that coil is driven. Every
 prediction of each hypothesis: all coils healthy, or one axis open, shorted, or with one leg of an input stuck
 (`flight.loop.coil_response`). A verdict is given when the hypothesis `healthy` is rejected and all hypotheses
 that explain the later readings name the same axis. If the axes are not driven, a small probe current on one
-axis after another decides between them. A reversed coil is detected from the angular acceleration, which also
-distinguishes a wrong current monitor from a broken coil. Averaged over longer bins, the acceleration reveals
-missing torque at currents that are too small for the current monitor.
+axis after another decides which axis is broken. A reversed coil is detected from the angular acceleration,
+which also distinguishes a wrong current monitor from a broken coil. Averaged over longer bins, the
+acceleration reveals missing torque at currents that are too small for the current monitor.
 
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
@@ -254,7 +254,7 @@ class BrakeProof:
         self._axes.discard(axis)
 
     def ingest(self, exceeds: bool) -> frozenset[int]:
-        """Accept whether an ADC sample shows a current in spite of braking.
+        """Process whether an ADC sample shows a current in spite of braking.
 
         Return the axes that are braked wrongly.
         """

@@ -271,7 +271,7 @@ class CoilCommands:
         return time_ns >= max(self._braked_ns, self._commands[0][0])
 
     def window(self, begin_ns: int, end_ns: int) -> FloatArray:
-        """Return the commands (k, 3), A, possibly in force between two times, in equal time steps."""
+        """Return the commands (k, 3), A, that may be in force between two times, in equal steps."""
         later = iter(self._commands)
         _, currents = next(later)
         following = next(later, None)

@@ -37,8 +37,9 @@ class Worker:
     Attributes:
         name: short name of the worker for telemetry.
         function: function of one argument, which in real time runs in a process of its own. The argument of
-            the worker's function must be picklable. The result must consist of plain values, arrays of
-            numbers, and dataclasses and enumerations from modules that the control process has imported.
+            the worker's function must be picklable. The result of the worker's function must consist of plain
+            values, arrays of numbers, and dataclasses and enumerations from modules that the control process
+            has imported.
         latency_ns: time (ns) from a job's submission to its result in a lock-step simulation.
         timeout_ns: longest execution time (ns) of a job in real time, after which the job is killed.
     """
@@ -235,7 +236,7 @@ class Observer(Protocol):
 
 
 class CyclicExecutive:
-    """Runs rate groups; `stopwatch` is a clock (ns) for their execution times, used in telemetry only."""
+    """Runs rate groups; `stopwatch` returns times (ns) by which execution times are measured."""
 
     def __init__(
         self,

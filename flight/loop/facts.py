@@ -1,8 +1,8 @@
 """Events, facts and streams, by which the loop detects and reports faults, and its shared services.
 
 Events are written to the flight log and trigger their reactions. The first event of a kind is written at
-once. Later, at most one event of this kind is written in each `THROTTLE_NS`, together with the number of
-events held back. A fault in every 40 Hz cycle therefore writes only one event every few seconds.
+once. Later, at most one event of each kind is written per `THROTTLE_NS`, together with the number of events
+held back. A fault in every 40 Hz cycle therefore writes only one event every few seconds.
 
 A fact is a condition whose state is updated by monitors. As in NASA's Limit Checker, a fact becomes active
 after N violations in a row; an unknown state (None) leaves the count unchanged. A latching fact stays active
@@ -54,7 +54,7 @@ class EventLog:
         self.counts: Counter[EventKind] = Counter()
 
     def react_by(self, react: Reactor) -> None:
-        """Call `react` for every event with a reaction other than a record, even if it is held back."""
+        """Call `react` for every event whose reaction is not just a record, even if it is held back."""
         self._react = react
 
     def report(self, kind: EventKind, time_ns: int, text: str) -> None:
@@ -250,8 +250,8 @@ class StreamState(IntEnum):
 class StreamLimits:
     """Limits of a stream: nominal rate (Hz), age limit (s), and range of its value in the value's unit.
 
-    `has_silence_alarm` states whether another fact reports missing readings, so that the fact `poor` does
-    not.
+    `has_silence_alarm` states whether another fact reports missing readings, so that the fact `poor` does not
+    report them.
     """
 
     name: str
@@ -332,12 +332,12 @@ class StreamWatch:
             return StreamState.STALE
         if not self._valid:
             return StreamState.INVALID
-        if self.rate(now_ns) < LEAST_RATE * self.stream.rate_hz:  # False for NaN, an unknown rate
+        if self.rate(now_ns) < LEAST_RATE * self.stream.rate_hz:  # NaN, an unknown rate, compares false
             return StreamState.SLOW
         return StreamState.GOOD
 
     def poor(self, now_ns: int) -> tuple[bool | None, str]:
-        """Return whether the stream is poor, and why; None if unknown or reported by another fact."""
+        """Return whether the stream is poor, and why, or None if unknown or reported by another fact."""
         stream, state = self.stream, self.state(now_ns)
         if state is StreamState.GOOD:
             return False, f"{stream.name}: good again"

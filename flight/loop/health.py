@@ -8,8 +8,9 @@ Linux, a script in tests) samples processor load, memory, disk space and tempera
 control loop, because the kernel may take milliseconds to answer.
 
 Housekeeping records the counters of devices and tasks once a second, and checks the flight log. The
-performance record stores lateness and execution time of the control cycles in a separate log. Its observer
-reports skipped time slots and failures as events, and switches the coils off after a failed control cycle.
+performance record stores lateness and execution time of the control cycles in a separate log. The observer of
+the executive reports skipped time slots and failures as events, and switches the coils off after a failed
+control cycle.
 """
 
 from __future__ import annotations

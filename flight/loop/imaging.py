@@ -256,7 +256,10 @@ class FrameReport:
         now_ns: int,
         accepted: bool | None,
     ) -> None:
-        """Record an attitude measured with stars; `accepted` is None if it was not passed to the filter."""
+        """Record an attitude measured with stars.
+
+        The flag `accepted` is None for an attitude that was not passed to the filter.
+        """
         if is_strange(solution):
             text = f"frame {frame.sequence}: {len(solution.points)} detected stars match no part of the sky"
             self._events.report(events.CAMERA_STRANGE, now_ns, text)
@@ -449,7 +452,7 @@ class Imaging:
         self._last_frame_ns = 0
         self._triggered_ns = -settings.fine_rest_ns
         self._ordered: tuple[int, int] | None = None  # start and duration (ns) of an ordered exposure
-        self._due_ns: int | None = None  # latest arrival (ns) of the frame of the oldest trigger
+        self._due_ns: int | None = None  # time (ns) after which the oldest trigger's frame is late
         self._rows = RepeatedRows()
         self._busy_since_ns = 0
         self._frames = 0
@@ -469,7 +472,7 @@ class Imaging:
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:
-        """Order an exposure. This is the task of the camera's rate group.
+        """Order an exposure. Ordering exposures is the task of the camera's rate group.
 
         No exposure is made while the body rotates faster than permitted. Exposures are less frequent while
         the attitude is fine. An exposure starts when no coil will switch until its end, so that the body rate

@@ -126,7 +126,7 @@ TRANSITIONS: Table = {
         Trigger.DETUMBLED: Mode.HOLD,
         Trigger.SLOWED: Mode.ACQUIRE,
     },
-    Mode.HOLD: _USUAL,  # a repeated command holds the attitude at its time
+    Mode.HOLD: _USUAL,  # a repeated command holds the attitude at the time of the command
     Mode.SLEW: {**_USUAL, Trigger.REACT_HOLD: Mode.HOLD, Trigger.ARRIVED: Mode.HOLD},
     # Without a plan, the demonstration holds the attitude until the next plan arrives.
     Mode.TESTBED_DEMO: {**_USUAL, Trigger.COMMAND_DEMO: TriggerAnswer.STAY},

@@ -130,8 +130,7 @@ class ObjectTracking(Section, frozen=True, kw_only=True):
 class V4l2Device(Section, frozen=True, kw_only=True, tag_field="kind", tag="v4l2"):
     """A Video for Linux camera (`hal.drivers.v4l2_camera`).
 
-    The value `gain` is in the camera's own steps, `stamp_delay` in s. `gain` in its own steps, `stamp_delay`
-    in s.
+    The value `gain` is in the camera's own steps, and `stamp_delay` is in s.
     """
 
     path: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-camera"

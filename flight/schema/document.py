@@ -146,7 +146,7 @@ def checked_length(text: str, path: Path) -> str:
 
 
 def read_document(text: str, name: str) -> Document:
-    """Return the values of a YAML text. In messages, `name` stands for the file. Raises ConfigError."""
+    """Return the values of a YAML text. Error messages name the file `name`. Raises ConfigError."""
     lines: dict[str, int] = {}
     try:
         loader = _Loader(text)

@@ -135,7 +135,7 @@ class Requirements(Section, frozen=True, kw_only=True):
 
 
 class OrbitConfig(Config, frozen=True, kw_only=True):
-    """The configuration of a satellite in orbit; `elements` are its two-line elements, if known."""
+    """The configuration of a satellite in orbit, with its two-line elements (`elements`), if known."""
 
     craft: Craft
     elements: tuple[str, str] | None = None

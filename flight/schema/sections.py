@@ -50,10 +50,11 @@ class Estimation(Section, frozen=True, kw_only=True):
     """The multiplicative Kalman filter of attitude, rate, gyro bias and disturbance.
 
     The initial standard deviations are `bias_start` (gyro bias, rad/s), `gain_start` (coil gains) and
-    `latency_start` (age of an inertial unit's sample at its time stamp, s). A zero keeps the state fixed. The
-    latency has the random walk `latency_walk`, s per sqrt(s). Without measurements, the estimate is
-    propagated by the model for `coast` s, but the coils stay off (`inertial_unit.max_age`). From one boot to
-    the next, a learned value may change by the fraction `changed` of its initial standard deviation.
+    `latency_start` (age of an inertial unit's sample at its time stamp, s). A state whose initial standard
+    deviation is zero stays fixed. The latency has the random walk `latency_walk`, s per sqrt(s). Without
+    measurements, the estimate is propagated by the model for `coast` s, but the coils stay off
+    (`inertial_unit.max_age`). From one boot to the next, a learned value may change by the fraction `changed`
+    of its initial standard deviation.
     """
 
     current_noise: NotNegative = 2.0e-3
@@ -172,8 +173,8 @@ class Link(Section, frozen=True, kw_only=True):
     in each frame. The addresses `udp` and `tcp` (HOST:PORT) accept frames only from the networks `peers`.
     Without `peers`, a loopback address accepts frames from this machine, any other address from its network
     of 256 addresses. The value `serial` describes the line of a radio. Telemetry is sent to authenticated
-    senders, to `telemetry_to` (HOST:PORT, UDP), to all clients of `tcp` and to `serial`. Its frames have
-    `frame_bytes` bytes, and each line carries at most `rate` bytes/s.
+    senders, to `telemetry_to` (HOST:PORT, UDP), to all clients of `tcp` and to `serial`. Telemetry frames
+    have `frame_bytes` bytes, and each line carries at most `rate` bytes/s.
     """
 
     keys: Annotated[str, Meta(min_length=1)]

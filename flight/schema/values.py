@@ -54,7 +54,7 @@ _OWN = {
     "ground": ("latitude_deg", "longitude_deg"),
     "object": ("right_ascension_deg", "declination_deg"),
 }
-"""Keys that a goal requires and no other goal accepts; `object` requires both of its keys or none."""
+"""Keys that a goal requires and no other goal accepts; the goal `object` may lack both of its keys."""
 _LENGTH_ERROR = 1e-3
 """Largest accepted deviation of a commanded quaternion's norm from 1."""
 

@@ -19,7 +19,7 @@ from knightcube.errors import FlightError
 
 
 def summary_text(result: RunResult, elapsed: float) -> str:
-    """Return the summary of a flight as lines; `elapsed` (s) is measured by the machine's clock."""
+    """Return the summary of a flight of the duration `elapsed` (s), by the machine's clock, as lines."""
     ending = result.ending
     lines = [
         ("flown", f"{ending.mission_time:.0f} s in {elapsed:.1f} s, {result.reason}"),

@@ -59,9 +59,9 @@ from knightcube.gnc.tracker import Track
 from knightcube.vision.solar_cells import SolarStringModel
 
 SPIN_EVERY = 10
-"""Control cycles from one spin packet to the next."""
+"""Number of control cycles from one spin packet to the next."""
 NAVIGATION_EVERY = 40
-"""Control cycles from one navigation packet to the next."""
+"""Number of control cycles from one navigation packet to the next."""
 LEVELS = (Knowledge.LOST, Knowledge.COARSE, Knowledge.FINE)
 """Knowledge of the attitude, in the order of the numbers in the navigation packet."""
 _NAN3 = [math.nan] * 3
@@ -135,7 +135,7 @@ class OrbitView:
         self._events.report(events.TARGET, now_ns, target.law.text)
 
     def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
-        """Return the fields of the mode packet that belong to this body."""
+        """Return the satellite's fields of the mode packet."""
         return {"target_q2": math.nan}
 
     def rate_text(self, rate: MeanRateMeasurement) -> str:

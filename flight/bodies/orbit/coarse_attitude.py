@@ -64,7 +64,7 @@ SUNLIT = 0.99
 CONTRADICTED = 3
 """Number of contradicting measurements in a row after which a coarse estimate is discarded."""
 GATE = 30.7
-"""Chi-square threshold (3 degrees of freedom, probability 1e-6) above which an attitude contradicts."""
+"""Chi-square threshold (3 degrees of freedom, 1e-6) above which an attitude contradicts the estimate."""
 START_SIGMA = np.radians(5.0)
 """Largest standard deviation (rad) of the rotation about the field direction at which the filter starts."""
 STRENGTH_SIGMA = 5.0
@@ -200,7 +200,7 @@ class HorizonCameraFeed:
 
     @property
     def needed(self) -> bool:
-        """Whether the attitude needs horizon frames; in eclipse only while the attitude is lost."""
+        """Whether horizon frames are needed to improve the attitude; in eclipse only for a lost attitude."""
         if self._filter.worst_sigma <= NEEDED_SIGMA:
             return False
         around = self._environment.at(self._filter.measured_ns)
@@ -237,7 +237,7 @@ class HorizonCameraFeed:
         mine = [None if of_cells else seen[0], seen[1]]
         claim, turn = then.covariance[ATTITUDE, ATTITUDE], attitude_matrix(then.quaternion)
         refused = [one is not None and _contradicts(one, turn, claim) for one in mine]
-        # Count consecutive rounds that contradict an estimate that is not fine.
+        # Count consecutive measurements that contradict a coarse estimate.
         if self._filter.knowledge is Knowledge.FINE:
             self._against = 0
         elif any(one is not None for one in mine):

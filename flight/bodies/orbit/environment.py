@@ -46,7 +46,7 @@ class EstimatedEnvironment:
         self._clock = clock
         self._fix: GpsFix | None = None
         self._utc_offset_ns: int | None = None
-        self._newest_offset_ns: int | None = None  # from the newest GPS fix, used or not
+        self._newest_offset_ns: int | None = None  # time offset (ns) of the newest GPS fix, used or not
         self._near: Ephemeris | None = None
         self._refused_in_a_row = 0
         self.refused = 0
@@ -114,7 +114,7 @@ class EstimatedEnvironment:
         return np.asarray(earth_velocity(date) + near.velocity_at(times)[0])
 
     def _seconds_into(self, ephemeris: Ephemeris, now_ns: int) -> float:
-        """Return the time (s) since the start of `ephemeris` at a time of the clock."""
+        """Return the time (s) from the start of `ephemeris` to a time of the host's clock."""
         return (self.julian_date(now_ns) - ephemeris.julian_date) * DAY
 
     def _state(self, date: float) -> OrbitState | None:
