@@ -21,9 +21,9 @@ constant vector. A time T suffices to reduce the momentum to at most r if and on
 The minimum time is the smallest T at which even the worst y satisfies this inequality, and the plan is this
 y. For the worst y, A(y) y is parallel to h, where A is the integral of L (B^2 I - B B^T) / |B x y| plus r /
 |y|. The worst y is found by iterating this condition (iteratively reweighted least squares). Momentum along
-the field can be removed only after the field has rotated. Until then, the minimum-time plan may add momentum
-across the field, which is removed later. The plan leaves a residual momentum r, because removing the last
-momentum along a slowly rotating field would take most of the time.
+the field can be removed only after the field has rotated. The minimum-time plan may first add momentum across
+the field, which is removed later. The plan leaves a residual momentum r, because removing the last momentum
+along a slowly rotating field would take most of the time.
 
 The minimum-time plan first accelerates a body that spins along the field, about an axis across the field. The
 settings `gentle` and `spin_up` therefore give an upper bound of the rate. At the bound, no dipole moment is

@@ -1,15 +1,14 @@
-"""The planner's job of a satellite: from an orbit, an attitude and a target to a table of the pointing law.
+"""The planning job of a satellite, which computes a table of the pointing law for a target.
 
-The field and the torques are predicted along the orbit for a revolution and a quarter, because the last
-stored gains need this preview. A third of a revolution is stored. An object passes within minutes, so that
-its tables are short, have short steps, and are computed again at each sighting.
+Field and torques are predicted along the orbit for a revolution and a quarter, because the gains at the end
+of the table depend on the following revolution. The table covers a third of a revolution. A passing object is
+near for minutes only, so its tables are short, have short steps, and are computed again after each sighting.
 
-Far from the commanded attitude, the body can approach it by a slew of minimum heat, planned by `slew_plan`
-with the torques that the filter estimates. The planned dipoles of the slew are the feedforward, because an
-optimum of rotation error plus dipole would depart from the path of minimum heat. The gains are those of
-linear-quadratic tracking along slew and law, with the field of the revolution ahead; an error at the end of
-the slew has the highest cost. The table also contains the change of the dipole per change of the estimated
-torques.
+Far from the commanded attitude, the body can approach it by a slew of minimum heat. The module `slew_plan`
+plans the slew with the torques that the filter estimates. The planned dipole moments of the slew are used as
+feedforward. The gains come from linear-quadratic tracking along the slew and the following attitude law, and
+errors at the end of the slew have the highest cost. The table also contains the change of the dipole moment
+per change of the estimated torques.
 """
 
 from __future__ import annotations
@@ -51,22 +50,21 @@ from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft, SlewPath, S
 from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_task
 
 RESERVE = 0.8
-"""Fraction of the coils' limit for the planned dipoles of a slew; the remainder is for the correction of
-errors."""
+"""Fraction of the coils' limit that a planned slew may use; the remainder is for the correction of errors."""
 STIFFER = 5.0
-"""Factor by which the dipole of unit cost is larger during a slew."""
+"""Factor by which the dipole moment of unit cost is larger during a slew than otherwise."""
 LONGEST = 1_500.0
-"""Longest slew, s. It is shorter than a table, which must include some time after the slew."""
+"""Longest slew, s. A slew must be shorter than a table, which also includes some time after the slew."""
 FINE = 5
 """Number of steps of a slew table per step of a pointing table, because a slewing body rotates faster."""
 TAIL = 300.0
 """Duration (s) after the end of a slew over which its feedback gains are still computed."""
 END = 2_000.0
-"""Duration (s) of an error whose cost equals that of the same error at the end of a slew. The torques are not
-well known before the slew, and their effects should be corrected by its end."""
+"""Weight (s) of errors at the end of a slew: an end error costs as much as the same error during this time.
+The weight is high because the torques are poorly known before the slew, and their effects should be corrected
+by the end of the slew."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
-"""Factor by which a slew that rotates too fast is lengthened in addition to the excess of its rate, largest
-total factor, and number of trials."""
+"""Extra factor on the horizon of a slew that rotates too fast, largest total factor, and number of trials."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,11 +72,11 @@ class SlewRequest:
     """The parameters of slews into a pointing target.
 
     Attributes:
-        seconds: requested duration, s; a slew takes longer if this duration does not suffice.
-        heat: (3,) W/(A m^2)^2, heat of each coil per square of its dipole.
-        residual: (3,) A m^2, the residual dipole of the satellite.
-        camera, angles: body axis (3,) of the camera, and half-angles, rad, of its exclusion cones for `sun`,
-            `earth` and `moon`.
+        seconds: requested duration of the slew, s; the slew takes longer if this duration is too short.
+        heat: heating power of each coil per squared dipole moment (3,), W/(A m^2)^2.
+        residual: residual dipole moment (3,) of the satellite, A m^2.
+        camera: body axis (3,) of the camera.
+        angles: half angles of the camera's exclusion cones for `sun`, `earth` and `moon`, rad.
     """
 
     seconds: float
@@ -93,12 +91,12 @@ class SlewStart:
     """The state at the start of a slew.
 
     Attributes:
-        quaternion, rate: (4,) and (3,) rad/s, at the first of `times`.
-        times: (m,) s, equally spaced, preview included.
-        kept: number of steps of the table.
+        quaternion, rate: attitude (4,) and body rate (3,), rad/s, at the first of `times`.
+        times: equally spaced times (m,) of table and preview, s.
+        kept: number of steps of the pointing table.
         inertia: (3, 3) kg m^2.
-        limit: A m^2 of each coil, mean.
-        sizes: (9,) N m of the torques.
+        limit: mean dipole limit of a coil, A m^2.
+        sizes: estimated sizes (9,) of the disturbance torques, N m.
     """
 
     quaternion: FloatArray
@@ -120,7 +118,7 @@ def slew(
 ) -> SlewPath | None:
     """Return the slew into a target's law that stays slower than `fastest` rad/s; None if there is none.
 
-    Exclusion cones are kept unless the body already is inside one or no slew keeps them.
+    The slew avoids the exclusion cones, unless the body is already inside a cone or no such slew is found.
     """
     first = float(begin.times[0])
     craft = SlewCraft(begin.inertia, np.full(3, RESERVE * begin.limit), wish.heat, wish.residual)
@@ -140,15 +138,15 @@ def slew(
         found = _slow_enough(task, fastest)
     if found is None or not begin.sizes.any():
         return found
-    # Air and sunlight act on areas that depend on the path.
+    # The areas on which air and sunlight act depend on the path, so the slew is planned again.
     pressed = along(ahead, first, box_areas(begin.inertia), found)
     return _slow_enough(replace(task, along=pressed, horizon=found.horizon), fastest, found) or found
 
 
 def _slow_enough(task: SlewTask, fastest: float, near: SlewPath | None = None) -> SlewPath | None:
-    """Return the path of a task, over a longer time if it would rotate too fast; None if there is none.
+    """Return the path of a task, lengthened if the body would rotate too fast, or None without a path.
 
-    `near` is the path of a similar task.
+    The search is warm-started from `near`, the path of a similar task.
     """
     for _ in range(_TRIALS):
         try:
@@ -175,10 +173,10 @@ def slew_table(
     expected: PointingPreview,
     weights: PointingWeights,
 ) -> PointingTable:
-    """Return the table of a slew and of the law after it, in steps of a fifth of the given times' step.
+    """Return the table of a slew and the following law, in steps of a fifth of the step of `begin.times`.
 
-    `residual` (3,) A m^2 is the residual dipole that the path was planned with. `expected` is the environment
-    at the times of `begin`; its motions are not used.
+    `residual` (3,) A m^2 is the residual dipole moment with which the path was planned. Of `expected`, only
+    the environment at the times of `begin` is used.
     """
     step, first = float(begin.times[1] - begin.times[0]) / FINE, float(begin.times[0])
     law = law_of(target, axes, path.quaternion[-1], ahead, first + path.horizon)
@@ -197,7 +195,8 @@ def slew_table(
     times = np.asarray(first + step * np.arange(FINE * begin.kept + 1), dtype=float)
     wanted = references(law, ahead, times)
     flown = path.references(times[:count] - first)
-    dipole = path.dipoles(times[:count] + 0.5 * step - first) + residual  # the pointing law subtracts it
+    # The pointing law subtracts the residual dipole moment again.
+    dipole = path.dipoles(times[:count] + 0.5 * step - first) + residual
     stop = count + round(TAIL / step)
     tracked = _joined(flown, wanted.until(stop + 1))
     gain, torque_part = _tracking(tracked, ahead, dipole, begin, weights)
@@ -214,7 +213,7 @@ def slew_table(
 
 
 def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeReferences:
-    """Return a path at `times` (n,) s from the instant `count` on; earlier instants are not used."""
+    """Return a path interpolated at `times` (n,) s; the first `count` instants are placeholders."""
     rest = [path.at(float(time)) for time in times[count:]]
     whole = [*[rest[0]] * count, *rest]
     return AttitudeReferences(
@@ -226,7 +225,7 @@ def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeR
 
 
 def _joined(first: AttitudeReferences, then: AttitudeReferences) -> AttitudeReferences:
-    """Return `then` with its first instants replaced by `first`."""
+    """Return the motion `then` with its first instants replaced by those of `first`."""
     count = len(first.times)
     return AttitudeReferences(
         then.times,
@@ -243,7 +242,7 @@ def _tracking(
     begin: SlewStart,
     weights: PointingWeights,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the gains (n, 3, 6) along the dipoles (n, 3), and the dipoles per torque size (n, 3, sizes)."""
+    """Return the tracking gains (n, 3, 6), and the dipole moments per torque size (n, 3, sizes)."""
     count, steps = len(dipole), len(tracked.times) - 1
     times, step = tracked.times[:steps], float(tracked.times[1] - tracked.times[0])
     planned = np.concatenate([dipole, np.zeros((steps - count, 3))])
@@ -264,7 +263,7 @@ def _tracking(
 
 @dataclass(frozen=True, slots=True)
 class TableSpan:
-    """Durations of the prediction and of the stored table, and the step of the table, s."""
+    """Durations of the prediction (`preview`) and of the table (`kept`), and the step of the table, s."""
 
     preview: float
     kept: float
@@ -272,20 +271,19 @@ class TableSpan:
 
 
 STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
-"""Spans of the tables for lasting goals, and for a passing object."""
+"""Durations of tables for lasting goals, and for a passing object."""
 LEAD = 2.0
-"""Time (s) from the state to the start of the table."""
+"""Time (s) from the estimated state to the start of the table, in which the table is computed."""
 FAR = math.radians(15.0)
-"""Angle (rad) from the law above which the body approaches it by a slew of minimum heat, if slews are
-configured."""
+"""Angle (rad) from the attitude law above which the body slews to the law, if slews are configured."""
 WAY = 4.0
-"""Duration of the initial guess of the approach to the law, in time scales of the law. The path found does
-not depend on it."""
+"""Duration of the initial guess of the approach, in time constants of the pointing law. The optimised path
+does not depend on this duration."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectDirection:
-    """The direction (3,) of an object at `since` s after a job's origin, ICRS.
+    """The direction (3,) of an object, ICRS, at the time `since` (s after a job's origin).
 
     `velocity` (3,) 1/s is the relative velocity divided by the distance; zero for a fixed direction.
     """
@@ -296,20 +294,20 @@ class ObjectDirection:
 
     @property
     def span(self) -> TableSpan:
-        """The span of the object's tables."""
+        """Durations of the object's prediction and tables."""
         return PASSING if self.velocity.any() else STEADY
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingJob:
-    """A job: the state of the orbit, attitude (4,) and rate (3,) rad/s at `origin_ns`, ICRS and body axes.
+    """A planning job from the orbit state, the attitude (4,) and the body rate (3,) rad/s at `origin_ns`.
 
     Attributes:
         inertia: (3, 3) kg m^2.
-        sizes: (9,) N m of the torques.
-        limit: A m^2 of each coil, mean.
-        slew: parameters of slews; None if the body approaches the law without a slew.
-        sight: the object to point to instead of the target; None for the target.
+        sizes: estimated sizes (9,) of the disturbance torques, N m.
+        limit: mean dipole limit of a coil, A m^2.
+        slew: parameters of slews, or None if the body always approaches the law without a slew.
+        sight: the sighted object to which to point instead of `target`; None for the target.
     """
 
     number: int
@@ -333,14 +331,15 @@ class PointingJob:
 
 
 def prepare() -> None:
-    """Import the modules that plan slews; the worker does so before its first job."""
+    """Import the modules that plan slews, as the worker does before its first job."""
     from scipy.linalg import lapack  # noqa: F401, PLC0415 - the control process names the job, and needs none
 
 
 def run(job: PointingJob) -> PointingTable:
-    """Return the table, its times in s after the origin; takes one second, or two from far off the law.
+    """Return the table, whose times are in seconds after the job's origin.
 
-    Raises FlightError if the field is not known, UsageError if the law has no attitude.
+    The computation takes about one second, or two with a slew. Raises FlightError if the magnetic field is
+    unknown, and UsageError if the law does not define an attitude.
     """
     span = job.span
     ahead = predict(job.orbit, span.preview + 4.0 * STEADY.step)
@@ -353,7 +352,7 @@ def run(job: PointingJob) -> PointingTable:
     else:
         law = following(axis, sight.direction, sight.velocity, sight.since, quaternion).attitudes
     field, wanted = ahead.field_at(times), references(law, ahead, times)
-    # The duration of the initial guess: WAY times the time scale given by the weights.
+    # The initial guess lasts WAY times the time constant that follows from the weights.
     strength, inertia = float(np.mean(np.linalg.norm(field, axis=1))), float(np.diag(job.inertia).max())
     square = strength * job.weights.dipole / (inertia * job.weights.turn)
     seconds = min(max(WAY / math.sqrt(square), 10.0 * span.step), span.kept)

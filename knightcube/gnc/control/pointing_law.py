@@ -1,9 +1,9 @@
-"""The pointing law: from an estimate and a table of gains to a dipole, and the recovery of a body far off.
+"""The pointing law, which computes a dipole moment from a table of gains, and the recovery from large errors.
 
-The law is linear in small rotations. If the law led a light body back from far off, its coils would follow
-the path at their limits and make the body rotate faster than before. A body that leaves its path is therefore
-planned for again, and a body far off is first damped until it is slow. Damping cannot accelerate the body:
-its torque is the component of -2 w J rate normal to the field, which removes energy in any attitude.
+The law is linear in small rotations. With a large error, the law would saturate the coils and could make a
+light body rotate faster than before. A new path is therefore planned for a body that leaves its path. A body
+far from its path is first damped until its rate is low. The damping torque is the component of -2 w J rate
+normal to the field, which removes energy in any attitude.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
 
 LARGEST_ROTATION = math.radians(20.0)
-"""Largest rotation error (rad); a larger one is shortened, because the law is linear in small rotations."""
+"""Largest rotation error (rad) used by the law; larger errors are reduced, because the law is linear."""
 LARGEST_RATE = math.radians(1.0)
-"""Largest rate error (rad/s); a larger one is shortened."""
+"""Largest rate error (rad/s) used by the law; larger errors are reduced to it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,9 +35,9 @@ class PointingCommand:
     """A command of the pointing law.
 
     Attributes:
-        dipole: (3,) A m^2, within the limit.
-        rotation: (3,) rad, rotation error of the body relative to the reference.
-        rate: (3,) rad/s, rate error of the body relative to the reference.
+        dipole: dipole moment (3,) within the coils' limit, A m^2.
+        rotation: rotation vector (3,) from the reference attitude to the body, rad.
+        rate: rate (3,) of the body relative to the reference, rad/s.
     """
 
     dipole: FloatArray
@@ -46,25 +46,25 @@ class PointingCommand:
 
 
 class PointingLaw:
-    """Computes dipoles from a table; stateless apart from the table."""
+    """The feedback law that computes dipole moments from a pointing table."""
 
     def __init__(self, table: PointingTable, limit: float) -> None:
-        """Use `table` with coils of `limit` A m^2 each."""
+        """Create the law for a table and the dipole limit (A m^2) of each coil."""
         self._table = table
         self._limit = limit
 
     @property
     def span(self) -> tuple[float, float]:
-        """First and last time of the table, s; the gains of the last revolution have less preview."""
+        """First and last time of the table, s."""
         times = self._table.path.times
         return float(times[0]), float(times[-1])
 
     def reference(self, time: float) -> AttitudeReference:
-        """Return the path at a time, s, clamped to the times of the table."""
+        """Return the planned motion at a time (s), which is clamped to the times of the table."""
         return self._table.path.at(time)
 
     def wanted(self, time: float) -> AttitudeReference:
-        """Return the attitude law at a time, s, clamped to the times of the table."""
+        """Return the motion commanded by the attitude law at a time (s), clamped to the table's times."""
         return self._table.wanted.at(time)
 
     def command(
@@ -76,24 +76,25 @@ class PointingLaw:
         residual_dipole: FloatArray,
         sizes: FloatArray,
     ) -> PointingCommand:
-        """Return the command at `time` s for an attitude (4,) and a rate (3,) rad/s.
+        """Return the command at a time (s) for an estimated attitude (4,) and rate (3,) rad/s.
 
-        `field` (3,) T is in body axes. `residual_dipole` (3,) A m^2 and `sizes` (n,) of the torques are the
-        estimated disturbances: the dipole is cancelled at once, the torques as the field allows.
+        `field` (3,) T is in body axes. The estimated residual dipole moment `residual_dipole` (3,) A m^2 is
+        cancelled directly. The effects of disturbance torques of the estimated `sizes` (n,) are reduced as
+        far as the field allows.
         """
         wanted = self.reference(time)
         rotation = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
-        # Both rates in body axes: for a large rotation error they differ from the reference's axes.
+        # Both rates are expressed in body axes, which differ from the reference axes by the rotation error.
         missed = rate - attitude_matrix(from_rotation_vector(rotation)) @ wanted.rate
         cut_rotation, cut_rate = _cut(rotation, LARGEST_ROTATION), _cut(missed, LARGEST_RATE)
-        # The rate error of the table is the difference of components in the axes of each.
+        # The gains expect the difference of the rates' components, each rate in its own axes.
         error = np.concatenate([cut_rotation, cut_rate - np.cross(cut_rotation, wanted.rate)])
         k, table = self._table.path.position(time)[0], self._table
         beyond = sizes - table.sizes
         pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond
-        # A dipole along the field makes no torque.
+        # The component of the dipole moment along the field is removed, because it causes no torque.
         dipole = field * (float(field @ pull) / float(field @ field)) - pull - residual_dipole
-        # Scaled as a whole, so that the direction of the torque is kept.
+        # All coils are scaled by one factor, which preserves the direction of the torque.
         largest = float(np.abs(dipole).max())
         limited = dipole if largest <= self._limit else dipole * (self._limit / largest)
         return PointingCommand(limited, rotation, missed)
@@ -105,26 +106,25 @@ def _cut(vector: FloatArray, longest: float) -> FloatArray:
 
 
 FAR = math.radians(15.0)
-"""Deviation (rad) from the path beyond which a body is damped."""
+"""Deviation (rad) from the path above which the body is damped."""
 LEAVING = math.radians(5.0)
-"""Deviation (rad) from the path beyond which a new path is planned, because the torques are not as
-predicted."""
+"""Deviation (rad) from the path above which a new path is planned."""
 SLOW = math.radians(0.1)
-"""Rate (rad/s) below which a body is slow; the orbital rate is 0.06 deg/s."""
+"""Rate (rad/s) below which the damping ends; the orbital rate is 0.06 deg/s."""
 DAMPING_TIMEOUT = 180.0
-"""Time (s) after which a path is planned although the body is not slow: the momentum along the field takes a
-quarter of an orbit."""
+"""Time (s) after which the damping ends although the rate is not low. Momentum along the field could be
+removed only within a quarter of an orbit."""
 DAMPING = 0.01
-"""Bandwidth w of the damping, rad/s."""
+"""Bandwidth w of the damping torque, rad/s."""
 
 
 class PathRecovery:
-    """Decides between path following and damping.
+    """The decision between path following and damping.
 
     Attributes:
-        since: start of the damping, s; None while the path is flown.
+        since: start time of the damping, s, or None while the body follows the path.
         ready: whether a new path may be planned.
-        leaving: whether a new path should be planned although the path is still flown.
+        leaving: whether a new path should be planned while the body still follows the old path.
     """
 
     def __init__(self) -> None:
@@ -132,20 +132,20 @@ class PathRecovery:
         self.ready = self.leaving = False
 
     def update(self, off: float, speed: float, now: float) -> None:
-        """Update with the deviation from the path, rad, and the rate, rad/s, at a time, s."""
+        """Update the decision with the deviation from the path (rad), the rate (rad/s) and the time (s)."""
         if self.since is None and off > FAR:
             self.since = now
         self.leaving = self.since is None and off > LEAVING
         self.ready = self.since is not None and (speed < SLOW or now - self.since > DAMPING_TIMEOUT)
 
     def planned(self) -> None:
-        """Return to path following after a new plan."""
+        """Return to path following, because a new path was planned."""
         self.since, self.ready, self.leaving = None, False, False
 
 
 def damping_dipole(inertia: FloatArray, rate: FloatArray, field: FloatArray) -> FloatArray:
     """Return the dipole (3,) A m^2 that damps a rate (3,) rad/s in a field (3,) T, body axes.
 
-    `inertia` (3,) kg m^2 of the body axes.
+    `inertia` (3,) kg m^2 are the moments of inertia about the body axes.
     """
     return np.asarray(cross_product(field, -2.0 * DAMPING * inertia * rate) / float(field @ field))

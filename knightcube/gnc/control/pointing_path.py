@@ -1,22 +1,23 @@
-"""The optimal motion of a body from its attitude into its attitude law, by linear-quadratic sweeps.
+"""The optimal motion of a body from its attitude to its attitude law, by linear-quadratic sweeps.
 
-The errors x are the small rotation and the rate error of the body relative to a motion, in the motion's axes.
-With the field b(t) expected in these axes,
+The errors x of the body relative to a reference motion are a small rotation and a rate error, both in the
+axes of the reference motion. With the predicted field b(t) in these axes, the errors obey
 
     turn' = rate - w_r x turn,    J rate' = ([J w_r x] - [w_r x] J) rate + G turn + m x b - f,
 
-where G is the stiffness of the gravity gradient and f the torque that the motion requires in addition to the
-modelled torques. Riccati's equation is integrated backwards for the cost-to-go x^T S x / 2 + s^T x (Psiaki
-2001, J. Guid. Control Dyn. 24(2); the affine part s, a preview, is added here). The dipole m = -(K x + k) is
-held over a step. The affine parts are columns, one for each source, and k is linear in them. Other controls
-than the dipole are possible.
+where G is the stiffness of the gravity gradient and f the torque that the reference motion requires in
+addition to the modelled torques. Riccati's equation is integrated backwards for the cost-to-go x^T S x / 2 +
+s^T x (Psiaki 2001, J. Guid. Control Dyn. 24(2); the affine part s, a preview, is added here). The dipole
+moment m = -(K x + k) is constant during a step. The affine part of the error model has one column per source,
+and so has k, which is linear in the affine part. The sweep also supports other controls than the dipole
+moment.
 
-The path minimises the squared rotation error relative to the law plus the squared dipole, in the predicted
-field and torques. It obeys the full equations of motion and the limit of the coils. It is found by iterative
-linear-quadratic sweeps (Li & Todorov 2004, ICINCO; Tassa, Erez & Todorov 2012, IROS). Each iteration
-linearises about the last motion and simulates the result. Coils make no torque along the field, so that
-motions starting far from the law would tumble. The first sweeps therefore allow a torque along the field, at
-a cost that is increased until the torque vanishes.
+The path minimises the squared rotation error relative to the law plus the squared dipole moment, in the
+predicted field and torques. The path obeys the full equations of motion and the limit of the coils. The path
+is found by iterative linear-quadratic sweeps (Li & Todorov 2004, ICINCO, and Tassa, Erez & Todorov 2012,
+IROS). Each iteration linearises the equations about the last motion and simulates the result. Because coils
+cause no torque along the field, the first iterations from a large error would give tumbling motions. The
+first sweeps therefore allow a torque along the field, at a cost that is increased until this torque vanishes.
 """
 
 from __future__ import annotations
@@ -47,15 +48,14 @@ _EYE6: FloatArray = np.eye(6)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearErrorModel:
-    """The linear model of the errors over n steps.
+    """The linear model of the attitude and rate errors over n steps.
 
     Attributes:
         transition: (n, 6, 6).
-        by_control: (n, 6, controls); from `linearised` per A m^2 of each coil.
-        by_torque: (n, 6, 3), per N m.
-        missing: (n, 3) N m, the torque f of the module's docstring, which the modelled torques do not
-            provide.
-        field: (n, 3) T in the motion's axes.
+        by_control: change of the errors (n, 6, controls) per control, such as per A m^2 of each coil.
+        by_torque: change of the errors (n, 6, 3) per N m of torque in each axis.
+        missing: torque f (n, 3) that the reference motion requires in addition to the modelled torques, N m.
+        field: magnetic field (n, 3) in the axes of the reference motion, T.
     """
 
     transition: FloatArray
@@ -72,7 +72,7 @@ class SweepCost:
     Attributes:
         state: (n, 6, 6).
         control: (n, controls).
-        state_slope, control_slope: (n, 6, columns) and (n, controls, columns).
+        state_slope, control_slope: linear weights (n, 6, columns) and (n, controls, columns).
     """
 
     state: FloatArray
@@ -83,7 +83,7 @@ class SweepCost:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CostToGo:
-    """The cost-to-go: its quadratic part `square` (6, 6) S and its linear part `slope` (6, columns) s."""
+    """The cost-to-go, with the quadratic part `square` (6, 6) and the linear part `slope` (6, columns)."""
 
     square: FloatArray
     slope: FloatArray
@@ -97,11 +97,12 @@ def linearised(
     dipole: FloatArray | None = None,
     pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> LinearErrorModel:
-    """Return the linear model of the errors about references.
+    """Return the linear model of the errors relative to a reference motion.
 
-    `field` (n, 3) T and `position` (n, 3) m are in ICRS axes. `dipole` (n, 3) A m^2 is held in body axes, so
-    that an error rotates the field that acts on it. Each element of `pressed` is a constant vector (3,) of
-    the body, N m, and a direction (n, 3) in ICRS axes; their cross product is a torque.
+    `field` (n, 3) T and `position` (n, 3) m are in ICRS axes. The dipole moment `dipole` (n, 3) A m^2 is
+    fixed in body axes, so its torque depends on the rotation error. Each element of `pressed` is a torque by
+    air or sunlight, as a vector (3,) in body axes (N m) and a direction (n, 3) in ICRS axes whose cross
+    product is the torque.
     """
     rate, inverse = references.rate, np.linalg.inv(inertia)
     slopes, shown, up = acceleration_slopes(
@@ -126,10 +127,10 @@ def acceleration_slopes(
     dipole: FloatArray | None = None,
     pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return derivatives (n, 3, 6) of the accelerations by rotation and rate, and field and position.
+    """Return the derivatives (n, 3, 6) of the angular accelerations by rotation and rate.
 
-    The motion has attitudes (n, 4) and rates (n, 3) rad/s; the other arguments are those of `linearised`.
-    Field and position (n, 3) are returned in body axes.
+    Also return field and position (n, 3) in body axes. The motion has attitudes (n, 4) and rates (n, 3)
+    rad/s; the other arguments are those of `linearised`.
     """
     turned, inverse = attitude_matrix(quaternion), np.linalg.inv(inertia)
     shown, up = (np.einsum("nij,nj->ni", turned, vectors) for vectors in (field, position))
@@ -148,10 +149,10 @@ def acceleration_slopes(
 def sweep(
     linear: LinearErrorModel, affine: FloatArray, cost: SweepCost, end: CostToGo
 ) -> tuple[FloatArray, FloatArray, CostToGo]:
-    """Return K (n, controls, 6), k (n, controls, columns) and the cost-to-go at the start.
+    """Return the gains K (n, controls, 6) and k (n, controls, columns), and the cost-to-go at the start.
 
-    `affine` (n, 6, columns) is the affine part of the error model; `end` is the cost-to-go after the steps.
-    Takes 0.1 ms per step.
+    `affine` (n, 6, columns) is the affine part of the error model. `end` is the cost-to-go after the last
+    step. Takes 0.1 ms per step.
     """
     (count, controls), columns = cost.control.shape, affine.shape[2]
     gain, steady = np.empty((count, controls, 6)), np.empty((count, controls, columns))
@@ -172,7 +173,7 @@ def sweep(
 
 
 def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return gravity's torque (n, 3) and its derivative by the rotation (n, 3, 3).
+    """Return the gravity gradient torque (n, 3) and its derivatives (n, 3, 3) by a rotation of the body.
 
     `up` (n, 3) m is the position in body axes.
     """
@@ -186,7 +187,7 @@ def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Return exp(F dt) (n, 6, 6) and the rate columns (n, 6, 3) of its integral, to the third order."""
+    """Return exp(F dt) (n, 6, 6) and the rate columns (n, 6, 3) of its integral, to third order in dt."""
     first = flow * dt
     second = first @ first
     transition = _EYE6 + first + 0.5 * second + first @ second / 6.0
@@ -195,27 +196,27 @@ def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
 
 
 RISES = (4.0, 2.0, 10.0)
-"""Ratios between successive costs of a torque along the field. They lead to different optima and are tried in
-turn until a path settles."""
+"""Ratios between successive costs of a torque along the field. Different ratios lead to different optima and
+are tried in turn until a path settles."""
 DEAR, PROHIBITIVE = 1e4, 1e6
-"""Costs of a torque along the field, relative to the cost of the same torque across the field. DEAR ends the
-increase, and PROHIBITIVE is the cost of the last sweeps."""
+"""Costs of a torque along the field, relative to the cost of the same torque across the field. The increase
+of the cost ends at DEAR, and the last sweeps use the cost PROHIBITIVE."""
 SETTLED = math.radians(20.0)
-"""Largest angle (rad) from the law in the second half of a settled path."""
+"""Largest angle (rad) between body and law in the second half of a path that counts as settled."""
 SWEEPS = 8
-"""Largest number of sweeps at one cost of a torque along the field. The best motion is flown, converged or
-not."""
+"""Largest number of sweeps at one cost of a torque along the field. The best motion is used even if the
+sweeps have not converged."""
 SAVED = (0.05, 2e-3)
 """Relative improvement below which the sweeps at one cost of a torque along the field end. The second value
-is for the last cost."""
+is used at the last cost."""
 NEAR = math.radians(10.0)
-"""Largest angle (rad) from the law of a motion whose first sweeps need no torque along the field."""
+"""Largest angle (rad) from the law up to which the first sweeps do not need a torque along the field."""
 EXCESS = 3e-5
-"""Excess (rad/s) over the largest rate that has a cost of one."""
+"""Excess of the rate (rad/s) over its limit that has a cost of one."""
 SHARES = (1.0, 0.4, 0.15)
-"""Fractions of the change by a sweep that are tried in turn."""
+"""Fractions of the change proposed by a sweep that are tried in turn."""
 RUN_AWAY = 100.0
-"""Rate (rad/s) beyond which a diverging motion is not propagated further."""
+"""Rate (rad/s) above which a diverging motion is not propagated further."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,12 +224,12 @@ class PathConditions:
     """The commanded motion and the predicted environment at the n + 1 instants of a path.
 
     Attributes:
-        wanted: motion that the attitude law commands.
-        field, position: (n + 1, 3) T and m, ICRS.
-        pressures: pressures of air and sunlight, with which the torques vary.
-        sizes: (9,) N m, sizes of the disturbance torques.
-        inertia, inverse: (3, 3) kg m^2, and its inverse.
-        limit: A m^2, dipole limit of each coil.
+        wanted: motion commanded by the attitude law.
+        field, position: magnetic field (T) and position (m), each (n + 1, 3), ICRS.
+        pressures: pressures of air and sunlight, which determine the sizes of the torques.
+        sizes: estimated sizes (9,) of the disturbance torques, N m.
+        inertia, inverse: inertia tensor (3, 3) in body axes, kg m^2, and its inverse.
+        limit: dipole limit of each coil, A m^2.
     """
 
     wanted: AttitudeReferences
@@ -242,7 +243,7 @@ class PathConditions:
 
     @cached_property
     def around(self) -> FloatArray:
-        """Field, position, and pressures of air and sunlight, as rows (n + 1, 4, 3)."""
+        """Field, position, air pressure and sunlight pressure as rows of an array (n + 1, 4, 3)."""
         around = np.empty((len(self.field), 4, 3))
         around[:, 0], around[:, 1] = self.field, self.position
         around[:, 2], around[:, 3] = self.pressures.air, self.pressures.light
@@ -250,13 +251,13 @@ class PathConditions:
 
     @cached_property
     def twice(self) -> FloatArray:
-        """Block-diagonal matrix (6, 6) of the inertia twice, for position and rate at once."""
+        """Block-diagonal matrix (6, 6) with the inertia tensor twice, to multiply two vectors at once."""
         found: FloatArray = np.zeros((6, 6))
         found[:3, :3] = found[3:, 3:] = self.inertia
         return found
 
     def pressed(self, count: int) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the attitude-dependent torques at the first instants, as `linearised` takes them."""
+        """Return the air and sunlight torques at the first `count` instants, as arguments of `linearised`."""
         air, light = self.pressures.air[:count], self.pressures.light[:count]
         return [(self.sizes[AIR], air), (self.sizes[LIGHT], light)]
 
@@ -275,9 +276,9 @@ class PathConditions:
     def acceleration(
         self, k: int, quaternion: FloatArray, rate: FloatArray, control: FloatArray
     ) -> FloatArray:
-        """Return the acceleration (3,) at an attitude (4,) after instant k under a control (4,)."""
+        """Return the angular acceleration (3,) at an attitude (4,) after instant k under a control (4,)."""
         seen = self.around[k] @ attitude_matrix(quaternion).T
-        # Python floats are several times as fast as arrays of three elements.
+        # Python floats are used because they are several times as fast as arrays of three elements.
         (bx, by, bz), (px, py, pz), (ax, ay, az), (lx, ly, lz) = seen.tolist()
         mx, my, mz, along = control.tolist()
         wx, wy, wz = rate.tolist()
@@ -296,7 +297,7 @@ class PathConditions:
         return np.asarray(self.inverse @ np.array(torque))
 
     def accelerations(self, quaternion: FloatArray, rate: FloatArray, dipole: FloatArray) -> FloatArray:
-        """Return accelerations (n, 3) at attitudes (n, 4) after the first instants under dipoles (n, 3)."""
+        """Return angular accelerations (n, 3) at attitudes (n, 4) under dipole moments (n, 3) A m^2."""
         count = len(quaternion)
         shown = attitude_matrix(quaternion)
         field = np.einsum("nij,nj->ni", shown, self.field[:count])
@@ -312,12 +313,12 @@ class PathCriterion:
     """The terms of the cost of a step of a path.
 
     Attributes:
-        state: (6, 6) weights of rotation and rate errors relative to the law.
-        dipole: weight of the squared dipole of each axis.
-        end: cost-to-go of following the law after the path. The first column is for the law and the expected
-            torques, each further column for one size of the torques.
-        shape: (n + 1, 3, sizes) torques of unit size, in the axes of the law.
-        fastest: rad/s, rate above which the cost increases steeply, see `EXCESS`.
+        state: weights (6, 6) of rotation and rate errors relative to the law.
+        dipole: weight of the squared dipole moment of each axis.
+        end: cost-to-go of following the law after the path. Its first column is for the law and the expected
+            torques, and each further column is for the size of one disturbance torque.
+        shape: disturbance torques of unit size (n + 1, 3, sizes), in the axes of the law.
+        fastest: rate above which the cost increases steeply (see `EXCESS`), rad/s.
     """
 
     state: FloatArray
@@ -329,9 +330,9 @@ class PathCriterion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedMotion:
-    """A motion: attitudes (n + 1, 4), rates (n + 1, 3) rad/s, and controls (n, 4) held over the steps.
+    """A motion with attitudes (n + 1, 4), rates (n + 1, 3) rad/s and controls (n, 4) held over the steps.
 
-    A control is a dipole (A m^2, body axes) and a torque along the field (N m).
+    A control consists of a dipole moment (A m^2, body axes) and a torque along the field (N m).
     """
 
     quaternion: FloatArray
@@ -339,7 +340,7 @@ class PlannedMotion:
     control: FloatArray
 
     def references(self, times: FloatArray) -> AttitudeReferences:
-        """Return the motion as references at its times (n + 1,) s."""
+        """Return the motion as a reference motion, given its times (n + 1,) s."""
         rises = np.diff(self.rate, axis=0) / (times[1] - times[0])
         return AttitudeReferences(times, self.quaternion, self.rate, np.concatenate([rises, rises[-1:]]))
 
@@ -348,7 +349,7 @@ class PlannedMotion:
 class MotionGains:
     """Gains K (n, 4, 6) about a motion, and the affine part k (n, 4, columns).
 
-    The first column of k improves the motion, and each further column is for one size of the torques.
+    The first column of k improves the motion. Each further column compensates one disturbance torque.
     """
 
     gain: FloatArray
@@ -358,10 +359,11 @@ class MotionGains:
 def best_path(
     expected: PathConditions, initial: AttitudeReferences, criterion: PathCriterion
 ) -> tuple[PlannedMotion, MotionGains]:
-    """Return the path from the start of `initial` (n + 1,) and its gains; `initial` leads into the law.
+    """Return the best path from the first state of `initial` to the law, and the gains along the path.
 
-    The motion `initial` need not be feasible with coils. Takes 0.3 ms per instant and sweep. Raises
-    PlanningError if the body rotates too far in a step to be propagated.
+    The motion `initial` (n + 1,) is an initial guess that ends at the law and need not be feasible with
+    coils. The computation takes 0.3 ms per instant and sweep. Raises PlanningError if the body rotates too
+    fast to be propagated.
     """
     rest = PlannedMotion(initial.quaternion, initial.rate, np.zeros((len(initial.times) - 1, 4)))
     first = _first(expected, rest, _swept(expected, rest, criterion, 1.0, given=True))
@@ -382,11 +384,11 @@ def best_path(
 
 
 def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) -> PlannedMotion:
-    """Return the motion that the sweeps start with.
+    """Return the motion with which the sweeps start.
 
-    It is propagated with the given gains, or without control if it diverges with them. The torque along the
-    field has no limit, so that far from `rest` the gains may rotate the body by several revolutions in a
-    step.
+    The motion is propagated with the given gains, or without control if the gains make it diverge. The torque
+    along the field is not limited, so far from the motion `rest` the gains may rotate the body by several
+    revolutions in a step.
     """
     nothing = MotionGains(np.zeros_like(gains.gain), np.zeros_like(gains.steady))
     for tried in (gains, nothing):
@@ -399,7 +401,7 @@ def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) ->
 def _improved(
     expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, multiple: float
 ) -> PlannedMotion:
-    """Return the best motion near a feasible one for torques along the field at `multiple` cost."""
+    """Return the best motion near a feasible motion, for a cost `multiple` of torques along the field."""
     cost = _cost(expected, motion, criterion, multiple)
     enough = SAVED[multiple == PROHIBITIVE]
     for _ in range(SWEEPS):
@@ -418,10 +420,9 @@ def _improved(
 def propagate(
     expected: PathConditions, motion: PlannedMotion, gains: MotionGains, share: float
 ) -> PlannedMotion | None:
-    """Return the motion from the same start with a fraction `share` of the computed change, and feedback.
+    """Return the motion after applying the feedback gains and a fraction `share` of the computed change.
 
-    Returns None if the motion diverges. Far from `motion`, the unlimited torques along the field can cause
-    this.
+    Returns None if the motion diverges, which unlimited torques along the field can cause far from `motion`.
     """
     count, step = len(motion.control), expected.step
     quaternion, rate, flown = np.empty((count + 1, 4)), np.empty((count + 1, 3)), np.empty((count, 4))
@@ -448,9 +449,9 @@ def _swept(
     multiple: float,
     given: bool = False,
 ) -> MotionGains:
-    """Return the gains about a motion.
+    """Return the feedback gains about a motion.
 
-    A `given` motion need not be the result of its controls.
+    A `given` motion need not be a result of its own controls.
     """
     count, state, end = len(motion.control), criterion.state, criterion.end
     first = motion.references(expected.wanted.times).until(count)
@@ -491,7 +492,7 @@ def _swept(
 def _cost(
     expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, multiple: float
 ) -> float:
-    """Return the cost of a motion, including the cost-to-go after it."""
+    """Return the cost of a motion, including the cost-to-go at its end."""
     deviation, end = errors(expected.wanted, motion), criterion.end
     strength = np.linalg.norm(expected.field[:-1], axis=1)
     squares = np.einsum("ni,ij,nj->", deviation[:-1], criterion.state, deviation[:-1])
@@ -503,7 +504,7 @@ def _cost(
 
 
 def _haste(rate: FloatArray, fastest: float, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return slope (n, 3) and curvature (n, 3, 3) of the cost of rates (n, 3) above `fastest`, rad/s."""
+    """Return gradient (n, 3) and Hessian (n, 3, 3) of the cost of rates (n, 3) above `fastest`, rad/s."""
     speed = np.maximum(np.linalg.norm(rate, axis=1), 1e-9)
     along = rate / speed[:, None]
     excess, weight = np.maximum(speed - fastest, 0.0), step / EXCESS**2
@@ -520,17 +521,17 @@ def errors(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
 
 
 def _counted(wanted: AttitudeReferences, motion: PlannedMotion, criterion: PathCriterion) -> FloatArray:
-    """Return the rotation error (n + 1,) rad relative to the law, weighted by its cost."""
+    """Return the rotation error (n + 1,) rad relative to the law, with reduced errors about cheap axes."""
     turn, weights = errors(wanted, motion)[:, :3], criterion.state[:3, :3]
     squares = np.einsum("ni,ij,nj->n", turn, weights, turn)
     return np.asarray(np.sqrt(squares / np.linalg.eigvalsh(weights)[-1]))
 
 
 def error_jacobians(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
-    """Return the derivatives (n + 1, 6, 6) of the errors relative to the law by a small motion of the body.
+    """Return the derivatives (n + 1, 6, 6) of the errors relative to the law by small changes of the motion.
 
-    The rotation block is the inverse of the left Jacobian of the rotation group, for scalar-last quaternions
-    that rotate inertial into body axes.
+    The rotation block is the inverse left Jacobian of the rotation group, for scalar-last quaternions from
+    inertial into body axes.
     """
     turn = to_rotation_vector(multiply(motion.quaternion, conjugate(wanted.quaternion)))
     angle = np.linalg.norm(turn, axis=1)

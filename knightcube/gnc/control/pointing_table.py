@@ -1,18 +1,18 @@
-"""The table of the pointing law: the best motion over the revolution ahead, and gains along it.
+"""The table of the pointing law: the best motion over the next revolution, and feedback gains along it.
 
-The motion is found by multiple shooting, from linear-quadratic steps. Each step is shortened until it
-improves a merit function, the cost plus the weighted defects (Nocedal & Wright 2006, Numerical Optimization,
-algorithm 18.3). In contrast to the sweeps of `pointing_path`, the intermediate motions need not be feasible:
-the state to which the equations of motion propagate each instant is compared with the next instant, and the
-next step removes the defects (Bock & Plitt 1984, IFAC 9th World Congress). Errors therefore do not grow along
-a revolution. This matters, because coils make no torque about the field, and the body may rotate far about
-its pointing axis. A step takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and the
-derivatives are those of the discrete step. If a body rotates by degrees in a step, derivatives of the
-continuous motion would end at motions that no step improves.
+The motion is found by multiple shooting with linear-quadratic steps. Each step is shortened until it improves
+a merit function, the cost plus the weighted defects (Nocedal & Wright 2006, Numerical Optimization, algorithm
+18.3). In contrast to the sweeps of `pointing_path`, intermediate motions need not be feasible. The defect of
+a step is the difference between its propagated end and the next instant, and the following iterations remove
+all defects (Bock & Plitt 1984, IFAC 9th World Congress). Errors therefore do not grow along a revolution.
+Growing errors would be a problem, because coils cause no torque about the field and the body may rotate far
+about its pointing axis. An iteration takes 0.07 ms per instant. The motion is propagated by the midpoint
+rule, and the derivatives are those of the discrete rule. With derivatives of the continuous motion, the
+iteration would stall for bodies that rotate by degrees per time step.
 
-If no such motion is found, or the coils do not suffice for it, the table contains the best path of
-`pointing_path`. After the end of this path the body follows the law; a sweep over a revolution of preview
-gives the cost of an error at the end.
+If multiple shooting fails, or its motion exceeds the limit of the coils, the table contains the best path of
+`pointing_path`. At the end of this path, the cost of an error follows from a sweep along the law over one
+more revolution.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _EYE: FloatArray = np.eye(3)
 
 
 def midpoint_step(expected: PathConditions, motion: PlannedMotion) -> tuple[FloatArray, FloatArray]:
-    """Return the attitudes (n, 4) and rates (n, 3) rad/s at the end of the steps."""
+    """Return the attitudes (n, 4) and rates (n, 3) rad/s to which each step propagates its instant."""
     step, count = expected.step, len(motion.control)
     half, middle = _halfway(expected, motion)
     there = multiply(from_rotation_vector(step * middle), motion.quaternion[:count])
@@ -63,14 +63,14 @@ def midpoint_step(expected: PathConditions, motion: PlannedMotion) -> tuple[Floa
 
 
 def defects(expected: PathConditions, motion: PlannedMotion) -> FloatArray:
-    """Return the defects (n, 6): rotation and rate at the end of each step relative to the next instant."""
+    """Return the defects (n, 6): rotation and rate from the next instant to the end of each step."""
     there, speed = midpoint_step(expected, motion)
     turn = to_rotation_vector(multiply(there, conjugate(motion.quaternion[1:])))
     return np.concatenate([turn, speed - motion.rate[1:]], axis=1)
 
 
 def derivative(expected: PathConditions, motion: PlannedMotion) -> LinearErrorModel:
-    """Return the derivatives of the state after each step by the state before it, dipole and torque."""
+    """Return the derivatives of the state after each step by the previous state, dipole and torque."""
     step, count = expected.step, len(motion.control)
     q, w, dipole = motion.quaternion[:count], motion.rate[:count], motion.control
     half, middle = _halfway(expected, motion)
@@ -105,7 +105,7 @@ def _halfway(expected: PathConditions, motion: PlannedMotion) -> tuple[FloatArra
 
 
 def _pushes(inverse: FloatArray, shown: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 3, 6) of accelerations by dipole and torque in a field (n, 3), body axes."""
+    """Return the derivatives (n, 3, 6) of angular accelerations by dipole moment and torque, body axes."""
     return np.concatenate(
         [-inverse @ cross_matrices(shown), np.broadcast_to(inverse, (len(shown), 3, 3))], axis=2
     )
@@ -114,7 +114,7 @@ def _pushes(inverse: FloatArray, shown: FloatArray) -> FloatArray:
 def _rotation_jacobian(vector: FloatArray) -> FloatArray:
     """Return the derivatives (n, 3, 3) of rotations by their rotation vectors (n, 3).
 
-    They are the left Jacobian of the rotation group, for scalar-last quaternions that rotate inertial into
+    The derivatives are left Jacobians of the rotation group, for scalar-last quaternions from inertial into
     body axes.
     """
     angle = np.linalg.norm(vector, axis=1)[:, None, None]
@@ -126,32 +126,32 @@ def _rotation_jacobian(vector: FloatArray) -> FloatArray:
 
 
 STEPS = 40
-"""Maximum number of steps of multiple shooting."""
+"""Maximum number of iterations of multiple shooting."""
 FARTHEST = math.radians(30.0)
-"""Largest rotation (rad) by a step at any instant; a longer step is scaled as a whole."""
+"""Largest rotation (rad) of any attitude by an iteration; a larger change is scaled down."""
 HALVES = 6
-"""Largest number of halvings of a step."""
+"""Largest number of times that the change of an iteration is halved."""
 DEARER = 1.2
-"""Weight of the defects in the merit, as a multiple of the largest sensitivity of the cost to a defect."""
+"""Weight of the defects in the merit function, relative to the largest cost sensitivity to a defect."""
 DONE = math.radians(0.05)
-"""Largest rotation (rad) by a step after which the iteration ends. It also ends if a step improves the merit
-by less than the fraction SAVED."""
+"""Rotation (rad) by an iteration below which multiple shooting ends. Multiple shooting also ends if an
+iteration improves the merit by less than the fraction SAVED."""
 SAVED = 1e-4
 ENOUGH = 0.01
-"""Largest weighted defects of an acceptable motion, relative to its cost plus one."""
+"""Largest weighted defects of an acceptable motion, as a fraction of the motion's cost plus one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ShootingStep:
-    """A full step of multiple shooting.
+    """A full Newton-like step of multiple shooting.
 
     Attributes:
-        change: (n + 1, 6) change of rotation and rate.
-        control: (n, 3) change of the dipole.
-        gains: gains about the motion.
-        linear: linear model about the motion.
-        rotated: largest rotation by the step at any instant, rad.
-        sensitivity: (6,) largest derivative of the cost by a defect at any instant.
+        change: change (n + 1, 6) of rotation and rate.
+        control: change (n, 3) of the dipole moment, A m^2.
+        gains: feedback gains about the motion.
+        linear: linear error model about the motion.
+        rotated: largest rotation of any attitude by the step, rad.
+        sensitivity: largest derivative (6,) of the cost with respect to a defect at any instant.
     """
 
     change: FloatArray
@@ -165,11 +165,12 @@ class _ShootingStep:
 def best_course(
     expected: PathConditions, initial: AttitudeReferences, state: FloatArray, dipole: float, fastest: float
 ) -> tuple[PlannedMotion, MotionGains] | None:
-    """Return the best motion over all instants of `expected` from the start of `initial`, and its gains.
+    """Return the best motion over all instants from the first state of `initial`, with feedback gains.
 
-    `initial` (n + 1,) leads into the law and covers the part that will be flown; `state` (6, 6) and `dipole`
-    are the costs of a step (`step_costs`). None if no motion is found within `STEPS`, if it needs more dipole
-    than available, or if it rotates faster than `fastest` rad/s in the part that will be flown.
+    The initial guess `initial` (n + 1,) ends at the law and covers the part that will be flown. `state` (6,
+    6) and `dipole` are the costs of a step (`step_costs`). Returns None if no motion is found within `STEPS`
+    iterations or if the motion exceeds the limit of the coils. Returns None also if the body rotates faster
+    than `fastest` (rad/s) in the part that will be flown.
     """
     count, first = len(expected.field) - 1, len(initial.times)
     quaternion = np.concatenate([initial.quaternion, expected.wanted.quaternion[first:]])
@@ -199,7 +200,8 @@ def best_course(
 class _Merit:
     """The merit function of a motion.
 
-    `state` (6, 6) and `dipole` weight the errors and the dipole of a step, and `dear` (6,) the defects.
+    `state` (6, 6) and `dipole` weight the errors and the dipole moment of a step. `dear` (6,) weights the
+    defects.
     """
 
     expected: PathConditions
@@ -208,7 +210,7 @@ class _Merit:
     dear: FloatArray = field(default_factory=lambda: np.zeros(6))
 
     def merit(self, motion: PlannedMotion) -> tuple[float, float]:
-        """Return the cost of a motion, and the weighted defects."""
+        """Return the cost of a motion and the sum of its weighted defects."""
         deviation = errors(self.expected.wanted, motion)
         squares = float(np.einsum("ni,ij,nj->", deviation, self.state, deviation))
         squares += self.dipole * float(np.sum(motion.control**2))
@@ -216,7 +218,7 @@ class _Merit:
 
 
 def _direction(criterion: _Merit, motion: PlannedMotion) -> _ShootingStep:
-    """Return the full linear-quadratic step from a motion, and the gains about it."""
+    """Return the full linear-quadratic step from a motion."""
     expected, state, dipole = criterion.expected, criterion.state, criterion.dipole
     count, wanted, sizes = len(motion.control), expected.wanted, expected.sizes
     shown = attitude_matrix(motion.quaternion[:count])
@@ -249,7 +251,7 @@ def _direction(criterion: _Merit, motion: PlannedMotion) -> _ShootingStep:
 def _better(
     criterion: _Merit, motion: PlannedMotion, step: _ShootingStep, before: float
 ) -> PlannedMotion | None:
-    """Return the motion after the largest fraction of a step that improves the merit; None if none does."""
+    """Return the motion after the largest fraction of a step that improves the merit, or None."""
     share = min(1.0, FARTHEST / max(step.rotated, DONE))
     for _ in range(HALVES):
         moved = _moved(motion, share * step.change, share * step.control)
@@ -263,7 +265,7 @@ def _better(
 
 
 def _closed(expected: PathConditions, moved: PlannedMotion, step: _ShootingStep) -> PlannedMotion:
-    """Return a motion with smaller defects: a second-order correction after a step."""
+    """Return a motion with smaller defects, by a second-order correction after a step."""
     defect, gain = defects(expected, moved), step.gains.gain
     change, control = np.zeros((len(gain) + 1, 6)), np.empty((len(gain), 3))
     transition, push = step.linear.transition, step.linear.by_control
@@ -274,28 +276,28 @@ def _closed(expected: PathConditions, moved: PlannedMotion, step: _ShootingStep)
 
 
 def _moved(motion: PlannedMotion, change: FloatArray, control: FloatArray) -> PlannedMotion:
-    """Return a motion changed by (n + 1, 6) in rotation and rate and by (n, 3) in its dipole."""
+    """Return a motion with rotation and rate changed by `change` and the dipole moment by `control`."""
     rotated = multiply(from_rotation_vector(change[:, :3]), motion.quaternion)
     return PlannedMotion(rotated, motion.rate + change[:, 3:], motion.control + control)
 
 
 LEAST_PART = 1.0 / 3.0
-"""Minimum fraction of a table that may be flown alone; the previous table is kept if the flyable part is
-shorter."""
+"""Minimum fraction of a table that is used without the rest. If the usable part is shorter, the previous
+table is kept."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointingWeights:
-    """Weights of the errors. Each attribute is the value of an error that has a cost of one.
+    """Weights of the errors. Each weight is given as the size of an error that has a cost of one.
 
     Attributes:
-        turn: rad, rotation error about each axis.
-        rate: rad/s, rate error of each axis.
-        dipole: A m^2, dipole of each axis.
-        fastest: rad/s, rate above which the cost increases steeply, while the body approaches the law
-            (`pointing_path.EXCESS`).
-        roll: rad, rotation error about the unit vector `axis` (3,), if this rotation has a smaller weight
-            than others.
+        turn: rotation error about each axis with unit cost, rad.
+        rate: rate error about each axis with unit cost, rad/s.
+        dipole: dipole moment of each axis with unit cost, A m^2.
+        fastest: rate above which the cost increases steeply while the body approaches the law (see
+            `pointing_path.EXCESS`), rad/s.
+        roll: rotation error with unit cost about the unit vector `axis` (3,), rad, if it weighs less than
+            other rotations.
     """
 
     turn: float
@@ -308,17 +310,17 @@ class PointingWeights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingTable:
-    """A path and gains at n equally spaced instants.
+    """A planned motion with feedback gains at n equally spaced instants.
 
     Attributes:
-        path: planned motion of the body, n + 1 instants.
-        wanted: motion that the attitude law commands, n + 1 instants.
-        dipole: (n, 3) A m^2, feedforward dipole of the path, held until the next instant.
-        gain: (n, 3, 6) feedback gains K, in A m^2 per rad and per rad/s.
-        torque_part: (n, 3, sizes) A m^2/(N m), change of the dipole per change of the disturbance sizes from
-            `sizes`.
-        sizes: (sizes,) N m, sizes of the disturbance torques with which the path was planned.
-        slew: the slew that the path begins with, if any; its times count from the start of the path.
+        path: planned motion of the body at n + 1 instants.
+        wanted: motion commanded by the attitude law at n + 1 instants.
+        dipole: feedforward dipole moment (n, 3), held until the next instant, A m^2.
+        gain: feedback gains K (n, 3, 6), in A m^2 per rad and per rad/s.
+        torque_part: change of the dipole moment per change of each disturbance size (n, 3, sizes), A m^2/(N
+            m).
+        sizes: sizes of the disturbance torques with which the path was planned, N m.
+        slew: slew at the start of the path, or None; its times count from the start of the path.
     """
 
     path: AttitudeReferences
@@ -331,13 +333,15 @@ class PointingTable:
 
     @property
     def fastest(self) -> float:
-        """The largest rate of the path, rad/s."""
+        """The largest body rate along the path, rad/s."""
         return float(np.linalg.norm(self.path.rate, axis=1).max())
 
     def below(self, fastest: float) -> PointingTable | None:
-        """Return the part before the body reaches `fastest` rad/s, None if it is shorter than `LEAST_PART`.
+        """Return the part before the rate reaches `fastest`, rad/s.
 
-        A slew is flown as a whole or not at all.
+        Returns None if this part is shorter than the fraction `LEAST_PART` of the table.
+
+        A table with a slew is never shortened; it is returned whole or not at all.
         """
         over = np.flatnonzero(np.linalg.norm(self.path.rate, axis=1) >= fastest)
         if not len(over):
@@ -362,11 +366,11 @@ class PointingPreview:
 
     Attributes:
         wanted: the law.
-        initial: a motion (n + 1,) from the body's attitude and rate into the law; it need not be feasible
-            with coils.
-        field, position: (m, 3) T and m, ICRS.
-        pressures: (m,) pressures of air and sunlight.
-        sizes: (9,) N m, present estimates of the disturbance sizes.
+        initial: initial guess (n + 1,) of the motion from the body's state to the law, not necessarily
+            feasible.
+        field, position: magnetic field (T) and position (m), each (m, 3), ICRS.
+        pressures: pressures of air and sunlight at the m instants.
+        sizes: present estimates (9,) of the sizes of the disturbance torques, N m.
     """
 
     wanted: AttitudeReferences
@@ -380,10 +384,10 @@ class PointingPreview:
 def pointing_table(
     ahead: PointingPreview, inertia: FloatArray, limit: float, weights: PointingWeights
 ) -> PointingTable:
-    """Return the table from the start of `ahead.initial` to its end.
+    """Return the pointing table for the instants of `ahead.initial`.
 
-    `inertia` (3, 3) is in kg m^2, and `limit` is the dipole limit of each coil in A m^2. The preview should
-    last a revolution. Raises UsageError for times that are not equally spaced.
+    `inertia` (3, 3) is in kg m^2, and `limit` is the dipole limit of each coil in A m^2. The preview after
+    the table should cover one revolution. Raises UsageError for times that are not equally spaced.
     """
     steps = np.diff(ahead.wanted.times)
     count = len(ahead.initial.times) - 1
@@ -411,7 +415,7 @@ def pointing_table(
 
 
 def step_costs(weights: PointingWeights, dt: float) -> tuple[FloatArray, float]:
-    """Return the weights of a step of `dt` s: (6, 6) of rotation and rate errors, and one of the dipole."""
+    """Return the weights (6, 6) of the errors and the weight of the dipole moment in a step of `dt` s."""
     state = dt * np.diag(np.repeat([weights.turn**-2.0, weights.rate**-2.0], 3))
     if weights.roll is not None and weights.axis is not None:
         state[:3, :3] -= dt * (weights.turn**-2.0 - weights.roll**-2.0) * np.outer(weights.axis, weights.axis)
@@ -426,9 +430,9 @@ def _beyond(
     dipole: float,
     shape: FloatArray,
 ) -> CostToGo:
-    """Return the cost-to-go of following the law from instant `begin` on.
+    """Return the cost-to-go of following the law from the instant with index `begin` on.
 
-    Column 0 is for the expected torques.
+    Column 0 of the linear part is for the law and the expected torques.
     """
     air, light = ahead.pressures.air[begin:], ahead.pressures.light[begin:]
     pressed = [(ahead.sizes[AIR], air), (ahead.sizes[LIGHT], light)]

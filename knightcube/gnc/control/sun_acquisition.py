@@ -1,16 +1,15 @@
-"""Alignment of a body axis with the Sun by solar cells, gyro and magnetometer, without an attitude.
+"""Alignment of a body axis with the Sun by solar cells, gyro and magnetometer, without an attitude estimate.
 
 The direction of the Sun s and the field B are measured in body axes, and propagated between measurements by
-the gyro. Only the component across the field of the wanted torque J (w^2 e - 2 z w rate), e the rotation from
-the axis to the Sun, can be made (Lovera & Astolfi 2004, Automatica 40(8)). The component along the field is
-therefore cancelled by a torque about the Sun, which moves the axis off the Sun least. If the field is not
-normal to the Sun, both axes that matter are controlled at once, and the body rolls. The faster the roll, the
-less torque about the Sun is used.
-
-A Sun that is not visible is propagated through an eclipse (`PropagatedSun`); without a known Sun the body is
-only damped. The residual dipole, the largest torque on a light body, is estimated and cancelled
-(`ResidualDipole`). The coils pause while the field is measured. The coils act only after the fields of two
-consecutive pauses agree.
+the gyro. The law demands the torque J (w^2 e - 2 z w rate), where e is the rotation from the body axis to the
+Sun. The coils can produce only the component of this torque across the field (Lovera & Astolfi 2004,
+Automatica 40(8)). A torque about the direction of the Sun is therefore added to cancel the component along
+the field. This torque disturbs the pointing of the body axis least. Unless the field is normal to the Sun,
+both axes across the Sun are controlled at once, while the body may roll about the Sun. The faster the roll,
+the less torque about the Sun is used. The direction of the Sun is propagated through an eclipse
+(`PropagatedSun`). Without a known direction, the body is only damped. The residual dipole moment, which
+causes the largest torque on a light body, is estimated and cancelled (`ResidualDipole`). The coils are off
+while the field is measured. They are driven only after the fields of two consecutive pauses agree.
 """
 
 from __future__ import annotations
@@ -25,38 +24,39 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.gnc.control.detumble import WindowSchedule
 
 MEMORY = 2400.0
-"""Time (s) for which a direction is propagated: the longest eclipse of a low orbit, and some minutes."""
+"""Longest time (s) for which the Sun is propagated, which covers the longest eclipse of a low orbit."""
 SMOOTHED, DRIFT = 10.0, 6.5e-4
-"""Time (s) over which directions are averaged, and gain (rad/s^2) from a direction error to the gyro bias."""
+"""Averaging time (s) of measured directions, and gain (rad/s^2) from a direction error to the gyro bias."""
 JUMP = 0.5
-"""Sine of the smallest difference at which a measured direction replaces the propagated one."""
+"""Sine of the smallest angle from the propagated to a measured direction at which the measurement replaces
+it."""
 LARGEST_BIAS = 3e-3
-"""Largest gyro bias per axis, rad/s."""
+"""Largest estimated gyro bias per axis, rad/s."""
 LONGEST_DELAY = 0.5
-"""Longest time (s) since the last gyro reading at which propagated and measured direction are compared."""
+"""Longest age (s) of the last gyro reading at which propagated and measured direction are compared."""
 LONGEST_GAP = 3.0
 """Longest gyro gap (s) over which the direction can be propagated."""
 _SECOND = 1e-9
 
 
 class PropagatedSun:
-    """The Sun's direction in body axes, propagated by a gyro, and the gyro bias that its drift shows.
+    """An estimate of the Sun's direction in body axes and of the gyro bias.
 
-    Between measurements the gyro rotates the direction with the body. The difference from the measurements is
-    the gyro bias, except for its component about the Sun, which does not move the direction: a Sun that is no
-    longer visible can be propagated through an eclipse. This is a complementary filter (Mahony, Hamel &
-    Pflimlin 2008, IEEE Trans. Autom. Control 53(5)) of one direction.
+    Between measurements the direction is propagated with the gyro rate. The drift from the measured
+    directions gives the gyro bias, except for the bias component about the Sun, which does not move the
+    direction. The direction can therefore be propagated through an eclipse. The estimator is a complementary
+    filter of one direction (Mahony, Hamel & Pflimlin 2008, IEEE Trans. Autom. Control 53(5)).
     """
 
     def __init__(self) -> None:
         self.direction: FloatArray | None = None
-        """Direction (3,) in body axes at the last reading; None if unknown."""
+        """Direction (3,) of the Sun in body axes at the last gyro reading; None if unknown."""
         self.bias: FloatArray = np.zeros(3)
         """Gyro bias (3,), rad/s."""
         self._measured_ns = self._propagated_ns = 0
 
     def propagate(self, time_ns: int, rotation: FloatArray) -> None:
-        """Propagate the direction to `time_ns` by the body's rotation (3, 3) since the last reading."""
+        """Propagate the direction to `time_ns` by the rotation (3, 3) of the body since the last reading."""
         if self.direction is not None:
             gap = (time_ns - max(self._propagated_ns, self._measured_ns)) * _SECOND
             known = gap <= LONGEST_GAP and (time_ns - self._measured_ns) * _SECOND <= MEMORY
@@ -64,7 +64,7 @@ class PropagatedSun:
         self._propagated_ns = time_ns
 
     def measure(self, time_ns: int, sun: FloatArray) -> None:
-        """Accept the direction (3,) of the Sun, body axes, measured at a time just past."""
+        """Accept a direction (3,) of the Sun in body axes, measured a short time ago."""
         predicted, since = self.direction, (time_ns - self._measured_ns) * _SECOND
         if (time_ns - self._propagated_ns) * _SECOND > LONGEST_DELAY:
             predicted = None
@@ -80,35 +80,35 @@ class PropagatedSun:
 
 
 RATE_GAIN, DIPOLE_GAIN = 0.1, 8e-4
-"""Gains of the residual dipole observer, 1/s and 1/s^2: time constants of ten seconds and two minutes."""
+"""Gains (1/s and 1/s^2) of the residual dipole observer, for time constants of 10 s and 2 min."""
 LONGEST_INTERVAL = 1.0
-"""Longest time (s) between readings; after a longer one the observer restarts from the measured rate."""
+"""Longest gap (s) between readings; after a longer gap the observer restarts from the measured rate."""
 
 
 class ResidualDipole:
-    """The residual dipole of a body, from its rate under the known torque of the coils in a measured field.
+    """An estimate of the residual dipole moment from the body rate, the measured field and the coils' dipole.
 
-    A Luenberger observer: the rate by coils and residual dipole follows the measured one, and the difference
-    is attributed to a dipole across the field. The component along the field becomes observable when the
-    field rotates in body axes. Torques of gravity and air across the field are attributed to the dipole too,
-    and are cancelled with it.
+    A Luenberger observer predicts the rate from the dipole moments of coils and body and follows the measured
+    rate. The difference is attributed to a residual dipole moment across the field. The component along the
+    field becomes observable when the field rotates in body axes. Torques of gravity and air across the field
+    are also attributed to the dipole moment, and are cancelled with it.
     """
 
     def __init__(self, inertia: FloatArray, bound: float) -> None:
-        """Use the moments (3,) kg m^2 about the body axes; `bound` A m^2 limits the dipole per axis."""
+        """Create an observer for moments of inertia (3,) kg m^2; `bound` (A m^2) limits each component."""
         self._inertia, self._bound = inertia, bound
         self._rate: FloatArray | None = None
         self.dipole: FloatArray = np.zeros(3)
-        """Residual dipole (3,) A m^2, body axes."""
+        """Residual dipole moment (3,) in body axes, A m^2."""
 
     def restart(self) -> None:
-        """Keep the dipole and start from the next rate."""
+        """Restart the predicted rate at the next measured rate, but keep the estimated dipole moment."""
         self._rate = None
 
     def follow(self, seconds: float, rate: FloatArray, field: FloatArray, coils: FloatArray) -> None:
-        """Accept a rate (3,) rad/s, `seconds` after the last one.
+        """Accept a rate (3,) rad/s measured `seconds` after the previous rate.
 
-        In between the dipole `coils` (3,) A m^2 acted in the field (3,) T.
+        `coils` (3,) A m^2 is the dipole moment of the coils in that interval, and `field` (3,) T the field.
         """
         square = float(field @ field)
         if self._rate is None or seconds > LONGEST_INTERVAL or square == 0.0:
@@ -122,21 +122,21 @@ class ResidualDipole:
 
 
 AGREES = 0.2
-"""Largest relative difference of the fields of two pauses, after correction for the rotation between them."""
+"""Largest relative difference between the fields of two pauses, after propagation by the body's rotation."""
 ROLL = 150.0
-"""Ratio of the cost of other torques to that of a torque about the Sun."""
+"""Cost of torques about other axes relative to the cost of a torque about the Sun."""
 FASTEST, FASTEST_ACROSS = 0.0165, 0.010
-"""Total rate, and rate across the Sun (rad/s), above which the body is only damped; lower than the rates at
-which the flight mode detumbles."""
+"""Total rate and rate across the Sun (rad/s) above which the body is only damped. Both are lower than the
+rates above which the flight software detumbles."""
 FASTEST_ROLL = 0.0105
-"""Rate (rad/s) about the Sun above which a torque about the Sun is no longer preferred."""
+"""Roll rate (rad/s) about the Sun above which a torque about the Sun is no longer preferred."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
-"""Bandwidth w (rad/s) and damping z of the law. At one radian from the Sun the law uses at most `SHARE` of
-the coils' torque."""
+"""Bandwidth w (rad/s) and damping ratio z of the law. At one radian from the Sun the law uses at most the
+fraction `SHARE` of the coils' torque."""
 RESIDUAL = 0.05
-"""Largest residual dipole, as a fraction of the coils' limit."""
+"""Largest estimated residual dipole moment, as a fraction of the coils' limit."""
 _FIELD = 3e-5
-"""Field strength in a low orbit, T."""
+"""Typical field strength in a low orbit, T."""
 _NO_DIPOLE: FloatArray = np.zeros(3)
 
 
@@ -145,9 +145,9 @@ class SunAcquisitionSettings:
     """Settings of Sun acquisition.
 
     Attributes:
-        inertia: (3,) kg m^2 of the body axes.
-        axis: (3,) body axis to align with the Sun.
-        limit: A m^2 of each coil.
+        inertia: moments of inertia (3,) about the body axes, kg m^2.
+        axis: unit vector (3,) of the body axis to align with the Sun.
+        limit: dipole limit of each coil, A m^2.
     """
 
     inertia: FloatArray
@@ -156,15 +156,15 @@ class SunAcquisitionSettings:
 
     @property
     def speed(self) -> float:
-        """Bandwidth w of the law, rad/s."""
+        """Bandwidth w of the law for this body, rad/s."""
         return min(BANDWIDTH, math.sqrt(SHARE * self.limit * _FIELD / float(self.inertia.max())))
 
 
 class SunAcquisition:
-    """Estimates Sun and field and computes the dipole.
+    """The Sun acquisition with its estimates of Sun, field and residual dipole moment.
 
-    It takes each reading of the inertial unit and each direction of the Sun, and returns the dipole of each
-    cycle, in order of time.
+    It accepts the readings of the inertial unit and the directions of the Sun in order of time, and returns
+    the dipole moment of each cycle.
     """
 
     def __init__(self, schedule: WindowSchedule, seeking: SunAcquisitionSettings) -> None:
@@ -184,7 +184,7 @@ class SunAcquisition:
 
     @property
     def field(self) -> FloatArray | None:
-        """Field (3,) T in body axes at the last reading; None before it is known."""
+        """Magnetic field (3,) in body axes at the last reading, T; None before it is known."""
         return self._field
 
     @property
@@ -197,11 +197,11 @@ class SunAcquisition:
         self._sun.measure(time_ns, sun)
 
     def acts(self, dipole: FloatArray) -> None:
-        """Report a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
+        """Set the dipole moment (3,) A m^2 that acts instead of the commanded one until the next command."""
         self._acts = dipole
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,) T and a gyro rate (3,) rad/s of `time_ns`; the field is used in pauses only."""
+        """Accept a gyro rate (3,) rad/s and a field (3,) T, which is used only in pauses of the coils."""
         if time_ns <= self._time_ns or not np.all(np.isfinite(np.concatenate([field, rate]))):
             return
         rate = rate - self._sun.bias
@@ -220,7 +220,7 @@ class SunAcquisition:
             self._close(rotated)
 
     def dipole(self, now_ns: int) -> FloatArray:
-        """Return the dipole (3,) A m^2 now: zero while the field is measured or unknown."""
+        """Return the present dipole moment (3,) A m^2, zero while the field is measured or unknown."""
         schedule, seeking, field = self._schedule, self._seeking, self._field
         phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
         if phase_ns < schedule.settle_ns + schedule.measure_ns or field is None or not self._agrees:
@@ -232,7 +232,7 @@ class SunAcquisition:
         return self._acts
 
     def _torque(self, field: FloatArray) -> FloatArray:
-        """Return the commanded torque (3,) N m in a field (3,) T, normal to it while the Sun is tracked."""
+        """Return the commanded torque (3,) N m, which is normal to the field while the Sun is tracked."""
         seeking, sun, rate = self._seeking, self._sun.direction, self._rate
         speed = seeking.speed
         torque: FloatArray = -2.0 * DAMPING * speed * seeking.inertia * rate
@@ -242,13 +242,13 @@ class SunAcquisition:
         if square > FASTEST**2 or square - roll**2 > FASTEST_ACROSS**2:
             return torque
         torque = torque + speed**2 * seeking.inertia * _rotation_to_sun(seeking.axis, sun)
-        # Cancel the component along the field by a torque about the Sun, which disturbs the axis least.
+        # A torque about the Sun cancels the component along the field, because it disturbs the axis least.
         cheap = 1.0 + (ROLL - 1.0) * math.exp(-((roll / FASTEST_ROLL) ** 2))
         spread = field + (cheap - 1.0) * float(sun @ field) * sun
         return torque - spread * (float(field @ torque) / float(field @ spread))
 
     def _close(self, rotated: FloatArray) -> None:
-        """End a pause: the median of its samples is the field, which is robust to single outliers."""
+        """End a pause, and estimate the field as the median of its samples, which is robust to outliers."""
         found = np.median([rotated @ sample for sample in self._samples], axis=0)
         self._samples = []
         strength = math.sqrt(float(found @ found))
@@ -261,7 +261,7 @@ class SunAcquisition:
 
 
 def _rotation_to_sun(axis: FloatArray, sun: FloatArray) -> FloatArray:
-    """Return the rotation vector (3,), at most one radian, from an axis to the Sun, both unit vectors."""
+    """Return the rotation vector (3,) from an axis to the Sun, shortened to at most one radian."""
     across = cross_product(axis, sun)
     sine = math.sqrt(float(across @ across))
     cosine = float(axis @ sun)
