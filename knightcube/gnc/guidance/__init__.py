@@ -1,1 +1,1 @@
-"""Guidance: from a state estimate to an energy-optimal path, and which path is flown."""
+"""Guidance: planning of energy-optimal paths from a state estimate, and selection of the path to follow."""

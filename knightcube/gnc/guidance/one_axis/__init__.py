@@ -1,1 +1,1 @@
-"""Guidance about one axis: virtual motion camouflage in q2 (Sease 2013, 5.8-5.15)."""
+"""Guidance about one axis by virtual motion camouflage in q2 (Sease 2013, eqs. (5.8) to (5.15))."""

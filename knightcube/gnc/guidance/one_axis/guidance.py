@@ -24,11 +24,11 @@ from knightcube.gnc.guidance.one_axis.vmc import StepPlan
 
 _CHECKED_POINTS = 600
 _SAME = 1e-6
-"""Largest difference between the end of a path and the target, in q2 and in rad/s."""
+"""Largest accepted difference between the end of a path and the target, in q2 and in rate (rad/s)."""
 
 
 class GuidanceState(StrEnum):
-    """The result of `PathGuidance.sample`: a path under way, a held attitude, or none yet."""
+    """The kind of motion that `PathGuidance` commands: a path, a held attitude, or none yet."""
 
     NONE = "none"
     FOLLOWING = "following"
@@ -40,10 +40,10 @@ class AcceptanceRules:
     """The conditions for the acceptance of a plan.
 
     Attributes:
-        late_after: s from its origin to its arrival.
-        angle_tolerance: rad, between its start and the estimate at its origin.
-        rate_tolerance: rad/s, between its start and the estimate at its origin.
-        q2_limit: bound of |q2|; an overshoot of 1e-3 of it is accepted.
+        late_after: longest accepted time from a plan's origin to its arrival, s.
+        angle_tolerance: largest difference between the start angle of a plan and the estimated angle, rad.
+        rate_tolerance: largest difference between the start rate of a plan and the estimated rate, rad/s.
+        q2_limit: upper bound of |q2|; a relative excess of 1e-3 is accepted.
         current_excess: largest relative excess over the plant's current limit anywhere on the path.
     """
 
@@ -70,12 +70,12 @@ class PlanVerdict:
 
 
 class PathGuidance:
-    """Follows accepted paths towards the current target."""
+    """The guidance that follows accepted paths towards the current target."""
 
     def __init__(self, plant: SingleAxisPlant, rules: AcceptanceRules, arrives: bool = True) -> None:
-        """Check plans for `plant` and its limits.
+        """Create a guidance that checks plans against `plant` and the limits.
 
-        `arrives` states that paths end at the target and hold it. On a receding horizon (`arrives` false) a
+        With `arrives`, paths must end at the target, which is then held. Without it, on a receding horizon, a
         path that ends means that later plans are missing.
         """
         self._plant = plant
@@ -94,7 +94,7 @@ class PathGuidance:
 
     @property
     def path(self) -> PolynomialPath | None:
-        """The path being followed or held; None without one."""
+        """The path that is followed or whose end is held; None without one."""
         return self._path
 
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
@@ -111,7 +111,7 @@ class PathGuidance:
         self._aimed_ns = now_ns
 
     def hold(self, angle: float, now_ns: int) -> None:
-        """Hold `angle` rad from now on; plans made earlier than now are then out of order.
+        """Hold an angle (rad) from now on, and reject plans that were made earlier.
 
         Raises UsageError when the angle is not finite.
         """
@@ -121,7 +121,7 @@ class PathGuidance:
         self._planned_ns = now_ns - 1
 
     def release(self) -> None:
-        """Drop the path; none is followed until the next accepted plan or hold."""
+        """Stop following a path until the next accepted plan or the next call of `hold`."""
         self._path = None
         self._planned_ns = None
 
@@ -136,8 +136,8 @@ class PathGuidance:
     ) -> PlanVerdict:
         """Follow `plan` from `origin_ns` if it satisfies the acceptance rules.
 
-        The estimates are in rad and rad/s at its origin; the current limit is checked under `disturbance` in
-        rad/s^2.
+        The estimated angle (rad) and rate (rad/s) are those at the origin of the plan. The current limit is
+        checked for the estimated `disturbance` (rad/s^2).
         """
         reason = (
             self._untimely(origin_ns, now_ns)
@@ -156,17 +156,17 @@ class PathGuidance:
         return None if self._path is None else self._path.sample(now_ns)
 
     def state(self, now_ns: int) -> GuidanceState:
-        """Return whether a path is being followed or its end held now."""
+        """Return whether a path is being followed or the end of a path is held now."""
         if self._path is None:
             return GuidanceState.NONE
         return GuidanceState.HOLDING if self._path.has_ended(now_ns) else GuidanceState.FOLLOWING
 
     def is_following(self, now_ns: int) -> bool:
-        """Return whether a path is under way, rather than its end held."""
+        """Return whether a path is being followed that has not ended."""
         return self.state(now_ns) is GuidanceState.FOLLOWING
 
     def is_adrift(self, now_ns: int) -> bool:
-        """Return whether an attitude other than the target is held because no plan came in time."""
+        """Return whether another attitude than the target is held because no plan arrived in time."""
         if self._path is None or not self._path.has_ended(now_ns):
             return False
         if not self._arrives:
@@ -175,7 +175,7 @@ class PathGuidance:
         return not self._reaches_target(self._path) and waited > self._rules.late_after
 
     def remains(self, now_ns: int) -> PolynomialPath | None:
-        """Return the path under way to the target, its origin relative to `now_ns`; None without one."""
+        """Return the path that is being followed, with its origin relative to `now_ns`; None without one."""
         path = self._path
         if path is None or path.has_ended(now_ns) or not self._reaches_target(path):
             return None
@@ -208,7 +208,7 @@ class PathGuidance:
     def _unflyable(self, path: PolynomialPath, plant: SingleAxisPlant) -> str:
         if not (math.isfinite(path.horizon) and path.horizon > 0.0):
             return f"not finite: its horizon is {path.horizon} s"
-        # Just inside the end: at the end itself the hold has begun.
+        # The check is made just before the end, because the hold begins at the end itself.
         times = path.horizon * np.linspace(0.0, 1.0 - 1e-12, _CHECKED_POINTS)
         angle, rate, acceleration = path.motion(times)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):

@@ -1,22 +1,24 @@
 """The single-axis plant, its coil power, and paths of its angle in time.
 
-The plant is a rigid body on a thread, rotated by one torque coil in a fixed horizontal field. Sease 2013, 5.4
-with the thread and a constant disturbance d added: J (w' - d) = n A B I cos(theta) - k theta - c w, where
-theta is the angle about the thread and q2 = sin(theta/2) (5.5, 5.6). Planner, tracker and estimator share
-these relations, so that the tracker can follow the planned path. Functions with singular names (`current`)
-take floats and use `math` because they run in the 40 Hz loop; functions with plural names (`currents`) take
-arrays of one shape.
+The plant is a rigid body on a thread, rotated by one torque coil in a fixed horizontal field. The equation of
+motion is Sease 2013, eq. (5.4), with the thread and a constant disturbance d added: J (w' - d) = n A B I
+cos(theta) - k theta - c w. Here theta is the angle about the thread and q2 = sin(theta/2). Planner, tracker
+and estimator share these relations, so that the tracker can follow the planned path. Functions with singular
+names (`current`) take floats and use `math` because they run in the 40 Hz loop; functions with plural names
+(`currents`) take arrays of one shape.
 
-Coils on a chopped supply (Sease ch. 5: PWM of 20 ms through an H-bridge): the L/R of a coil, 0.1 ms, is short
-against the period, so that the coil carries V/R while its bridge drives it, and no current otherwise. The
-supply delivers V |I| for a mean current I over the period, V = R Imax, and the coil converts it to heat. R
-I^2 of the mean current, the cost of Sease 5.1, is the heat of a steady current: V |I| times the duty cycle.
+The coils are driven by pulse-width modulation with a period of 20 ms (Sease thesis, chapter 5). The time
+constant L/R of a coil, 0.1 ms, is short compared with the period, so a coil carries V/R while the H-bridge
+drives it, and otherwise no current. For a mean current I the supply delivers V |I| with V = R Imax, which the
+coil converts to heat. The cost R I^2 of Sease, eq. (5.1), is the heat of a steady current, which equals V |I|
+times the duty cycle.
 
-The pseudospectral discretisation is that of Sease 5.8. The n nodes are -1, 1 and the roots of P'(x), P the
-Legendre polynomial of degree n - 1. Quadrature on the nodes is exact to degree 2n - 3, the differentiation
-matrix to degree n - 1. A path is one polynomial in time of q2. Angle, rate and acceleration follow from q2
-exactly (Sease 5.9; 5.13 corrected), so that the limit imposed by the planner also holds between nodes. After
-its end a path holds its last attitude, or coasts at its end rate as far as the coil has authority.
+The pseudospectral discretisation is that of Sease, eq. (5.8). The n nodes are -1, 1 and the roots of P'(x),
+where P is the Legendre polynomial of degree n - 1. Quadrature on the nodes is exact up to degree 2n - 3, and
+the differentiation matrix up to degree n - 1. A path is one polynomial in time of q2. Angle, rate and
+acceleration follow exactly from q2 (Sease, eqs. (5.9) and (5.13), corrected), so the planner's limits also
+hold between the nodes. After its end, a path holds the last attitude, or continues at the end rate up to the
+angle where the coil loses its torque.
 """
 
 from __future__ import annotations
@@ -38,31 +40,30 @@ def supply_power(current: FloatArray, voltage: float) -> FloatArray:
     """Return V |I|, the power that each coil takes from its supply, W.
 
     Args:
-        current: mean currents over a PWM period, A, of any shape.
-        voltage: V. The voltage across a driven coil (`coils.supply_voltage`, after the losses of the bridge)
-            gives the power at the coils. The voltage of the bus before the bridge, which carries the same
-            current, gives the power at the bus.
+        current: mean coil currents over a PWM period, of any shape, A.
+        voltage: V. With the voltage across a driven coil (`coils.supply_voltage`), the result is the power at
+            the coils. With the bus voltage before the H-bridge, the result is the power taken from the bus.
     """
     return np.asarray(voltage * np.abs(current))
 
 
 def steady_heat(current: FloatArray, resistance: float | FloatArray) -> FloatArray:
-    """Return R I^2, the heat of steady currents, W: a cost of paths, not the consumption of chopped coils.
+    """Return the heat R I^2 of steady currents, W; pulse-width modulated coils consume more.
 
     Args:
-        current: mean currents over a PWM period, A.
-        resistance: ohm, of a shape that broadcasts with `current`.
+        current: mean coil currents over a PWM period, A.
+        resistance: coil resistance, of a shape that broadcasts with `current`, ohm.
     """
     return np.asarray(resistance * current * current)
 
 
 Q2_LIMIT = 0.68
-"""Largest |q2| of any path. cos(theta) is 0.075 there; at 0.707 no current rotates the body."""
+"""Largest |q2| of any path, at which cos(theta) is 0.075. At |q2| = 0.707 the coil has no torque."""
 
 
 SQUARE_Q2_WITHOUT_AUTHORITY = 0.5
-"""Value of q2^2 at which cos(theta) = 1 - 2 q2^2 is zero, because the coil's axis lies along the field (Sease
-5.15 corrected)."""
+"""Value of q2^2 at which the coil's axis lies along the field and cos(theta) = 1 - 2 q2^2 is zero (Sease, eq.
+(5.15), corrected)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +72,12 @@ class SingleAxisPlant:
 
     Attributes:
         inertia: J, kg m^2.
-        torque_constant: n A B, N m/A: the torque of one ampere at theta = 0.
+        torque_constant: torque per current n A B of the coil at theta = 0, N m/A.
         resistance: of the coil, ohm.
         current_limit: largest |I|, A.
         stiffness: k of the thread, N m/rad.
         damping: c, N m s/rad.
-        disturbance: d, rad/s^2, acceleration that the other terms do not explain, from the estimator.
+        disturbance: estimated angular acceleration d that the other terms do not explain, rad/s^2.
     """
 
     inertia: float
@@ -101,19 +102,19 @@ class SingleAxisPlant:
             raise UsageError(f"plant disturbance is {self.disturbance}: it must be finite")
 
     def current(self, angle: float, rate: float, acceleration: float) -> float:
-        """Return the current in A that gives `acceleration` rad/s^2 at `angle` rad and `rate` rad/s (5.5)."""
+        """Return the current (A) for an acceleration (rad/s^2) at an angle (rad) and a rate (rad/s)."""
         torque = (
             self.inertia * (acceleration - self.disturbance) + self.stiffness * angle + self.damping * rate
         )
         return torque / (self.torque_constant * math.cos(angle))
 
     def acceleration(self, angle: float, rate: float, current: float) -> float:
-        """Return the angular acceleration in rad/s^2 under `current` A (5.4)."""
+        """Return the angular acceleration (rad/s^2) under a current (A) (Sease, eq. (5.4))."""
         torque = self.torque_constant * current * math.cos(angle) - self.stiffness * angle
         return (torque - self.damping * rate) / self.inertia + self.disturbance
 
     def currents(self, angle: FloatArray, rate: FloatArray, acceleration: FloatArray) -> FloatArray:
-        """Return `current` for arrays (n,)."""
+        """Return the currents (n,) in A for arrays (n,) of accelerations, angles and rates."""
         torque = (
             self.inertia * (acceleration - self.disturbance) + self.stiffness * angle + self.damping * rate
         )
@@ -131,17 +132,17 @@ def q2_of(angle: float) -> float:
 
 
 def rate_of(q2: float, q2_rate: float) -> float:
-    """Return the body rate in rad/s: w = 2 q2' / sqrt(1 - q2^2) (5.9; 5.13 corrected)."""
+    """Return the body rate w = 2 q2' / sqrt(1 - q2^2) in rad/s (Sease, eq. (5.9))."""
     return 2.0 * q2_rate / math.sqrt(1.0 - q2 * q2)
 
 
 def q2_rate_of(q2: float, rate: float) -> float:
-    """Return q2' = w sqrt(1 - q2^2) / 2 in 1/s (5.9)."""
+    """Return the derivative q2' = w sqrt(1 - q2^2) / 2 in 1/s (Sease, eq. (5.9))."""
     return 0.5 * rate * math.sqrt(1.0 - q2 * q2)
 
 
 def acceleration_of(q2: float, q2_rate: float, q2_acceleration: float) -> float:
-    """Return w' in rad/s^2, the exact derivative of 5.9: 2 q2''/u + 2 q2 q2'^2/u^3, u = sqrt(1 - q2^2)."""
+    """Return w' = 2 q2''/u + 2 q2 q2'^2/u^3 in rad/s^2, where u = sqrt(1 - q2^2)."""
     square = 1.0 - q2 * q2
     return 2.0 * (q2_acceleration + q2 * q2_rate * q2_rate / square) / math.sqrt(square)
 
@@ -149,7 +150,7 @@ def acceleration_of(q2: float, q2_rate: float, q2_acceleration: float) -> float:
 def motion_of(
     q2: FloatArray, q2_rate: FloatArray, q2_acceleration: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return theta, w and w' (n,) of q2 and its two time derivatives (n,)."""
+    """Return theta, w and w' (n,) from q2 and its first two time derivatives (n,)."""
     square = 1.0 - q2 * q2
     root = np.sqrt(square)
     acceleration = 2.0 * (q2_acceleration + q2 * q2_rate * q2_rate / square) / root
@@ -161,11 +162,11 @@ def current_and_slopes(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the current (n,) in A and its partial derivatives by q2, q2' and q2'' (n,) each.
 
-    Equation 5.6 of the thesis with the exact w' instead of the derivative of a polynomial for w, and with the
-    torques of the thread and of the disturbance.
+    The current follows from Sease, eq. (5.6), with the exact w' and with the torques of thread and
+    disturbance.
     """
     square = 1.0 - q2 * q2
-    by_acceleration = 2.0 / np.sqrt(square)  # dw'/dq2'', and dw/dq2' as well
+    by_acceleration = 2.0 / np.sqrt(square)  # the derivative dw'/dq2'' equals dw/dq2'
     ratio = q2_rate / square
     swing = q2 * ratio
     cosine = 1.0 - 2.0 * q2 * q2
@@ -190,8 +191,8 @@ def current_and_slopes(
 
 
 _ROUNDED = 0.1
-"""Smoothing parameter e, relative to Imax, of |I| in the cost. The minimised function is sqrt(I^2 + e^2) - e,
-whose slope is continuous."""
+"""Smoothing parameter e of |I| in the cost, relative to Imax. The cost uses sqrt(I^2 + e^2) - e instead of
+|I|, because its slope is continuous."""
 
 
 class PathCost(StrEnum):
@@ -207,7 +208,7 @@ class PathCost(StrEnum):
         return supply_power(current, plant.resistance * plant.current_limit)
 
     def smooth(self, plant: SingleAxisPlant, current: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the smoothed power, W, to minimise, and its derivative, W/A, for currents (m,) in A."""
+        """Return the smoothed power (W) and its derivative (W/A) for currents (m,) in A."""
         if self is PathCost.HEAT:
             pull = plant.resistance * current
             return pull * current, 2.0 * pull
@@ -218,13 +219,13 @@ class PathCost(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LglRule:
-    """A set of nodes with its matrices; the arrays are read-only because rules are shared.
+    """Nodes with quadrature weights and differentiation matrix, as read-only arrays.
 
     Attributes:
-        nodes: (n,) ascending, from -1 to 1.
-        weights: (n,) of the quadrature; their sum is 2.
-        differentiation: (n, n) from values on the nodes to derivatives on the nodes.
-        barycentric: (n,) weights of Lagrange interpolation through the nodes.
+        nodes: nodes (n,) in ascending order from -1 to 1.
+        weights: quadrature weights (n,), whose sum is 2.
+        differentiation: matrix (n, n) from values to derivatives on the nodes.
+        barycentric: weights (n,) of barycentric Lagrange interpolation through the nodes.
     """
 
     nodes: FloatArray
@@ -243,7 +244,10 @@ class LglRule:
 
 @lru_cache(maxsize=32)
 def lgl_rule(count: int) -> LglRule:
-    """Return the rule of `count` >= 2 nodes; raises UsageError below that."""
+    """Return the rule of `count` nodes.
+
+    Raises UsageError for fewer than two nodes.
+    """
     if count < 2:
         raise UsageError(f"{count} Legendre-Gauss-Lobatto nodes: at least 2, the ends, are needed")
     degree = count - 1
@@ -259,7 +263,7 @@ def lgl_rule(count: int) -> LglRule:
     barycentric = 1.0 / values
     gap = nodes[:, None] - nodes + np.eye(count)
     differentiation = barycentric / barycentric[:, None] / gap
-    # The diagonal is minus the sum of its row, so that the derivative of a constant is zero to rounding.
+    # Each diagonal element is minus the sum of its row, so the derivative of a constant is zero.
     np.fill_diagonal(differentiation, 0.0)
     np.fill_diagonal(differentiation, -differentiation.sum(axis=1))
     for array in (nodes, weights, differentiation, barycentric):
@@ -269,7 +273,7 @@ def lgl_rule(count: int) -> LglRule:
 
 @dataclass(frozen=True, slots=True)
 class CubicPrey:
-    """q_p(t) = C0 + C1 t + C2 t^2 + C3 t^3 for t in s (5.35)."""
+    """The cubic q_p(t) = C0 + C1 t + C2 t^2 + C3 t^3, with t in s (Sease, eq. (5.35))."""
 
     c0: float
     c1: float
@@ -280,7 +284,7 @@ class CubicPrey:
     def between(
         cls, start: float, start_slope: float, end: float, end_slope: float, horizon: float
     ) -> CubicPrey:
-        """Return the cubic from `start` to `end` in `horizon` s, slopes q2' in 1/s (5.37, 5.38)."""
+        """Return the cubic from `start` to `end` in `horizon` s with end slopes q2' (1/s)."""
         c2 = (3.0 * (end - start) - (2.0 * start_slope + end_slope) * horizon) / horizon**2
         c3 = (end_slope - start_slope - 2.0 * c2 * horizon) / (3.0 * horizon**2)
         return cls(start, start_slope, c2, c3)
@@ -295,12 +299,12 @@ class CubicPrey:
 
 
 FARTHEST = angle_of(Q2_LIMIT)
-"""Largest angle of a coast, rad."""
+"""Largest angle (rad) up to which a path continues at its end rate."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathSample:
-    """The commanded motion at one time: theta in rad, theta' in rad/s, theta'' in rad/s^2."""
+    """The commanded angle (rad), rate (rad/s) and acceleration (rad/s^2) at one time."""
 
     angle: float
     rate: float
@@ -308,7 +312,7 @@ class PathSample:
 
     @property
     def quaternion(self) -> FloatArray:
-        """Attitude (4,) of the angle about body y."""
+        """Attitude quaternion (4,) of the commanded angle about body y."""
         return about_axis_y(self.angle)
 
     @property
@@ -322,11 +326,11 @@ class PolynomialPath:
     """A path that starts at `origin_ns` and lasts `horizon` s.
 
     Attributes:
-        origin_ns: monotonic time of its start.
-        horizon: s; zero for a held attitude.
-        series: Chebyshev coefficients of (q2, q2' in 1/s, q2'' in 1/s^2), highest degree first.
-        end_angle: theta in rad at the horizon.
-        end_rate: theta' in rad/s kept after the horizon; zero holds the end.
+        origin_ns: monotonic time of the start of the path, ns.
+        horizon: duration of the path, s; zero for a held attitude.
+        series: Chebyshev coefficients of q2, q2' (1/s) and q2'' (1/s^2), highest degree first.
+        end_angle: angle at the end of the path, rad.
+        end_rate: rate that is kept after the end of the path, rad/s; zero holds the attitude.
     """
 
     origin_ns: int
@@ -400,7 +404,7 @@ class PolynomialPath:
         return angle, rate, acceleration
 
     def _coast(self, since: float) -> PathSample:
-        """Return the motion `since` s after the horizon."""
+        """Return the commanded motion `since` seconds after the end of the path."""
         angle = self.end_angle + self.end_rate * since
         farthest = max(FARTHEST, abs(self.end_angle))
         if abs(angle) > farthest:
@@ -410,5 +414,5 @@ class PolynomialPath:
 
 @lru_cache(maxsize=8)
 def _chebyshev_fit(count: int) -> FloatArray:
-    """Return the matrix (N, N) from values on N nodes to Chebyshev coefficients."""
+    """Return the matrix (N, N) from values on N nodes to Chebyshev coefficients of the polynomial."""
     return np.asarray(np.linalg.inv(chebyshev.chebvander(lgl_rule(count).nodes, count - 1)), dtype=float)

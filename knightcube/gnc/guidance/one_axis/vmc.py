@@ -1,9 +1,10 @@
 """The planner of paths about one axis: minimum energy by virtual motion camouflage.
 
-Sease 2013, 5.8-5.15 corrected. NLopt optimises the free path control parameters under |I| <= Imax and |q2| <=
-a bound at every time. If no path over the requested horizon keeps the limits, the horizon is stretched to the
-shortest feasible one and the status of the plan is STRETCHED. With a time cost the horizon is optimised too.
-Energy is the integral of R I^2 in J, without the factor 1/2 of 5.1.
+The method is that of Sease 2013, eqs. (5.8) to (5.15), corrected. NLopt optimises the free path control
+parameters under |I| <= Imax and |q2| <= a bound at every time. If no path over the requested horizon keeps
+the limits, the horizon is stretched to the shortest feasible one and the status of the plan is STRETCHED.
+With a time cost the horizon is optimised too. Energy is the integral of R I^2 in J, without the factor 1/2 of
+Sease, eq. (5.1).
 
 All three searches for a horizon minimise energy plus a time cost between a shortest and a longest horizon. If
 the time cost is far above the coil's power and the shortest horizon is the requested one, the solution is the
@@ -47,7 +48,7 @@ from knightcube.gnc.guidance.one_axis.vmc_program import (
 )
 
 ProgramAt = Callable[[float], PathProgram]
-"""Function from a horizon, s, to the program whose family is whitened about the prey over that horizon."""
+"""Function from a horizon (s) to the nonlinear program that is whitened about the prey of this horizon."""
 
 SHORTEST_COST = 7.0
 """Time cost, in units of R Imax^2, with which the shortest horizon is found. An infinite cost would give the
@@ -62,7 +63,7 @@ _START_BELOW = 1.7
 _GROW_TO = 1.4
 _RETRY = 1.4
 ALONG_LIMIT = 0.99
-"""Ratio to a limit above which a path runs along the limit."""
+"""Ratio of a path's largest value to a limit, above which the path counts as running along the limit."""
 _ATTEMPTS = 10
 _AT_BOUND = 1e-9
 _ANCHORS = (0.85, 0.7, 0.5, 0.35, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
@@ -74,12 +75,13 @@ _TIME_COST_CHANGE = 0.03
 
 @dataclass(slots=True)
 class HorizonSearch:
-    """A search for the horizon of a path; counts the evaluations of the cost.
+    """A search for the horizon of a path.
 
     Attributes:
         program_at: builds programs.
-        warm: (N,) difference between an earlier path and its prey on the nodes; None to start from the prey.
-        evaluations: of the cost so far.
+        warm: difference (N,) between an earlier path and its prey on the nodes, for a warm start; None to
+            start from the prey.
+        evaluations: number of evaluations of the cost so far.
     """
 
     program_at: ProgramAt
@@ -126,9 +128,9 @@ class HorizonSearch:
         """Return the path of minimum energy plus `time_cost` W times its horizon, initially `guess` s.
 
         The derivative of the minimum energy by the horizon is the partial derivative at the optimum over this
-        horizon. A horizon is a lower bound if a longer one saves more energy than it costs, otherwise an
-        upper bound. The next horizon follows from E ~ 1/T^3, which holds for a slew without limits. Only the
-        last program imposes the limits.
+        horizon. A tried horizon is a lower bound of the optimum if a longer horizon reduces the total cost,
+        otherwise an upper bound. The next horizon follows from E ~ 1/T^3, which holds for a slew without
+        limits. Only the last program imposes the limits.
         """
         low, high, time = shortest, longest, min(max(guess, shortest), longest)
         time_cost = min(time_cost, SHORTEST_COST * self.program_at(time).bang_power)
@@ -160,7 +162,7 @@ class HorizonSearch:
     def _at_requested(self, program: PathProgram, trial: Trial, asked: float) -> tuple[PathProgram, Trial]:
         """Return a path over `asked` s instead of a slightly longer one, if there is such a path.
 
-        It starts from the longer path, in a program whitened about the requested horizon.
+        The search starts from the longer path.
         """
         if not asked * (1.0 + _AT_BOUND) < trial.horizon <= asked * _SHORTEST_STRETCH:
             return program, trial
@@ -198,7 +200,7 @@ class HorizonSearch:
         return stretched or (failed, None)
 
     def over(self, time: float, apart: FloatArray | None) -> tuple[PathProgram, Trial | None]:
-        """Return the program at `time` s and a path within the limits, started `apart` (N,) from the prey."""
+        """Return the program over `time` s and a path within its limits, started `apart` (N,) from the prey."""
         program = self.program_at(time)
         trial = None if apart is None else program.limited(program.beside_prey(apart, time))
         if trial is None:
@@ -235,14 +237,14 @@ class HorizonSearch:
 
 
 NODES = 24
-"""Number of nodes of a path. With 24 nodes, the cost is within 1e-4 of the optimum for horizons above 1.1
-times the shortest one, and a stretched horizon is within 1.5 % of the shortest. With 16 nodes, planning takes
-half the time and a stretched horizon is within 2.5 %."""
+"""Number of nodes of a path. With 24 nodes, the relative error of the cost is below 1e-4 for horizons above
+1.1 times the shortest horizon, and a stretched horizon is at most 1.5 % too long. With 16 nodes, planning
+takes half the time and a stretched horizon is at most 2.5 % too long."""
 FINE_NODES = 40
 """Number of nodes for paths that run along the current limit near the requested horizon. With 24 nodes the
 cost of such paths is up to 0.3 % above the optimum, with 40 nodes up to 0.07 %."""
 _NEARLY = 1.03
-"""Stretch up to which finer nodes may still find a path over the requested horizon."""
+"""Largest stretch of a horizon at which a path on more nodes is tried over the requested horizon."""
 
 REFERENCE = 2.0
 MAX_STRETCH = 6.0
@@ -264,15 +266,15 @@ class StepPlan:
     """A path and its properties.
 
     Attributes:
-        path: its origin is zero until guidance starts it.
+        path: planned path, whose origin is zero until guidance starts it.
         status: optimal at the requested horizon, or stretched to the shortest feasible one.
-        horizon_asked, horizon: s; equal with a time cost.
-        energy: integral of R I^2, J.
-        supplied: integral of V |I|, J.
+        horizon_asked, horizon: requested and planned duration, s; equal with a time cost.
+        energy: integral of R I^2 along the path, J.
+        supplied: integral of V |I| along the path, J.
         peak_current: largest |I| on a dense grid, A.
         evaluations: number of evaluations of the cost.
         target_q2: q2 at the end.
-        nu: (N,) path control parameters relative to the prey over `horizon`.
+        nu: path control parameters (N,) relative to the prey over `horizon`.
         node_times: (N,) s.
         node_q2: (N,).
     """
@@ -313,14 +315,15 @@ def plan(
 ) -> StepPlan:
     """Return the minimum-energy path between two states in `horizon` s, or in the shortest feasible time.
 
-    Rates are body rates in rad/s. `reference` is q_r, beyond the range of q2 (5.10); `q2_limit` bounds |q2|;
-    the horizon is stretched to at most `max_stretch` times the requested one. A stretched horizon lies about
-    0.3 % above the shortest of the paths on `nodes` nodes, within 1.5 % of the bang-bang time.
+    Rates are body rates in rad/s. `reference` is the reference point q_r of Sease, eq. (5.10), which must lie
+    beyond the range of q2. `q2_limit` is the upper bound of |q2|. The horizon is stretched to at most
+    `max_stretch` times the requested horizon. A stretched horizon is about 0.3 % longer than the shortest
+    feasible horizon on `nodes` nodes, and at most 1.5 % longer than the bang-bang time.
 
     With `time_cost` in W the path minimises energy plus time cost, over horizons from SHORTEST_WITH_TIME_COST
     s to `max_stretch` times `horizon`; `horizon` is then the initial guess. `last` is the path followed until
-    now, its origin relative to the new start (so not positive); its remainder is the initial guess of the
-    path. `cost` selects the energy that is minimised.
+    now, with its origin relative to the new start. The remainder of this path is the initial guess. `cost`
+    selects the energy that is minimised.
 
     Raises PlanningError if an argument is not finite or outside its limits, or if no allowed horizon is
     feasible.
@@ -396,7 +399,10 @@ def _assemble(
     evaluations: int,
     end_rate: float,
 ) -> StepPlan:
-    """Return the plan of `trial`. Raises PlanningError if it is not finite."""
+    """Return the plan that belongs to a solution `trial` of the optimiser.
+
+    Raises PlanningError if it is not finite.
+    """
     energy, supplied = (program.spent(trial, cost) for cost in PathCost)
     peak = float(np.abs(program.ratios(trial)[0]).max()) * program.current_limit
     node_q2 = program.family.nodes(trial.parameters, trial.horizon)
@@ -457,9 +463,9 @@ def _check(
 
 @dataclass(frozen=True, slots=True)
 class PlanJob:
-    """Job of the planner's worker: a path from one state to another, both as q2 and rad/s, in `horizon` s.
+    """A job of the planner's worker: a path between two states (q2 and rad/s) in `horizon` seconds.
 
-    `number` counts the jobs; the path starts at `origin_ns`. `last` is the path followed until now, its
+    `number` counts the jobs; the path starts at `origin_ns`. `last` is the path followed until now, with its
     origin relative to `origin_ns`. The other attributes are arguments of `plan`.
     """
 
@@ -510,10 +516,10 @@ def plan_step(
 ) -> StepPlan:
     """Return the minimum-energy path of a body about one axis that one torque coil rotates.
 
-    The path is optimised by virtual motion camouflage (Sease 2013, 5.8-5.15) with NLopt's SLSQP, under the
-    current limit of the plant and |angle| <= 1.496 rad at every time, beyond which the coil has almost no
-    torque. If no path over the horizon keeps the limits, the horizon is stretched to the shortest feasible
-    one and the status of the plan is "stretched". A plan takes about 2 ms.
+    The path is optimised by virtual motion camouflage (Sease 2013, eqs. (5.8) to (5.15)) with NLopt's SLSQP,
+    under the current limit of the plant and |angle| <= 1.496 rad at every time, beyond which the coil has
+    almost no torque. If no path over the horizon keeps the limits, the horizon is stretched to the shortest
+    feasible one and the status of the plan is "stretched". A plan takes about 2 ms.
 
     `plan.path.motion(times)` gives angle, rate and acceleration at times (n,), s after the start, and
     `plant.currents` the coil current for them.
@@ -525,8 +531,8 @@ def plan_step(
         horizon: duration, s; with `time_cost` the initial guess of the duration.
         start_rate: body rate at the start, rad/s.
         end_rate: body rate at the end, rad/s.
-        time_cost: W; the duration is optimised too, for minimum energy plus `time_cost` times the duration.
-            None keeps the horizon.
+        time_cost: cost of time, W; the duration is then optimised for minimum energy plus `time_cost` times
+            duration. None keeps the horizon.
         minimise: "heat" for the integral of R I^2, "supply" for that of V |I|, the energy taken from a
             chopped supply.
         nodes: number of nodes of the path, 8 to 40.

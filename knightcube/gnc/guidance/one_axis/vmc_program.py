@@ -1,9 +1,10 @@
-"""The programs of virtual motion camouflage, on NLopt's SLSQP with exact gradients (Sease 5.8-5.14).
+"""The nonlinear programs of virtual motion camouflage (Sease, eqs. (5.8) to (5.14)), solved with SLSQP.
 
-The paths are q2 = q_r + v (q_p - q_r) on N nodes, where q_p is the prey and q_r the reference point
-(5.10-5.12). A path is the polynomial of degree N - 1 through its node values, so q2', q2'' and the current
-are exact between nodes too. The path control parameter v is 1 at both ends; v_2 and v_(N-1) follow from the
-boundary rates by q' = D q at the ends (5.11 corrected). N - 4 path control parameters are free.
+The paths are q2 = q_r + v (q_p - q_r) on N nodes, where q_p is the prey and q_r the reference point (Sease,
+eqs. (5.10) to (5.12)). A path is the polynomial of degree N - 1 through its node values, so q2', q2'' and the
+current are exact between nodes too. The path control parameter v is 1 at both ends; v_2 and v_(N-1) follow
+from the boundary rates by q' = D q at the ends (Sease, eq. (5.11), corrected). N - 4 path control parameters
+are free.
 
 The prey is an affine function of the horizon T, and for a fixed prey the path is an affine function of v - 1.
 The paths are therefore written as prey(T) + M y. The columns of M are the changes that preserve the ends and
@@ -41,7 +42,7 @@ DENSE_POINTS = 769
 
 @dataclass(frozen=True, slots=True)
 class SamplePoints:
-    """Points (m,) to evaluate paths at, and matrices (3, m, N) from nodes to q2 and its s-derivatives."""
+    """Points (m,) at which paths are evaluated, with matrices (3, m, N) from nodes to q2 and derivatives."""
 
     points: FloatArray
     matrices: FloatArray
@@ -54,21 +55,23 @@ class SamplePoints:
         return cls(points, np.stack([value, slope, slope @ rule.differentiation]))
 
     def take(self, index: IntArray) -> SamplePoints:
-        """Return the samples at the points of `index`."""
+        """Return the samples at the points with the indices `index`."""
         return SamplePoints(self.points[index], self.matrices[:, index])
 
 
 @dataclass(frozen=True, slots=True)
 class Discretisation:
-    """Matrices that depend on the number of nodes only.
+    """Matrices that depend only on the number of nodes.
 
     Attributes:
         rule: the N nodes.
-        cost: samples on 2 N LGL nodes, where the energy is integrated: I^2 has about twice the path's degree,
-            so that N nodes leave an error for the optimiser to exploit.
-        cost_weights: (2 N,) of that quadrature, their sum 2.
-        dense: samples where the limits are checked, denser towards the ends as the extrema are.
-        free: (N, N - 4) from the free nodes' changes to all nodes' changes, ends and end slopes unchanged.
+        cost: samples on the 2 N nodes on which the energy is integrated. With only N nodes, the optimiser
+            would exploit the quadrature error, because I^2 has about twice the degree of the path.
+        cost_weights: quadrature weights (2 N,) of the energy, whose sum is 2.
+        dense: samples at which the limits are checked, denser towards the ends like the extrema of
+            polynomials.
+        free: matrix (N, N - 4) from changes at the free nodes to changes at all nodes that keep the ends and
+            end slopes.
     """
 
     rule: LglRule
@@ -85,7 +88,7 @@ def discretisation(count: int) -> Discretisation:
     fine = lgl_rule(2 * count)
     dense = -np.cos(np.linspace(0.0, np.pi, DENSE_POINTS))
     slopes = rule.differentiation[[0, -1]]
-    # 5.11, 5.12: the two nodes next to the ends change so that q' at the ends does not.
+    # The nodes next to the ends change so that q' at the ends stays constant (Sease, eqs. (5.11), (5.12)).
     next_to_ends = np.linalg.solve(slopes[:, [1, -2]], -slopes[:, 2:-2])
     free = np.zeros((count, count - 4))
     free[2:-2] = np.eye(count - 4)
@@ -111,13 +114,13 @@ class BoundaryStates:
 
 @dataclass(frozen=True, slots=True)
 class PathFamily:
-    """All paths between two states on N nodes: still + T * drift + basis @ y, with the parameters y.
+    """The family of paths between two states on N nodes, still + T * drift + basis @ y with parameters y.
 
     Attributes:
         grid: the discretisation.
-        still: (N,) the prey with both slopes zero, which no horizon changes.
-        drift: (N,) change of the prey per second of horizon, through its end slopes.
-        basis: (N, N - 4) node changes for each parameter y.
+        still: prey (N,) with zero end slopes, which does not depend on the horizon.
+        drift: change (N,) of the prey per second of horizon, due to its end slopes.
+        basis: change of the node values for each parameter (N, N - 4).
     """
 
     grid: Discretisation
@@ -142,7 +145,7 @@ class PathFamily:
 
     @property
     def farthest_end(self) -> float:
-        """The larger |q2| of the two ends."""
+        """The larger |q2| of the two ends of the paths."""
         return float(np.abs(self.still[[0, -1]]).max())
 
     def remixed(self, mixing: FloatArray) -> PathFamily:
@@ -161,18 +164,18 @@ class PathFamily:
 
 @dataclass(frozen=True, slots=True)
 class ObservedFamily:
-    """A family at m points: q2, dq2/ds, d2q2/ds2, affine in horizon and parameters: (3, m[, N - 4])."""
+    """A family of paths evaluated at m points: q2, dq2/ds and d2q2/ds2, affine in horizon and parameters."""
 
     still: FloatArray
     drift: FloatArray
     basis: FloatArray
 
     def trajectory(self, parameters: FloatArray, horizon: float) -> FloatArray:
-        """Return q2, q2' in 1/s and q2'' in 1/s^2 (3, m)."""
+        """Return q2, q2' (1/s) and q2'' (1/s^2) as an array (3, m)."""
         return time_scale(horizon) * (self.still + horizon * self.drift + self.basis @ parameters)
 
     def aging(self, trajectory: FloatArray, horizon: float) -> FloatArray:
-        """Return the derivative of `trajectory` (3, m) by the horizon, in units of the s-derivatives.
+        """Return the derivative of `trajectory` (3, m) with respect to the horizon.
 
         A longer horizon changes the prey and lowers the factors from s-derivatives to time derivatives.
         """
@@ -181,20 +184,19 @@ class ObservedFamily:
 
 
 def time_scale(horizon: float) -> FloatArray:
-    """Return the factors (3, 1) from s-derivatives to time derivatives: s grows by 2 in `horizon` s (5.8)."""
+    """Return the factors (3, 1) from derivatives by s in [-1, 1] to time derivatives over `horizon` s."""
     per_second = 2.0 / horizon
     return np.array([[1.0], [per_second], [per_second * per_second]])
 
 
 LIMIT_TOLERANCE = 3e-4
-"""Largest relative excess over a limit on the dense grid; it leaves a margin below 1e-3 between the
-points."""
+"""Largest accepted relative excess over a limit on the dense grid; between its points it stays below 1e-3."""
 
 IMPOSED_MARGIN = 2e-4
-"""Relative margin by which a limit is tightened where imposed, so that peaks between those points keep it
-too; without the margin the exchanges converge slowly."""
+"""Relative margin by which an imposed limit is tightened, so that peaks between the imposed points keep the
+limit. Without the margin the exchange method converges slowly."""
 
-# NLopt 2.11 has a runtime_error of its own, older bindings raise Python's.
+# NLopt 2.11 raises its own runtime_error, and older versions raise Python's RuntimeError.
 _SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
 _CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
 _EXCHANGES = 10
@@ -206,7 +208,7 @@ _IMPOSE_EVERY = 16
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One point of a program: the path's parameters (N - 4,) and its horizon in s."""
+    """A point of the search space: the parameters (N - 4,) of a path and its horizon (s)."""
 
     parameters: FloatArray
     horizon: float
@@ -243,8 +245,8 @@ class PathProgram:
     """The program of one plant and one family of paths between two states, with cost and limits.
 
     Attributes:
-        family: whitened about the prey at the given horizon.
-        evaluations: of the cost, over all solutions.
+        family: paths between the two states, whitened about the prey at the given horizon.
+        evaluations: number of evaluations of the cost, over all solutions.
     """
 
     def __init__(
@@ -275,7 +277,7 @@ class PathProgram:
 
     @property
     def bang_power(self) -> float:
-        """R Imax^2, W: the coil's power at its current limit."""
+        """Power R Imax^2 of the coil at its current limit, W."""
         return self._bang
 
     def prey(self, horizon: float) -> Trial:
@@ -307,7 +309,7 @@ class PathProgram:
     def energy(self, trial: Trial) -> tuple[float, FloatArray, float]:
         """Return the integral of the power in J, its gradient (N - 4,), and its derivative by the horizon.
 
-        For heat the integral is that of 5.8 without the 1/2 of 5.1.
+        For heat, the integral is that of Sease, eq. (5.8), without the factor 1/2 of eq. (5.1).
         """
         points, horizon = self._cost_points, trial.horizon
         trajectory = points.trajectory(trial.parameters, horizon)
@@ -328,7 +330,7 @@ class PathProgram:
     def excess(
         self, limits: ImposedLimits, points: ObservedFamily, trial: Trial
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return excesses over the limits (m,), gradients (m, N - 4) and derivatives by the horizon (m,)."""
+        """Return excesses (m,) over the limits, gradients (m, N - 4) and derivatives (m,) by the horizon."""
         trajectory = points.trajectory(trial.parameters, trial.horizon)
         current, slopes = self._current(trajectory, trial.horizon)
         value = np.where(limits.is_q2, trajectory[0] / self._q2_limit, current / self._plant.current_limit)
@@ -361,7 +363,7 @@ class PathProgram:
         trial, converged = self._minimise(start, None, None)
         if converged:
             return trial
-        # NLopt reports a problem that starts at its optimum as limited by rounding, which is not a failure.
+        # If the start is the optimum, NLopt reports that rounding limits progress, which is not a failure.
         # In this case half the square of the whitened gradient, the remaining energy saving, is small.
         _, gradient, _ = self.energy(trial)
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
@@ -383,14 +385,14 @@ class PathProgram:
             if worst <= 1.0 + LIMIT_TOLERANCE:
                 return trial if converged else None
             if not math.isfinite(worst) or np.any(np.abs(latest[chosen]) > 1.0 + LIMIT_TOLERANCE):
-                return None  # an imposed limit is exceeded
+                return None  # an imposed limit is still exceeded
             added = _peaks(latest) & ~chosen
             ratios = np.where(added, latest, ratios)
             chosen = chosen | added
         return None
 
     def _energy_tolerance(self, horizon: float) -> float:
-        """Return the tolerance on energy, J: 1e-8 of the energy at the current limit over the horizon."""
+        """Return the tolerance of the energy (J), which is 1e-8 of the energy at the current limit."""
         return 1e-8 * self._bang * horizon
 
     def _minimise(
@@ -415,7 +417,7 @@ class PathProgram:
 
         solver = nlopt.opt(nlopt.LD_SLSQP, last.size)
         solver.set_min_objective(objective)
-        # A part of 1e-5 of a free horizon's objective is a horizon to 0.01 % or better.
+        # A relative tolerance of 1e-5 of the objective determines a free horizon to 0.01 % or better.
         origin = variables.origin
         solver.set_ftol_abs(_FREE_TOLERANCE * time_cost * origin if free else self._energy_tolerance(origin))
         solver.set_maxeval(_EVALUATIONS)
@@ -425,7 +427,7 @@ class PathProgram:
         try:
             found = np.asarray(solver.optimize(last))
         except _SOLVER_STOPS:
-            # Trivial and infeasible problems end in this way, with a line search of negligible length.
+            # Trivial and infeasible problems end in this way, after a line search of negligible length.
             return variables.trial(last), False
         return variables.trial(found), solver.last_optimize_result() in _CONVERGED
 
@@ -478,12 +480,12 @@ class _Variables:
 
 
 def _contract(slopes: FloatArray, basis: FloatArray) -> FloatArray:
-    """Return d/dy (m, n) from slopes (3, m) by q2 and its s-derivatives and their d/dy (3, m, n)."""
+    """Return the gradient (m, n) by the chain rule from slopes (3, m) and derivatives (3, m, n)."""
     return np.asarray((slopes[:, :, None] * basis).sum(axis=0))
 
 
 def _peaks(ratios: FloatArray) -> BoolArray:
-    """Return where (2, m) |ratios| (2, m) has a local maximum above one along its rows."""
+    """Return a mask (2, m) of the local maxima above one of |ratios| (2, m) along the rows."""
     size = np.abs(ratios)
     peak = size > 1.0
     peak[:, 1:] &= size[:, 1:] >= size[:, :-1]
