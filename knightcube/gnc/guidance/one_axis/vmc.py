@@ -200,7 +200,7 @@ class HorizonSearch:
         return stretched or (failed, None)
 
     def over(self, time: float, apart: FloatArray | None) -> tuple[PathProgram, Trial | None]:
-        """Return the program over `time` s and a path within its limits, started `apart` (N,) from the prey."""
+        """Return the program over `time` s and a path within its limits, started at prey plus `apart`."""
         program = self.program_at(time)
         trial = None if apart is None else program.limited(program.beside_prey(apart, time))
         if trial is None:

@@ -1,1 +1,1 @@
-"""Guidance of a free satellite: attitude laws, the references that they give, and slews at the optimum."""
+"""Guidance of a free satellite: attitude laws, their reference motions, and optimal slews."""

@@ -4,12 +4,12 @@ A law aligns one body axis with a first direction exactly, and a second body axi
 closely as the first allows (TRIAD: Black 1964). Directions are inertial, fixed in the orbit's axes (nadir,
 velocity, normal), the Sun's, or that of a point on the ground. For a free roll the second direction is taken
 from the attitude at the start. It is held fixed in the inertial or in the orbital axes, whichever the first
-direction belongs to, so that nothing rotates about the first.
+direction belongs to, so that the body does not rotate about the first direction.
 
 The law of a pointing target aligns the pointing axis with the goal and the body axis `across` with a second
 direction: the velocity for goals below, nadir for the velocity itself, the celestial pole for the Sun. A
-given roll rotates the body about the pointing axis from there. A free roll is the roll of the body when the
-law begins.
+given roll is a rotation about the pointing axis from this alignment. A free roll is the roll of the body when
+the law begins.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ Direction = Callable[[Ephemeris, FloatArray], FloatArray]
 DIFFERENCE = 1.0
 """Step of the central differences for rate and acceleration, s."""
 MINIMUM_SINE = 1e-3
-"""Smallest sine of the angle between the two directions; closer to parallel they determine no attitude."""
+"""Smallest sine of the angle between the two directions; nearly parallel directions do not determine the
+roll."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,9 +61,9 @@ class AttitudeReferences:
 
     Attributes:
         times: (n,) s.
-        quaternion: (n, 4) ICRS into body.
-        rate: (n, 3) rad/s, in the axes of the commanded attitude.
-        acceleration: (n, 3) rad/s^2, in the axes of the commanded attitude.
+        quaternion: commanded attitudes (n, 4), from ICRS into body axes.
+        rate: commanded body rates (n, 3) in the axes of the commanded attitude, rad/s.
+        acceleration: commanded angular accelerations (n, 3) in the axes of the commanded attitude, rad/s^2.
     """
 
     times: FloatArray
@@ -108,7 +109,7 @@ class AttitudeReferences:
 class AttitudeLaw:
     """A law that aligns body `axis` (3,) with `first`, and body axis `across` (3,) with `second`.
 
-    The second alignment is as close as the first allows.
+    The second alignment is as close as the exact first alignment allows.
     """
 
     axis: FloatArray
@@ -206,7 +207,7 @@ def free_roll(
     shown = attitude_matrix(quaternion).T @ across
     when = np.array([time])
     wanted = first(ephemeris, when)[0]
-    # Shortest rotation: the second direction rotates with the axis from the present to the final direction.
+    # The second direction rotates with the axis by the shortest rotation to the final direction.
     shown = _turned(attitude_matrix(quaternion).T @ axis, wanted, shown)
     moved = float(np.linalg.norm(first(ephemeris, when + 10.0)[0] - wanted))
     if moved < 1e-4:
@@ -259,7 +260,7 @@ def approach(
         left = to_rotation_vector(multiply(quaternion, conjugate(start[1])))
         law_rate = to_rotation_vector(multiply(start[2], conjugate(start[0]))) / (2.0 * DIFFERENCE)
         shown = attitude_matrix(from_rotation_vector(left)) @ law_rate
-        # The polynomial also covers times before the start, because differences there need both sides.
+        # The polynomial also covers times before the start, for central differences at the start.
         share = np.minimum((np.asarray(times) - begin) / (end - begin), 1.0)[:, None]
         rest = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
         drift = (end - begin) * share * (1.0 - share) ** 3 * (1.0 + 3.0 * share)
@@ -284,7 +285,7 @@ def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArra
     """Return `vector` (3,) rotated by the shortest rotation from unit vector `start` to `end`."""
     axis = np.cross(start, end)
     cosine = float(start @ end)
-    if cosine < -1.0 + 1e-9:  # opposite: any normal axis will do; this one leaves the vector unchanged
+    if cosine < -1.0 + 1e-9:  # opposite directions, for which any normal axis can be used
         return vector
     return np.asarray(cosine * vector + np.cross(axis, vector) + axis * (axis @ vector) / (1.0 + cosine))
 

@@ -44,25 +44,25 @@ class Goal(IntEnum):
 
 
 NUMBERS = {Goal.INERTIAL: (4,), Goal.GROUND: (2,), Goal.OBJECT: (0, 2)}
-"""Permitted counts of numbers for each goal, the largest count last. Goals that are not listed take no
-numbers."""
+"""Permitted numbers of arguments of each goal, the largest last. Other goals have no arguments."""
 ROLLS = {
     Goal.INERTIAL: "an inertial attitude has its roll in its quaternion",
     Goal.OBJECT: "an object is followed with a free roll",
 }
-"""Reasons for goals that take no roll."""
+"""Goals for which a roll cannot be given, each with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class PointingTarget:
-    """A pointing goal with its numbers and its roll.
+    """A pointing goal with its numerical arguments and its roll.
 
     Attributes:
         goal: what to point at.
         numbers: arguments of the goal. INERTIAL has an attitude quaternion (4,), ICRS into body; GROUND has
             latitude and longitude, rad; OBJECT has right ascension and declination, rad, of the field to
             search, or no numbers for the present field of view. Other goals have no numbers.
-        roll: rad about the pointing axis; None leaves it free. Some goals take no roll (`ROLLS`).
+        roll: rotation about the pointing axis, rad; None leaves it free. For some goals a roll cannot be
+            given (`ROLLS`).
     """
 
     goal: Goal

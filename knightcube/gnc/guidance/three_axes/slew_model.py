@@ -49,11 +49,10 @@ class SlewCraft:
 
     Attributes:
         inertia: (3, 3) kg m^2.
-        limit: (3,) A m^2, of each coil.
-        weights: (3,) W/(A m^2)^2, heat of each coil per square of its dipole.
-        residual: (3,) A m^2, the residual dipole of the satellite.
-        torque, air, light: (3,) N m, sizes of the constant disturbance torque, of the torque by air, and of
-            that by sunlight.
+        limit: dipole limit (3,) of each coil, A m^2.
+        weights: heating power of each coil per squared dipole moment (3,), W/(A m^2)^2.
+        residual: residual dipole moment (3,) of the satellite, A m^2.
+        torque, air, light: sizes (3,) of the constant, the air and the sunlight torque, N m.
     """
 
     inertia: FloatArray
@@ -84,7 +83,7 @@ class SlewEnvironment:
     pressures: Pressures | None = None
 
     def part(self, which: IntArray) -> SlewEnvironment:
-        """Return the environment at the times of the index array `which`."""
+        """Return the environment at the times with the indices `which`."""
         found = self.pressures
         pressed = None if found is None else Pressures(found.air[which], found.light[which])
         return SlewEnvironment(self.field[which], self.position[which], pressed)
@@ -178,7 +177,7 @@ class SlewDynamics:
         return np.asarray(result)
 
     def _quantities(self, x: FloatArray, m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return z (n, 16), and the derivative (n, 6, 4) of b and e by the attitude."""
+        """Return the vector z (n, 16), and the derivatives (n, 6, 4) of b and e by the attitude."""
         z, q = np.empty((len(x), _Z)), x[:, :4]
         turned = (self._forms.reshape(-1, 24, 4) @ q[:, :, None]).reshape(-1, 6, 4)
         z[:, _M], z[:, _W], z[:, _Q] = m + self._residual, x[:, 4:], q
@@ -218,7 +217,7 @@ def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
 def _quadratic(inertia: FloatArray) -> FloatArray:
     """Return the symmetric H (7, 16, 16): x' is 1/2 z . H z plus the constant torque's acceleration."""
     result = np.zeros((7, _Z, _Z))
-    crossed = -cross_matrices(_EYE3)  # crossed[i] . (a, c) is the part i of a x c
+    crossed = -cross_matrices(_EYE3)  # crossed[i] . (a, c) is component i of a x c
     result[:3, _Q, _W][:, :3] = 0.5 * crossed
     result[_AXES, 15, 9 + _AXES] = 0.5
     result[3, 12 + _AXES, 9 + _AXES] = -0.5
@@ -245,7 +244,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 class HermiteCubic:
     """A curve through `values` (n, k) with `slopes` (n, k) at increasing `times` (n,), n > 1.
 
-    Times outside extrapolate the first or the last cubic.
+    For times outside its range, the first or the last cubic is extrapolated.
     """
 
     times: FloatArray
@@ -281,10 +280,10 @@ class SlewPath:
 
     Attributes:
         times: (n,) s.
-        quaternion: (n, 4) ICRS into body.
-        rate: (n, 3) rad/s, body axes.
-        acceleration: (n, 3) rad/s^2, body axes.
-        dipole: (n, 3) A m^2, body axes, linear between the times.
+        quaternion: attitudes (n, 4), from ICRS into body axes.
+        rate: body rates (n, 3) in body axes, rad/s.
+        acceleration: angular accelerations (n, 3) in body axes, rad/s^2.
+        dipole: dipole moments (n, 3) of the coils in body axes, linear between the times, A m^2.
     """
 
     times: FloatArray
@@ -423,7 +422,7 @@ EndLaw = Callable[[float], End]
 
 
 class EndConditions:
-    """The equations of an end: the error of a state (7,), attitude first, then rate (3,)."""
+    """The equations for the end of a slew: the attitude error and the rate error of a state (7,)."""
 
     def __init__(self, end: End, scale: float) -> None:
         """Set up the equations of `end` for times in units of `scale` s."""
@@ -502,10 +501,9 @@ time within 0.6 %."""
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
 _DEEP, _STILL = math.radians(5.0), 1e-4
-"""Depth (rad) inside a cone above which an end is refused, and rate (rad/s) below which an end counts as
-inertially fixed."""
+"""Depth (rad) inside a cone above which an end is rejected, and rate (rad/s) of an inertially fixed end."""
 MINIMUM_TIME = math.inf
-"""Time cost at which only the duration counts."""
+"""Value of the time cost for which only the duration is minimised."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -514,12 +512,13 @@ class SlewTask:
 
     Attributes:
         craft, along: the model; `along` counts times from the start of the slew.
-        quaternion, rate: the start, (4,) ICRS into body and (3,) rad/s, body axes.
+        quaternion, rate: attitude (4,) from ICRS into body axes and body rate (3,), rad/s, at the start.
         end: the end of a slew as a function of its duration.
-        horizon, longest: s; the horizon is stretched up to `longest` if no path over it is found.
+        horizon, longest: requested and longest duration, s; the slew is stretched if no path over `horizon`
+            is found.
         time_cost: cost of time, W; None keeps the horizon, MINIMUM_TIME minimises it.
         cones: exclusion cones kept during the whole slew.
-        nodes: intervals of the collocation.
+        nodes: number of collocation intervals.
     """
 
     craft: SlewCraft

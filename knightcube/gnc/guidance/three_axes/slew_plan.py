@@ -62,10 +62,10 @@ from knightcube.gnc.guidance.three_axes.slew_search import GRIDS, GRIDS_WITH_CON
 STRETCH = 3.0
 """Longest slew of `plan_slew` without `longest`, as a multiple of `duration`."""
 _STEPS = 4
-"""Runge-Kutta steps per interval, an even number."""
+"""Number of Runge-Kutta steps per collocation interval, which must be even."""
 _ROUNDS, _CLOSED, _LOST = 6, 1e-7, 1e-4
-"""Largest number of corrections, and the errors at the nodes (rad, half an angle) below which a path is
-closed and above which it cannot be closed."""
+"""Largest number of corrections of a path, and the node errors (half angles, rad) at which the corrections
+succeed and fail."""
 
 
 def closed(
@@ -145,11 +145,11 @@ class SlewPlan:
     Attributes:
         path: the path.
         status: whether the requested horizon was kept.
-        horizon_asked, horizon: s.
-        energy: J, heat of the coils.
-        peak: largest ratio of a dipole to its limit.
-        clearance: rad, smallest distance outside each cone, in the order of the task's cones.
-        steps: Newton steps over all guesses.
+        horizon_asked, horizon: requested and planned duration, s.
+        energy: heat of the coils during the slew, J.
+        peak: largest ratio of a coil's dipole moment to its limit.
+        clearance: smallest angle between the path and each cone, in the order of the task's cones, rad.
+        steps: number of Newton steps over all initial guesses.
     """
 
     path: SlewPath
@@ -281,14 +281,14 @@ class SlewOrder:
     Attributes:
         craft: the model of the satellite.
         axes: the pointing axes, to which the targets refer.
-        camera: (3,) the axis that keeps the exclusion cones.
+        camera: body axis (3,) that stays outside the exclusion cones.
         start: the target that is held until the slew begins; a free roll is taken as zero.
         goal: the target at the end; with a free roll only its direction counts.
-        horizon, longest: s, as in `SlewTask`.
-        window: s, within which the slew begins.
-        time_cost: W, as in `SlewTask`.
-        angles: rad, of the exclusion cones of `sun`, `earth` and `moon`.
-        nodes: intervals of the collocation.
+        horizon, longest: requested and longest duration of the slew, s.
+        window: duration of the interval in which the slew may begin, s.
+        time_cost: cost of time, W (see `SlewTask`).
+        angles: half angles of the exclusion cones of `sun`, `earth` and `moon`, rad.
+        nodes: number of collocation intervals.
     """
 
     craft: SlewCraft
@@ -349,7 +349,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
         except PlanningError as error:
             failed = error
         else:
-            # First the stretched horizon, then the cost.
+            # Plans are compared first by the stretch of the horizon, then by the cost.
             if order.time_cost is None:
                 value = (plan.horizon if plan.status is SlewStatus.STRETCHED else 0.0, plan.energy)
             elif math.isinf(order.time_cost):

@@ -44,7 +44,7 @@ node."""
 EQUATIONS: IntArray = np.r_[10:17, 24:31]
 """Positions of an interval's 14 equation multipliers among its 31 unknowns and multipliers."""
 _BAND = 33
-_ROWS = 3 * _BAND + 1  # LAPACK's, with room for the pivots
+_ROWS = 3 * _BAND + 1  # rows of LAPACK's band storage, with room for pivots
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +57,7 @@ class BandLayout:
         equations: (k, 14).
         start: (7,).
         end: (ends,).
-        begins: (k + 1,) first element of each interval and of the last node.
+        begins: index (k + 1,) of the first element of each interval and of the last node.
         places, entries: indices of the elements of the band that the intervals fill, and of the block
             elements that fill them.
     """
@@ -165,9 +165,9 @@ class LinearisedEquations:
 
     Attributes:
         at: the trajectory.
-        between: (k, 14) residuals of the intervals.
-        begun: (7,) residuals of the start.
-        ended: (ends,) residuals of the end.
+        between: residuals (k, 14) of the intervals' equations.
+        begun: residuals (7,) of the start conditions.
+        ended: residuals (ends,) of the end conditions.
         jacobian: (k, 14, WIDE) derivatives of the intervals' equations.
         ending: (ends, 7) derivatives of the end's equations by the last state.
     """
@@ -404,8 +404,8 @@ class Iterate:
 
     Attributes:
         linear: the equations linearised about its trajectory.
-        multipliers: (size,) of the equations, at their indices.
-        slack, dual: of every limit.
+        multipliers: Lagrange multipliers (size,) at the indices of the equations.
+        slack, dual: slack variable and dual variable of every limit.
         slope: (size,) derivative of the Lagrangian without the limits, with the residuals of the equations at
             their positions.
     """
@@ -628,7 +628,7 @@ class NewtonRun:
 
 
 def _share(values: FloatArray, change: FloatArray) -> float:
-    """Return the largest share of a change, at most one, that keeps positive values positive."""
+    """Return the largest fraction of a change, at most one, that keeps positive values positive."""
     falling = change < 0.0
     if not falling.any():
         return 1.0

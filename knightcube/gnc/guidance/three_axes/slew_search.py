@@ -51,7 +51,7 @@ from knightcube.gnc.guidance.three_axes.slew_program import (
 )
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
-"""Last barrier parameters of a path for a warm start, and of a path that is flown."""
+"""Last barrier parameters of a path for a warm start, and of a final path."""
 MET, _FLOWN_MET = 1e-2, 3e-3
 """Constraint violations below which an iterate is accepted before it is optimal, as a warm start and as a
 path to fly. Many runs converge slowly. The final integration of the path removes the residuals."""
@@ -87,10 +87,10 @@ class SolvedPath:
 
 
 class SlewSolver:
-    """Solves for paths of one task; `unit` A m^2 is the unit of its dipoles.
+    """A solver for the paths of one task; `unit` A m^2 is the unit of its dipoles.
 
-    `extra` (cones, 2 nodes) rad widens the cones at the points of the fine grid. `share` is the part of the
-    dipole limit that is used. `steps` counts the Newton steps, `work` the steps times their intervals.
+    `extra` (cones, 2 nodes) rad widens the cones at the points of the fine grid. `share` is the fraction of
+    the dipole limit that is used. `steps` counts the Newton steps, `work` the steps times their intervals.
     """
 
     def __init__(self, task: SlewTask) -> None:
@@ -366,7 +366,7 @@ class _MomentumFit:
         )
 
     def _end_errors(self, q: FloatArray) -> FloatArray:
-        """Return the end-point errors (m, 3), rad, of paths (m, n, 4). For a boresight they are sines."""
+        """Return the end-point errors (m, 3), rad, of paths (m, n, 4), as sines for a boresight."""
         end, last = self._end, q[:, -1]
         if isinstance(end, BoresightEnd):
             return shown(last, np.broadcast_to(end.direction, (len(q), 3))) - end.axis
@@ -475,8 +475,8 @@ class HorizonContinuation:
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
         """Return a path near one that crosses cones between the points; None if there is none.
 
-        `depths` (cones, 2 nodes) rad are the depths inside the cones between each two points. The last point
-        stays in place.
+        `depths` (cones, 2 nodes) rad are the depths inside the cones between each two points. The cones at
+        the last point of the path are not widened.
         """
         wider = np.where(depths > 0.0, _CROSSED * depths + _BEYOND, 0.0)
         both = wider.copy()
@@ -702,7 +702,7 @@ class SlewSearch:
             if (kept and energy(start) >= min(map(energy, kept))) or self.solver.work > self._budget:
                 break
             if any(math.isclose(energy(start), known, rel_tol=1e-4) for known in self._known):
-                continue  # already tried without success
+                continue  # a path of this energy was already tried without success
             self._known.append(energy(start))
             found = self._walker.within(start)
             if found is not None:
