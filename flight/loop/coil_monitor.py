@@ -298,7 +298,7 @@ class CoilMonitorSettings:
         probe_current: amplitude (A) of the square wave that reveals which of the undriven axes is faulty.
         probe_half_ns: half the period (ns) of the probe's square wave.
         response: settings for judging coils by the body's motion; None if the motion is not used.
-        slow: settings as `response` with longer bins, for torques of currents below the monitor's noise.
+        slow: as `response`, but with longer bins, which reveal missing torque at small currents.
         tumble_rate: body rate (rad/s) above which a coil that looks reversed is not isolated but kept at zero
             current.
     """

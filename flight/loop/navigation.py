@@ -71,7 +71,7 @@ class Navigation:
         self._facts = services.facts
         self._streams = services.streams
         self._since_ns = 0
-        self._received_ns = 0  # times (ns): newest reading, newest agreeing reading
+        self._received_ns = 0  # time (ns) of the newest reading
         self._agreed_ns = 0
         self._link = unit.link()
         self._bytes_since_ns = 0

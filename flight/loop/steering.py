@@ -2,8 +2,8 @@
 
 The coil drive excludes failed axes, and reallocates the current among the remaining axes so that the
 direction of the torque is preserved. The sent commands are compared with the supply current and the body's
-motion (`flight.loop.coil_monitor`). A verdict on an axis activates a fact. The fact reports an event, whose
-reaction excludes the axis.
+motion (`flight.loop.coil_monitor`). A verdict that a coil is broken activates a fact. The fact reports an
+event, whose reaction excludes the axis.
 """
 
 from __future__ import annotations
