@@ -163,7 +163,8 @@ def directions_of_bodies(julian_date: float) -> dict[str, FloatArray]:
 
 
 _SAME_PX = 0.1
-"""Distance (px) between optical axis and image centre above which the report states both."""
+"""Distance (px) between optical axis and image centre above which the report states the coordinates of
+each."""
 
 
 def sky_facts(sky: SkyMap | None, bodies: Sequence[SkyBody]) -> dict[str, Any]:

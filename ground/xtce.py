@@ -2,10 +2,10 @@
 
 `python -m ground.xtce [--epoch UTC] [--verified] > knightcube.xml`
 
-The document uses only features that the known clients read. It has one flat space system, one parameter per
-array element (`rate_1`), names without `. / : [ ]`, zero-terminated texts, and a header of fixed values in
-each telecommand. A parameter is named `<packet>_<field>`. Yamcs counts mission time from the epoch in the
-document.
+The document uses only features that the known clients read. The document has one flat space system, one
+parameter per array element (`rate_1`), names without `. / : [ ]`, zero-terminated texts, and a header of
+fixed values in each telecommand. A parameter is named `<packet>_<field>`. Yamcs counts mission time from the
+epoch in the document.
 """
 
 from __future__ import annotations

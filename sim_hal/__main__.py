@@ -1,7 +1,7 @@
 """Command line of `python -m sim_hal`, which serves emulated devices to any client.
 
-The command `emulate` serves one device. The command `serve` serves the simulated hardware of a configuration
-in real time.
+The command `emulate` serves one emulated device. The command `serve` serves the simulated hardware of a
+configuration in real time.
 """
 
 from __future__ import annotations

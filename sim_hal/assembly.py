@@ -143,7 +143,7 @@ def assemble(
     faults = FaultTimeline()
     if truth is not None:
         truth.watch(world)
-    # Devices whose events fall on the same time run in this order.
+    # Devices with events at the same time run in the order of this list.
     devices: list[EmulatedDevice | None] = [unit, camera, orbit.gps, *orbit.wide, faults, truth]
     simulation = TimedSimulation(world.advance_to, [device for device in devices if device is not None])
     return Hardware(

@@ -91,10 +91,10 @@ class TimedSimulation:
 
 
 class TimedWorld(Protocol):
-    """A world that a SimClock advances."""
+    """A simulated world that a SimClock advances."""
 
     def next_event_ns(self) -> int:
-        """Return the time of the next event."""
+        """Return the time of the world's next event."""
 
     def run_events(self, event_ns: int) -> None:
         """Process the events at `event_ns`, which is the time of the next event."""
@@ -179,7 +179,7 @@ class SimTicker(ContainedJob):
         self._busy = False
 
     def kick(self) -> None:
-        """Run the job now and restart its period."""
+        """Run the job now, and restart the period of the job."""
         self.due_ns = self._clock.now_ns() + self.period_ns
         self.run()
 

@@ -71,7 +71,7 @@ class SimulationRequest:
 
     Attributes:
         config_path: path of the configuration file.
-        text: text of the configuration, including faults that corrupt it.
+        text: text of the configuration as flown, with any injected corruption.
         out: folder of the run, in which the log of the true state is written.
         realtime: whether the devices run in a server process.
         seed: random seed that replaces the seed of the configuration, or None.

@@ -1,8 +1,9 @@
 """The `simulation` section of a configuration: the true properties of the world.
 
-A true constant that this section omits is taken from the flight configuration. A constant given here makes
-the world differ from the flight software's model. Units are SI unless the name states another unit. In
-`free_body`, each disturbance is given as a multiple of its worst case, and zero switches the disturbance off.
+A true constant that the `simulation` section omits is taken from the flight configuration. A constant given
+here makes the world differ from the flight software's model. All values are in SI units unless the name of
+the key states another unit. In `free_body`, each disturbance is given as a multiple of its worst case, and
+zero switches the disturbance off.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
 
 
 class OrbitSection(Section, frozen=True, kw_only=True):
-    """The orbit at simulation time zero; `altitude` (m) is the semi-major axis minus the Earth's radius.
+    """The orbit of the craft at simulation time zero.
+
+    `altitude` (m) is the semi-major axis minus the Earth's radius.
 
     `local_time`, the mean local time of the ascending node in hours, overrides `ascending_node_deg`.
     """
@@ -105,7 +108,7 @@ class Thread(Section, frozen=True, kw_only=True):
 
 
 class ImuNoise(Section, frozen=True, kw_only=True):
-    """Errors of the inertial unit.
+    """Errors of the emulated inertial unit.
 
     `quaternion_noise` and `rate_noise` (rad/s) bound the uniform noise of quaternion and rate. `profile:
     datasheet` adds the white noise of the unit's data sheet and a random bias at each start. `gyro_bias`
@@ -140,7 +143,8 @@ class Truth(Section, frozen=True, kw_only=True):
 class CageTruth(Section, frozen=True, kw_only=True):
     """The magnetic field of the simulated cage; `orbit` is the orbit at simulation time zero.
 
-    `gain` is the ratio of the cage's field to the commanded field. `ring_current` is a multiple of 20 nT.
+    `gain` is the ratio of the cage's field to the commanded field. `ring_current` scales the mean field of
+    the ring current, 20 nT.
     """
 
     orbit: OrbitSection = OrbitSection()
@@ -214,7 +218,7 @@ class OrbitDeviceTruth(Section, frozen=True, kw_only=True):
     `gps_walk` and `gps_noise` (m) are the standard deviations of the slow error and the white noise of each
     axis. `gps_start` (s) is the time from power-on to the first fix. `string_gain` is the relative standard
     deviation of the gains of the solar cell strings, and `string_noise` (A) the standard deviation of the
-    noise of their currents. `albedo` is the albedo of the Earth.
+    noise of their currents. `albedo` is the mean reflectance of the Earth, from 0 to 1.
     """
 
     gps_walk: NotNegative = 2.0

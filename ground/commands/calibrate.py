@@ -27,7 +27,7 @@ from knightcube.vision.lens_calibration import (
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this command to the parser."""
+    """Add the arguments of `flight calibrate` to the parser."""
     parser.description = (
         "Calibrate a camera from pictures of the night sky: focal length, optical axis and radial "
         "distortion, with their errors. All pictures must be of one camera at one focus; pictures that do "

@@ -37,7 +37,7 @@ _MAX_EXPOSURES = 8
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this command to the parser."""
+    """Add the arguments of `flight camera` to the parser."""
     parser.description = (
         "Take frames from the camera of a configuration, real or simulated, one per trigger. Print the "
         "number of each frame, its delay after the end of the exposure, and its counts. --out writes the "

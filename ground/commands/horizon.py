@@ -50,7 +50,7 @@ from knightcube.vision.horizon.settings import (
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this command to the parser."""
+    """Add the arguments of `flight horizon` to the parser."""
     parser.description = (
         "Find the Earth's limb in a picture and the direction to the Earth's centre in camera axes: z along "
         "the boresight, x to the right, y down. The picture is a PNG, TIFF, JPEG or FITS file, grey or "

@@ -60,7 +60,7 @@ class _Identified:
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this command to the parser."""
+    """Add the arguments of `flight identify` to the parser."""
     parser.description = (
         "Identify torque constant, thread stiffness and damping from a short flight with pulses of the "
         "coil on x and free swings, on the testbed or simulated, or from the folder of an earlier flight. "
@@ -146,7 +146,7 @@ def _fly(options: argparse.Namespace) -> Path:
 
 
 def _identify(folder: Path) -> _Identified:
-    """Fit the flight in a folder."""
+    """Fit the constants to the flight log in a folder."""
     config = configuration.load_testbed(folder / "config.yaml")
     record = read_record(read_run(folder), config.coils.stale_after)
     with_line = sys.stderr.isatty()

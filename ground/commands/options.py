@@ -18,7 +18,7 @@ _RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)")
 
 
 def add_picture(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that name a picture."""
+    """Add the arguments that name a picture file."""
     parser.add_argument("image", type=Path, metavar="IMAGE", help="PNG, TIFF, JPEG, BMP, FITS, or see --raw")
     parser.add_argument(
         "--raw",
@@ -29,7 +29,7 @@ def add_picture(parser: argparse.ArgumentParser) -> None:
 
 
 def add_field(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
-    """Add the arguments that describe the camera; if `required`, the user must give exactly one of them."""
+    """Add the arguments that describe the camera; if `required`, the user must give exactly one."""
     group = parser.add_mutually_exclusive_group(required=True) if required else parser
     group.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
     group.add_argument(
@@ -62,7 +62,10 @@ def check_size(path: Path, pixels: Image) -> None:
 
 
 def raw_shape(text: str) -> tuple[int, int, int]:
-    """Return columns, rows and bits. Raises ArgumentTypeError unless they are given as 1280x960x16."""
+    """Return the columns, rows and bits of a raw picture.
+
+    Raises ArgumentTypeError unless the text has the form 1280x960x16.
+    """
     found = _RAW.fullmatch(text)
     if found is None or "0" in found.groups():
         raise argparse.ArgumentTypeError(f"{text!r}: give columns x rows x bits, such as 1280x960x16")
@@ -73,7 +76,7 @@ def raw_shape(text: str) -> tuple[int, int, int]:
 def positive(text: str) -> float:
     """Return the positive number in an argument.
 
-    Raises ArgumentTypeError unless it is finite and positive.
+    Raises ArgumentTypeError unless the number is finite and positive.
     """
     value = finite(text)
     if value <= 0.0:
@@ -82,7 +85,10 @@ def positive(text: str) -> float:
 
 
 def finite(text: str) -> float:
-    """Return a finite number from an argument's text. Raises ArgumentTypeError unless it is finite."""
+    """Return a finite number from an argument's text.
+
+    Raises ArgumentTypeError unless the number is finite.
+    """
     try:
         value = float(text)
     except ValueError as error:

@@ -41,7 +41,7 @@ _ORBIT_ONLY = ("at", "within", "longest", "window", "least_time", *(f"{name}_con
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this command to the parser."""
+    """Add the arguments of `flight plan` to the parser."""
     parser.description = (
         "Plan the least-energy slew between two attitudes, of the testbed by virtual motion camouflage, or "
         "with --orbit of a satellite in three axes; print it or draw it. A horizon that is too short is "
@@ -65,7 +65,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the optional arguments."""
+    """Add the optional arguments of `flight plan`."""
     parser.add_argument("--horizon", type=finite, metavar="S", help="seconds (default: the configuration's)")
     parser.add_argument(
         "--time-price",
@@ -90,7 +90,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Plan a slew, print and draw it."""
+    """Plan a slew, and print and draw the result."""
     in_orbit = options.orbit is not None
     for name in _TESTBED_ONLY if in_orbit else _ORBIT_ONLY:
         if getattr(options, name) not in (None, False):
@@ -100,7 +100,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _run_testbed(options: argparse.Namespace) -> int:
-    """Plan a path of the testbed, print and draw it."""
+    """Plan a path of the testbed, and print and draw the path."""
     start, end = _q2("--from", options.start), _q2("--to", options.end)
     _check(options)
     config = configuration.load_testbed(options.config or config_path(_DEFAULT_CONFIG))
@@ -226,7 +226,7 @@ def _add_orbit_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_orbit(options: argparse.Namespace) -> int:
-    """Plan a slew in orbit, print and draw it."""
+    """Plan a slew in orbit, and print and draw the slew."""
     if options.at is None or options.within is None:
         raise UsageError("--orbit needs --at UTC and --within S")
     config = as_orbit(configuration.load(options.orbit))

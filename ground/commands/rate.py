@@ -35,7 +35,7 @@ _SHUTTER = (
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this command to the parser."""
+    """Add the arguments of `flight rate` to the parser."""
     parser.description = (
         "Estimate the mean body rate over one exposure from the star streaks in a picture: PNG, TIFF, "
         "JPEG or FITS of 8 or 16 bits. The rate is of the camera, in its frame: boresight +z, x right, y "

@@ -139,7 +139,7 @@ def configure_orbit(parser: argparse.ArgumentParser) -> None:
 
 
 def run_orbit(options: argparse.Namespace) -> int:
-    """Determine the orbits, print and write them."""
+    """Determine, print and write the initial orbits."""
     found = orbits_of(read_run(options.run))
     paths = [] if options.opm is None else write_orbit_messages(found, options.opm)
     if options.json:

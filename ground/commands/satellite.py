@@ -89,7 +89,7 @@ Object = dict[str, Any]
 _DIRECTIVES = ("play", "stop-playback", "new-key", "schedule", "unschedule", "list-schedule")
 _ORIGINS = {field.name: dict(field.states) for field in PARAMETERS.fields if field.name == "table"}
 _RATE = 20_000.0
-"""Default rate of frames up (bytes/s)."""
+"""Default rate of frames to the satellite (bytes/s)."""
 _SILENCE_S = 60.0
 """Default time (s) without a packet after which a file command fails."""
 _TURN_S = 0.01
@@ -403,7 +403,10 @@ def _change(text: str) -> tuple[str, float]:
 
 
 def _parameters_in(path: Path) -> dict[str, float]:
-    """Return the parameter table in a file. Raises ConfigError, UsageError."""
+    """Return the parameter table in a file.
+
+    Raises ConfigError for an invalid table, and UsageError for an unreadable file.
+    """
     document = read_document(read_text(path), str(path))
     values: dict[str, float] = {}
     for section, entries in document.values.items():
@@ -486,7 +489,7 @@ def run_files(options: argparse.Namespace) -> int:
 
 
 class _FileWork:
-    """Execution of one file command with a session."""
+    """Runner of one `flight files` command over a link session."""
 
     def __init__(
         self, session: FileSession, terminal: Terminal, patience_s: float, ended: Callable[[], bool]

@@ -51,7 +51,7 @@ IMAGE = "image"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this command to the parser."""
+    """Add the arguments of `flight solve` to the parser."""
     parser.description = (
         "Determine where a picture of the sky points: right ascension, declination and roll (the position "
         "angle of up, from north through east), ICRS; which stars it shows; and, from star streaks, "

@@ -80,7 +80,7 @@ def configure_gateway(parser: argparse.ArgumentParser) -> None:
 
 
 def run_gateway(options: argparse.Namespace) -> int:
-    """Relay packets until a signal."""
+    """Relay packets until a signal arrives."""
     token = new_token()
     with contextlib.closing(terminal_of(options)) as terminal:
         gateway = Gateway(
@@ -118,7 +118,7 @@ def configure_watch(parser: argparse.ArgumentParser) -> None:
 
 
 def run_watch(options: argparse.Namespace) -> int:
-    """Show a flight until it ends, its log stops growing, or a signal."""
+    """Show a flight until the flight ends, the log stops growing, or a signal arrives."""
     folder = Path(options.flight)
     if folder.is_socket() or (":" in options.flight and not folder.exists()):
         return _watch_socket(options)
@@ -217,7 +217,7 @@ def _facts(state: FlightState) -> dict[str, Any]:
 
 
 def _watch_socket(options: argparse.Namespace) -> int:
-    """Request the state of a flight until it does not answer, or a signal."""
+    """Request the state of a flight until the flight does not answer or a signal arrives."""
     once, answered, state = options.once or options.json, False, FlightState()
     with _ending() as ended:
         for answer in answers(options.flight, options.patience, ended):

@@ -82,7 +82,7 @@ class CommandForms:
 
     @property
     def possible(self) -> bool:
-        """Whether commands can be sent."""
+        """Whether the console can send commands."""
         return self._send is not None
 
     def text(self, name: str, given: Object) -> str:
@@ -157,7 +157,7 @@ class LinkFeed:
 
     @property
     def silence(self) -> float:
-        """Time without telemetry, s."""
+        """Time (s) since the last telemetry."""
         return time.monotonic() - self._received
 
     def new(self) -> dict[str, PacketArray]:
@@ -180,7 +180,7 @@ class LinkFeed:
         return found
 
     def send(self, packet: bytes) -> Object:
-        """Send a command and return its state after acceptance. Raises FlightError without a report."""
+        """Send a command and return its state after acceptance. Raises FlightError if no report arrives."""
         with self._lock:
             counter = self._terminal.send(packet, _SPI)
         until = time.monotonic() + _ANSWER_S
@@ -195,7 +195,7 @@ class LinkFeed:
         raise FlightError(f"no answer over the link within {_ANSWER_S:g} s")
 
     def close(self) -> None:
-        """Store the counters and close the line."""
+        """Store the frame counters and close the line."""
         self._terminal.close()
 
 
@@ -203,7 +203,7 @@ class LinkFeed:
 def flying(config: Path, out: Path) -> Iterator[str]:
     """Fly a simulated configuration into `out` in real time and yield the flight's command socket.
 
-    The flight ends with the context. Raises FlightError if it does not start.
+    The flight ends when the context is left. Raises FlightError if it does not start.
     """
     text = read_text(config)
     parsed = parse(text, str(config))

@@ -24,7 +24,7 @@ from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
 LISTED = ("event", "command", "verification", "streak", "stars", "sightings")
-"""Packet types that the page lists one by one; of other types it shows only the newest packet."""
+"""Packet types that the page lists one by one; of other types the page shows only the newest packet."""
 MAX_SPEED = 1000.0
 """Highest speed of a replay, as multiple of real time."""
 _MAX_LISTED = 500
@@ -50,7 +50,7 @@ class History:
         self._folder.cleanup()
 
     def append(self, packets: Mapping[str, PacketArray]) -> None:
-        """Append packets in order of arrival."""
+        """Append packets to the history in order of arrival."""
         for name, rows in packets.items():
             if len(rows):
                 self._tracks[name].append(rows)

@@ -60,7 +60,7 @@ class PacketFeed(Protocol):
 
     @property
     def silence(self) -> float:
-        """Time without new packets, s."""
+        """Time (s) since the last new packets."""
 
     def new(self) -> dict[str, PacketArray]:
         """Return the new packets by name since the last call. Raises FlightError."""
@@ -76,9 +76,9 @@ class Console:
         history: packets received so far.
         surroundings: orbit and devices of the flight.
         forms: sender of commands from the page.
-        utc_ns: UTC at mission time zero, ns, None until it is known.
+        utc_ns: UTC at mission time zero, ns, or None while unknown.
         flight_received: monotonic time of the last packet of the flight itself, s.
-        frames: kept camera frames.
+        frames: camera frames that the flight has kept.
         trouble: reason why the last read failed, or an empty text.
         settled_ns: newest time (ns) of which all packets have been received, which the live page shows.
         sockets: open WebSockets.
@@ -159,7 +159,7 @@ def refusal(headers: Mapping[str, str], origin_required: bool) -> str:
 
 
 def application(console: Console, access: Access) -> web.Application:
-    """Return the web application; `console` must have been read once."""
+    """Return the web application; The packets of `console` must have been read once before."""
 
     @web.middleware
     async def only_own_page(request: web.Request, handler: _Handler) -> web.StreamResponse:
@@ -302,7 +302,7 @@ class _Pages:
         return await asyncio.get_running_loop().run_in_executor(self._drawing, make, sequence)
 
     async def words(self, request: web.Request) -> web.StreamResponse:
-        """Answer with the text of a command before it is sent."""
+        """Answer with the text of a command for confirmation before the command is sent."""
         name, given = await _command_of(request)
         return web.json_response({"words": self._console.forms.text(name, given)})
 

@@ -23,7 +23,7 @@ from knightcube.vision.camera.images import facts_of
 
 Object = dict[str, Any]
 _TRACK_STEP, _TRACK_HALF = 60.0, 5700.0
-"""Step (s) of the ground track, and the time (s) that it covers before and after the present."""
+"""Step (s) of the ground track, and the time (s) before and after the present that the track covers."""
 _MAX_SIDE = 640
 """Largest side of a picture on the page (px)."""
 _DARK, _BRIGHT = 50.0, 99.9
@@ -101,7 +101,7 @@ class FlightSurroundings:
 
 
 UNKNOWN = FlightSurroundings(None, None)
-"""Surroundings without a configuration."""
+"""Surroundings of a flight whose configuration cannot be read."""
 
 
 def _julian_date(utc_ns: int) -> float:
@@ -156,7 +156,10 @@ class FrameFolder:
 
 
 def pixels_of(data: bytes) -> Image:
-    """Return a view of the pixels (rows, columns) of a kept frame. Raises ValueError for another file."""
+    """Return a view of the pixels (rows, columns) of a kept frame.
+
+    Raises ValueError if the file has another size.
+    """
     parts = data.split(b"\n", 4)
     if len(parts) != 5 or parts[0] != b"P5":
         raise ValueError("not a kept frame")

@@ -15,9 +15,10 @@ priors are wide and matter only for records that do not determine a value. The p
 ms, and the prior noise levels are uncertain by a factor of 3. Events that no noise explains, such as the
 release, a jolt or an outlier, restart the filter.
 
-The covariance is the inverse of the information if the innovations are white (test of Ljung and Box 1978).
-Otherwise each standard deviation is at least that of the sandwich estimate (Huber 1967) over segments of the
-record. Innovations are not white because of the inertial unit's attitude filter or air currents.
+The covariance is the inverse of the information if the innovations are white (test of Ljung and Box 1978). If
+the innovations are not white, each standard deviation is at least the sandwich estimate (Huber 1967) over
+segments of the record. Innovations are not white because of the inertial unit's attitude filter or air
+currents.
 """
 
 from __future__ import annotations
@@ -200,7 +201,7 @@ class _Predictor:
         self._by_angle, self._by_rate = np.zeros(len(NAMES)), -self._bias_row
 
     def distance(self, angle: float, rate: float) -> float:
-        """Return the larger normalised innovation of angle and rate."""
+        """Return the larger one of the normalised innovations of angle and rate."""
         by_angle = (angle - self._angle) ** 2 / (self._paa + self._r_angle)
         by_rate = (rate - self._rate - self._constants.bias) ** 2 / (self._pbb + self._r_rate)
         return math.sqrt(max(by_angle, by_rate))
@@ -384,7 +385,10 @@ def _gated(
 def _finished(
     record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int]
 ) -> PlantFit:
-    """Return the fit with its covariance. Raises IdentificationError if the gain is uncertain or negative."""
+    """Return the fitted constants with their covariance.
+
+    Raises IdentificationError if the gain is uncertain or negative.
+    """
     passed = innovations(record, constants, noise, restarts)
     covariance = _inverse(_step(passed, constants)[1])
     whiteness = _whiteness(passed.whitened)

@@ -153,7 +153,10 @@ def _sample_times(imu: PacketArray) -> FloatArray:
 def _currents(
     control: PacketArray, stale_after: float, limit: float
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return switch times, currents and whether they are at the `limit`, with a zero after stale commands."""
+    """Return switch times, coil currents, and whether each current is at the `limit`.
+
+    A current of zero is inserted where the driver switched the coils off after stale commands.
+    """
     time = control["time_ns"] * 1e-9
     requested, written = (
         control[name][:, 0].astype(float) for name in ("current_command", "current_written")

@@ -28,7 +28,8 @@ from knightcube.errors import FlightError, UsageError
 
 Show = Callable[[Report], object]
 _BLOCK = 64
-"""Number of frame counters reserved at once; a command of another process discards the remaining counters."""
+"""Number of frame counters reserved at once; a command by another process makes the remaining counters
+unusable."""
 _REPEAT_NS = 5_000_000_000
 """Time (ns) after which an unanswered command is sent again."""
 _BURST_S = 0.05
@@ -49,7 +50,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
     if host and port.isdigit() and not Path(to).exists():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             return _ask(line, (host, int(port)), data, timeout, to)
-    # The service `deploy/knightcube.service` has a private /tmp, so this socket is beside the flight's.
+    # A flight run by `deploy/knightcube.service` cannot see /tmp, so this socket is beside its socket.
     beside = Path(to).absolute().parent
     place = beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
     with (
@@ -102,7 +103,10 @@ def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExc
 
 
 def terminal_of(options: argparse.Namespace) -> Terminal:
-    """Return the terminal for the link options. Raises UsageError, FlightError."""
+    """Return the terminal for the link options.
+
+    Raises UsageError for invalid options, and FlightError if the link cannot be opened.
+    """
     if options.keys is None:
         raise UsageError("--link needs --keys, the ground's folder of `python -m ground keys`")
     settings = TerminalSettings(options.spacecraft, options.frame_bytes)

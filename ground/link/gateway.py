@@ -76,7 +76,7 @@ class _HeaderForm:
     version: int
 
     def begins(self, header: bytes) -> bool:
-        """Return whether a packet of this type can begin with these bytes."""
+        """Return whether a packet of this type can begin with the bytes `header`."""
         if header[:2] != self.identifier[: len(header)]:
             return False
         if len(header) > 2 and header[2] >> 6 != _UNSEGMENTED:
@@ -198,7 +198,7 @@ class Gateway:
     Attributes:
         down: number of telemetry packets relayed.
         up: number of commands sent.
-        refused: number of connections closed because they did not send the token, or sent an invalid byte.
+        refused: number of connections closed for a missing token or an invalid byte.
     """
 
     def __init__(

@@ -177,7 +177,7 @@ class Terminal:
                     return
 
     def close(self) -> None:
-        """Store the counters and close the line."""
+        """Store the frame counters and close the line."""
         self.gate.close()
         self._line.close()
 

@@ -1,6 +1,6 @@
 """Pictures of a run of the testbed (Sease 2013, Figures 5.9 to 5.11), of a planned path and of a fit.
 
-They are drawn with matplotlib's Figure objects, without the global state of pyplot.
+The pictures are drawn with matplotlib's Figure objects, without the global state of pyplot.
 """
 
 from __future__ import annotations

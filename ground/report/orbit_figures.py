@@ -352,7 +352,7 @@ def _cones(ax: Axes, cones: tuple[Cone, ...], ends: FloatArray) -> Iterator[Patc
 
 
 def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
-    """Draw the torque that the motion requires, across the magnetic field and along it."""
+    """Draw the torque that the motion requires across and along the magnetic field."""
     task, path = made.task, made.plan.path
     reference, craft, around = path.references(times), task.craft, task.along(times)
     q = reference.quaternion

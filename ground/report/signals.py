@@ -67,7 +67,7 @@ class PowerHistory:
     def average(self, power: FloatArray, begin: float = -np.inf, end: float = np.inf) -> float:
         """Return the mean of `supply` or `heat` over the intervals from `begin` to `end` s, W.
 
-        Returns NaN if no interval lies between them.
+        Returns NaN if no interval lies between `begin` and `end`.
         """
         inside = (self.time >= begin) & (self.time < end)
         spans = self.spans[inside]
@@ -134,8 +134,8 @@ def coil_power(run: Run) -> PowerHistory | None:
 def bus_power(run: Run) -> tuple[FloatArray, FloatArray]:
     """Return the times (n,), s, and the power (n,), W, measured by the monitor in the coils' supply.
 
-    The power is the bus voltage, before the losses of the bridges, times the current of all coils. Both
-    arrays are empty without a monitor.
+    The power is the bus voltage, before the losses of the bridges, times the current of all coils. The arrays
+    of times and power are empty without a monitor.
     """
     packets = run["housekeeping"]
     packets = packets[np.isfinite(packets["coil_power"])]

@@ -84,7 +84,7 @@ class StepResponse:
 def commanded_steps(
     indices: Sequence[int], times: FloatArray, targets: FloatArray, release_q2: float, end: float
 ) -> list[StepCommand]:
-    """Return the steps between targets.
+    """Return the commanded attitude steps between successive targets.
 
     Args:
         indices: numbers (n,) of the steps in the configuration.
@@ -104,7 +104,7 @@ def commanded_steps(
 def flown_steps(
     commanded: Sequence[StepCommand], time: FloatArray, q2: FloatArray, stops: FloatArray
 ) -> list[StepCommand]:
-    """Return the steps as flown, which start at the body's attitude and end when a mode change ended them.
+    """Return the steps as flown, which start at the body's attitude and may end early by a mode change.
 
     Args:
         commanded: steps between targets.
@@ -186,7 +186,7 @@ def _interpolate(t: FloatArray, y: FloatArray, i: int, level: float) -> float:
 def judged_steps(
     run: Run, attitude: ThreadMotion, planned_end: float, notes: list[str]
 ) -> list[tuple[StepCommand, StepResponse | None]]:
-    """Return each commanded step with its response, or None if it was interrupted or is not in the log.
+    """Return each commanded step with its response, or None for an interrupted or unrecorded step.
 
     The reasons for missing numbers are appended to `notes`.
     """

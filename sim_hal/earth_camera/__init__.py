@@ -6,8 +6,8 @@
 
 The module `scene` holds the positions of camera, Earth and Sun, the atmosphere, and the radiance along lines
 of sight. The module `image` holds the camera's parameters and models the optics, the Sun's disc and the
-detector. The unit of radiance is that of a white Lambertian surface with the Sun at the zenith. In this unit
-the Sun's disc has a radiance of 46,000.
+detector. Radiance is stated relative to that of a white Lambertian surface with the Sun at the zenith, so the
+radiance of the Sun's disc is 46,000.
 """
 
 from sim_hal.earth_camera.image import EarthCameraModel, expected_radiance, render

@@ -189,7 +189,7 @@ def add_disc(scene: EarthScene, model: EarthCameraModel, image: Float32Array) ->
     # Squared chords are more accurate than cosines for angles as small as the Sun's radius.
     share = np.sum((rays - axis) ** 2, axis=1) / (2.0 * math.sin(0.5 * radius)) ** 2
     fine = np.zeros(len(rays))
-    # Rays outside the lens's field are NaN, for which this comparison is false.
+    # Rays outside the lens's field are NaN, and a comparison with NaN is false.
     inside = np.flatnonzero(share < 1.0)
     fine[inside] = darkening(share[inside]) * transmission(scene, rays[inside])
     fine *= (1.0 - model.scatter) / math.sin(radius) ** 2
@@ -208,8 +208,8 @@ def add_glare(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -
 
     The scattered radiance decreases from its centre as 1/(1 + (s/s0)^2) with the chord s, which is the
     Harvey-Shack model for polished optics with a slope of two. The fraction `scatter` of the light is
-    scattered over the hemisphere. The lens has no hood, so sunlight reaches it from the whole half space in
-    front of the camera.
+    scattered over the hemisphere. The lens has no hood, so sunlight reaches the lens from the whole half
+    space in front of the camera.
     """
     axis, _ = towards_sun(scene)
     if axis[2] <= 0.0 or model.scatter == 0.0:
@@ -240,7 +240,7 @@ def _window(
     rim = rim[~np.isnan(rim[:, 0])]
     if not len(rim):
         return None
-    # The rim is clipped before the cast to int, because it overflows near 90 deg from the optical axis.
+    # The rim's pixels are clipped before the cast to int, because they overflow near 90 deg off axis.
     outer = np.array([lens.columns, lens.rows]) - 1 + margin
     low = np.maximum(np.floor(rim.min(axis=0)) - margin, -margin)
     high = np.minimum(np.ceil(rim.max(axis=0)) + margin, outer)
@@ -382,7 +382,7 @@ def _light(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
 
 
 def _earth(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
-    """Return the Earth's radiance (rows, columns), averaged over the pixels where the limb crosses them."""
+    """Return the Earth's radiance (rows, columns), averaged within the pixels that the limb crosses."""
     rays = pixel_rays(model.lens)
     sight = look(scene, rays)
     light = radiance(scene, rays, sight)

@@ -1,6 +1,6 @@
 """Scene of a camera that views Earth and Sun from a low orbit, and the radiance along lines of sight.
 
-The unit of radiance is that of a white Lambertian surface with the Sun at the zenith.
+Radiance is stated relative to that of a white Lambertian surface with the Sun at the zenith.
 
 The air density decreases exponentially with height. The air scatters sunlight once, which gives the soft
 limb, twilight, and haze over the ground. The optical depth along an oblique path is the vertical optical
@@ -94,8 +94,8 @@ class Atmosphere:
         `depth` (...) is the optical depth along the line of sight. `bottom` (...) is the air density at the
         line's lowest point, relative to the ground. `sunward` (...) is the optical depth from the ground
         below that point towards the Sun. The scattered light comes from the air above the point where the
-        optical depth along the line reaches one. The attenuation of sunlight, averaged over this air, is (1 -
-        exp(-x))/x.
+        optical depth along the line reaches one. The mean transmission of sunlight by the scattering air is
+        (1 - exp(-x))/x.
         """
         x = np.maximum(sunward * bottom / (1.0 + depth), 1e-6)
         return np.asarray(np.expm1(-depth) * np.expm1(-x) / x)
@@ -208,7 +208,7 @@ def albedo(directions: FloatArray, seed: int) -> Float32Array:
 
 
 def _covered(volume: Float32Array, places: Float32Array, share: float) -> Float32Array:
-    """Return the cover (n,), from 0 to 1, at `places` (3, n); the mean over the Earth is `share`."""
+    """Return the cover by land or cloud (n,), from 0 to 1, at `places` (3, n); its mean is `share`."""
     coarse = _read(volume, places)
     fine = _read(volume, places * np.float32(_MAGNIFICATION))
     height = (coarse + _FINE * fine) / np.hypot(1.0, _FINE)

@@ -4,7 +4,7 @@ The circuit is that of Sease 2013, chapter 5, Table 5.2.
 
 Only the mean current over a PWM period is modelled, because the coil's time constant L/R is 0.1 ms and the
 PWM period 20 ms (SN754410 and PCA9685 data sheets). While the two inputs of a bridge differ, the coil carries
-the current V/R. Equal inputs brake the coil.
+the current V/R. Equal inputs of a bridge short-circuit the coil.
 
 A bridge draws the coil current from the supply only while the bridge's inputs differ, so the supply current
 is chopped. `ChoppedSupply` integrates the supply current of three bridges exactly over any time window.
@@ -156,7 +156,7 @@ class CoilCircuit:
         uncertainty: float = CURRENT_UNCERTAINTY,
         bus_voltage: float | None = None,
     ) -> None:
-        """Connect the coils with their true properties.
+        """Create the circuit of coils with the true properties `truth`.
 
         `uncertainty` (A) bounds the uniform random error of a coil current, which is drawn at each write of
         the coil's channels. `bus_voltage` (V) is the voltage that a current monitor measures, by default the
@@ -182,7 +182,7 @@ class CoilCircuit:
         self._short_ohm = [1.0, 1.0, 1.0]
         self._bridges = [_OFF] * 3
         self._values = [0.0, 0.0, 0.0]
-        self._drawn = [0.0, 0.0, 0.0]  # current (A) of each bridge while it drives its coil
+        self._drawn = [0.0, 0.0, 0.0]  # supply current (A) of each bridge while driving its coil
         self._currents: FloatArray = np.zeros(3)
         self._supply = ChoppedSupply()
         chip.on_stop = self.update
@@ -291,7 +291,7 @@ class EmulatedIna219:
         self.brown_out()
 
     def brown_out(self) -> None:
-        """Interrupt the supply, which resets every register to its power-on value."""
+        """Interrupt the chip's supply, which resets every register to its power-on value."""
         self._pointer = 0
         self._calibration = 0
         self._shunt = 0
@@ -320,7 +320,7 @@ class EmulatedIna219:
         return words[register] & 0xFFFF if register < len(words) else 0
 
     def answers(self, address: int) -> bool:
-        """Return whether the chip acknowledges this address."""
+        """Return whether the chip acknowledges an address."""
         return address == self.address
 
     def write(self, address: int, data: bytes) -> None:

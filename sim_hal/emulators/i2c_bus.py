@@ -28,7 +28,7 @@ class I2cPart(Protocol):
     """An emulated chip on the I2C bus."""
 
     def answers(self, address: int) -> bool:
-        """Return whether the chip acknowledges this address (0 is the general call)."""
+        """Return whether the chip acknowledges an address (0 is the general call)."""
 
     def write(self, address: int, data: bytes) -> None:
         """Process the bytes of a write between the address and the STOP or repeated START."""
@@ -132,7 +132,7 @@ class EmulatedI2cBus:
         """Send messages joined by repeated STARTs, and return the data of each read.
 
         At most one fault acts on a chip in a transaction. A bit flip changes the data that are read. In a
-        transaction without reads it changes the data that are written after the register byte.
+        transaction without reads, a bit flip changes the data that are written after the register byte.
         """
         reads = any(message.count is not None for message in messages)
         given: list[bytes] = []
@@ -289,7 +289,7 @@ def smbus(
 
 def _block(bus: EmulatedI2cBus, address: int, reading: bool, head: bytes, size: int, data: bytes) -> bytes:
     """Execute a block transfer; an SMBus block on the bus begins with its length, an I2C block does not."""
-    # The old code of this transfer reads a block of the maximum length.
+    # The old code of an I2C block read reads a block of the maximum length.
     length = _BLOCK_LIMIT if size == _OLD_I2C_BLOCK and reading else data[0]
     if not 1 <= length <= _BLOCK_LIMIT:
         raise OSError(errno.EINVAL, f"a block of {length} bytes")

@@ -78,7 +78,7 @@ class EmulatedPca9685:
         self._power_on()
 
     def brown_out(self) -> None:
-        """Interrupt the supply, which resets every register to its power-on value."""
+        """Interrupt the chip's supply, which resets every register to its power-on value."""
         self._power_on()
         self._stop(_ALL_CHANNELS)
 
@@ -93,7 +93,7 @@ class EmulatedPca9685:
         self.upset(register, self._registers[register] ^ 1 << bit & _WRITABLE[register])
 
     def register(self, register: int) -> int:
-        """Return the content of a register as a bus read does."""
+        """Return the content of a register as a read over the bus returns it."""
         restart = RESTART if register == MODE1 and self._restart else 0
         return self._registers[register] | restart
 
@@ -128,7 +128,7 @@ class EmulatedPca9685:
         return address in self._addresses
 
     def write(self, address: int, data: bytes) -> None:
-        """Process the bytes of one write."""
+        """Process the bytes of one write over the bus."""
         if address == GENERAL_CALL:
             if data == bytes((SOFTWARE_RESET,)):
                 self._power_on()

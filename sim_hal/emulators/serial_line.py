@@ -29,10 +29,10 @@ _SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class LineFaults:
-    """Faults of a wire, which act on the bytes sent after they are set.
+    """Faults of a wire, which act on bytes that are sent afterwards.
 
     Attributes:
-        silent: whether all bytes are lost.
+        silent: whether a fault loses all bytes.
         garbage: whether every byte is replaced by a random byte.
         cut_probability: probability that a message loses a random run of its bytes.
         flip_probability: probability that a bit arrives inverted.
@@ -80,7 +80,10 @@ class Wire:
     """
 
     def __init__(self, rng: np.random.Generator, capacity: int = 6144) -> None:
-        """Create the wire with a random generator for faults; `capacity` is the buffer size (bytes)."""
+        """Create the wire with a random generator for faults.
+
+        `capacity` is the total size (bytes) of the buffers at both ends.
+        """
         self.faults = SOUND
         self.lost_bytes = 0
         self._rng = rng
@@ -114,7 +117,7 @@ class Wire:
             self._last_ns = message.crossed_ns(len(data))
 
     def noise(self, count: int, now_ns: int, baud_rate: int) -> None:
-        """Insert `count` random bytes into the wire."""
+        """Send `count` random bytes over the wire."""
         self.push(self._rng.bytes(count), now_ns, baud_rate, baud_rate)
 
     def pull(self, now_ns: int) -> list[tuple[int, bytes]]:

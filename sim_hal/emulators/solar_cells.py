@@ -7,8 +7,9 @@ uniform albedo. The default albedo of 0.3 is close to the Earth's mean of 0.29 (
 Geophys. 53).
 
 The emulated ADS1115 has the registers Config and Conversion and the conversion times of the data sheet (TI
-SBAS444, Table 8-3). It converts single-ended inputs in single-shot mode, as the driver does. Other settings
-are stored, but start no conversion. A conversion returns the voltage at its end.
+SBAS444, Table 8-3). The emulated ADS1115 converts single-ended inputs in single-shot mode, which the driver
+uses. Other settings are stored, but start no conversion. A conversion returns the voltage at the end of the
+conversion time.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class SolarCellsModel:
         gain_errors: relative errors (n,) of the peak currents.
         grazing: angle from the surface below which more and more light is reflected, rad.
         noise: standard deviation of the current noise, A.
-        albedo: albedo of the Earth.
+        albedo: reflectance (albedo) of the Earth, from 0 to 1.
     """
 
     normals: FloatArray
@@ -97,8 +98,8 @@ class SolarCellsModel:
 def _ground_in_view(position: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     """Return directions (m, 3) to the ground, the verticals (m, 3) of the ground, and a solid angle.
 
-    The directions start at `position` (3,), m. They sample the visible disc in rings of equal solid angle.
-    The solid angle (sr) is that of one direction.
+    The directions sample the visible disc in rings of equal solid
+    angle. The returned solid angle (sr) is the same for each direction.
     """
     distance = float(np.linalg.norm(position))
     down = -position / distance

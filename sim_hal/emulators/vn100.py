@@ -81,7 +81,7 @@ class Register:
     port_option: bool = False
 
     def checked(self, fields: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the fields as the unit stores them. Raises UnitError for invalid fields."""
+        """Return the fields of a write as the unit stores them. Raises UnitError for invalid fields."""
         if not self.writable:
             raise UnitError(UNAUTHORIZED)
         expect_count(fields, len(self.rules), len(self.rules) + self.port_option)
@@ -229,7 +229,7 @@ def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
 
 
 class RegisterFile:
-    """The register contents in use, and those in flash.
+    """The registers in use, and their copy in flash.
 
     Attributes:
         values: fields in use of each register.
@@ -271,8 +271,8 @@ class RegisterFile:
     def flip(self, number: int, bit: int) -> None:
         """Flip a bit of a register; bits after the last field are ignored.
 
-        Bits are counted from the lowest bit of the first field. The register keeps the new content. Raises
-        UnitError if a write of the new content would be rejected.
+        Bits are counted from the lowest bit of the first field. The register keeps the new content even if it
+        is invalid. Raises UnitError if a write of the new content would be rejected.
         """
         place, shift = divmod(bit, FIELD_BITS)
         fields = list(self.values[number])
@@ -359,7 +359,10 @@ class AttitudeCommands:
 
 
 def flag(fields: tuple[str, ...]) -> bool:
-    """Return the only field, 0 or 1, of a command as a bool. Raises UnitError for other fields."""
+    """Return the only field, 0 or 1, of a command as a bool.
+
+    Raises UnitError for a field other than 0 or 1.
+    """
     expect_count(fields, 1, 1)
     if fields[0] not in {"0", "1"}:
         raise UnitError(INVALID_PARAMETER)
@@ -445,7 +448,7 @@ class OutputStreams:
         return [stream for stream in self._streams.values() if tick % stream.divisor == 0]
 
     def checksum(self) -> Checksum:
-        """Return the checksum that register 30 selects."""
+        """Return the checksum of the kind that register 30 selects."""
         return "crc16" if self._registers.integer(30, 4) == 3 else "xor8"
 
     def _suffix(self, status: int) -> str:
@@ -504,7 +507,7 @@ class Vn100Emulator:
     """An emulated VN-100, which is a `sim_hal.clock.EmulatedDevice`.
 
     Attributes:
-        registers: registers of the unit.
+        registers: configuration and data registers of the unit.
         alter: function by which a fault alters each sample before it is sent, or None.
     """
 

@@ -1,10 +1,10 @@
-"""Measurements of an emulated VN-100 (frames, units, noise), and the messages that contain them.
+"""Measurements of an emulated VN-100 (frames, units, noise), and the messages with the measurements.
 
-There are two noise profiles. The profile "thesis" has uniform noise of attitude and rate with the bounds of
-Sease 2013, chapter 5. The profile "datasheet" has white noise with the densities of the data sheet and the
-filter windows of register 85, a static attitude error, and a gyro bias that is drawn at each start. The group
-delay of the filters (half a window, 12.5 ms for 20 samples) is not modelled. The layouts and number formats
-are those of VectorNav UM001 v2.43, chapters 4 and 5.
+The main noise profiles are "thesis" and "datasheet". The profile "thesis" has uniform noise of attitude and
+rate with the bounds of Sease 2013, chapter 5. The profile "datasheet" has white noise with the densities of
+the data sheet and the filter windows of register 85, a static attitude error, and a gyro bias that is drawn
+at each start. The group delay of the filters (half a window, 12.5 ms for 20 samples) is not modelled. The
+layouts and number formats are those of VectorNav UM001 v2.43, chapters 4 and 5.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ Values = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True)
 class MessageData:
-    """The data of all messages at one time.
+    """The data from which all messages of one time are made.
 
     Attributes:
         device_ns: unit's time since its start, ns.

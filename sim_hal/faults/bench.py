@@ -145,12 +145,12 @@ class Where(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A numeric parameter of a fault.
+    """A numeric parameter of a kind of fault.
 
     Attributes:
         default: default value, or None for a parameter that is drawn at random by default.
         low, high: its bounds.
-        unit: unit of default and bounds; empty for a number without unit.
+        unit: physical unit of the value, or an empty text for a number without unit.
         whole: whether the value must be an integer.
         choices: allowed values, or empty if all values between the bounds are allowed.
     """
@@ -163,7 +163,7 @@ class Parameter:
     choices: tuple[float, ...] = ()
 
     def accepts(self, value: float) -> bool:
-        """Return whether a parameter value is allowed; NaN is not."""
+        """Return whether a fault parameter may have a value; NaN is not."""
         if self.choices:
             return value in self.choices
         return self.low <= value <= self.high and not (self.whole and value % 1.0)
@@ -211,7 +211,7 @@ class FaultKind:
 
     @property
     def name(self) -> str:
-        """Name of the fault as a user writes it, "device: kind"."""
+        """Name of the fault as users write it, "device: kind"."""
         return f"{self.device}: {self.kind}"
 
     @property

@@ -74,7 +74,7 @@ def _gain(default: float) -> Parameter:
 
 
 def _turns(period: float = 0.5) -> dict[str, Parameter]:
-    """Return the parameters of an intermittent fault: its period, and the fraction of it with the fault."""
+    """Return the parameters of an intermittent fault: period, and fraction of the period with the fault."""
     return {"period": Parameter(period, 0.05, 3600.0, "s"), "share": Parameter(0.5, 0.01, 0.99)}
 
 
@@ -111,7 +111,7 @@ _late = _held("late_ns", lambda _, given: _nanoseconds(given), 0)
 _thinned = _held("one_of", lambda _, given: round(given["n"]), 1)
 
 
-# Serial lines of inertial unit and GPS receiver.
+# Faults of the serial lines of inertial unit and GPS receiver.
 
 _LINE_FAULTS: dict[str, Callable[[Parameters], LineFaults]] = {
     "silent": lambda _: LineFaults(silent=True),
@@ -129,7 +129,7 @@ def _on_line(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
     return no_removal if line is None else bench.disturb(line.to_host, _LINE_FAULTS[fault.kind](given))
 
 
-# Inertial unit and its magnetometer.
+# Faults of the inertial unit and its magnetometer.
 
 
 def _unit_off(bench: Bench, *_: object) -> Removal:
@@ -145,7 +145,7 @@ def _unit_reset(bench: Bench, *_: object) -> Removal:
 def _unplugged(bench: Bench, *_: object) -> Removal:
     if bench.host is not None:
         return hold(bench.host, "unplugged", True, False)
-    # A pseudo-terminal cannot be unplugged; it is silenced in both directions instead.
+    # A pseudo-terminal cannot be unplugged, so both directions are silenced instead.
     wires = (bench.line.to_host, bench.line.to_device)
     return all_of([bench.disturb(wire, LineFaults(silent=True)) for wire in wires])
 

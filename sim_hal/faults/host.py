@@ -1,7 +1,8 @@
 """Faults inside the flight process, which affect workers, wall clock, disk and configuration file.
 
-The application wraps clock, workers and log files by this module only if a simulation requests such faults.
-The wrappers apply each fault during the fault's window of mission time, in lock-step and in real time.
+The flight application uses the wrappers in this module (clock, workers, log files) only if a simulation
+requests such faults. The wrappers apply each fault during the fault's window of mission time, in lock-step
+and in real time.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ class ProcessFaults:
         return None
 
     def concerns(self, *devices: str) -> bool:
-        """Return whether any of `devices` has a fault in this flight."""
+        """Return whether a fault of any device in `devices` is scheduled for the flight."""
         return any(fault.kind.device in devices for fault in self._faults)
 
     def clock(self) -> Clock:
@@ -116,7 +117,10 @@ class ProcessFaults:
         return [dataclasses.replace(spec, function=perform) for spec in specs]
 
     def jobs(self, runner: Any, specs: Sequence[Any], result: Callable[..., Any]) -> Any:
-        """Return a job runner that passes the faults to the workers; `result` makes the result of a job."""
+        """Return a job runner that passes the faults to the workers.
+
+        The function `result` makes the result of a job.
+        """
         return _FaultyRunner(runner, specs, result, self) if self.concerns("planner", "vision") else runner
 
 

@@ -49,14 +49,14 @@ class ScheduledFault:
         return math.inf if self.span is None else self.at + self.span
 
     def __str__(self) -> str:
-        """Return the fault as a user writes it."""
+        """Return the fault as text in the form that users write."""
         given = ", ".join(f"{name}={value:g}" for name, value in self.parameters.items())
         lasts = "" if self.span is None else f" for {self.span:g}"
         return f"{self.kind.name}{f' ({given})' if given else ''} @ {self.at:g}{lasts}"
 
 
 def parse(text: str) -> ScheduledFault:
-    """Parse one fault. Raises UsageError with the correct form."""
+    """Parse one fault. Raises UsageError that states the correct form."""
     found = _FAULT.fullmatch(text)
     if found is None:
         raise UsageError(f"fault {text!r}: write it as {GRAMMAR}")

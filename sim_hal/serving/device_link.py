@@ -70,7 +70,7 @@ class DeviceLink:
         return number
 
     def pending(self) -> bool:
-        """Return whether `receive` would return at once."""
+        """Return whether `receive` would return a message at once."""
         return bool(self._messages)
 
     def receive(self) -> list[Any]:

@@ -133,7 +133,7 @@ class DeviceServer:
         self.gps_device = None if self._gps_pty is None else self._gps_pty.name
 
     def stop(self, *_: int | FrameType | None) -> None:
-        """Stop `serve`; this is also a signal handler."""
+        """Stop serving the devices; this method is also a signal handler."""
         self._stopped = True
 
     def serve(self, patience_ns: int | None = None) -> None:

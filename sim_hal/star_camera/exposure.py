@@ -75,7 +75,7 @@ def integrated_gaussian(sigma: float) -> PointSpread:
         return np.asarray(ndtr((offset + 0.5) / sigma) - ndtr((offset - 0.5) / sigma))
 
     def quadrature(length: float) -> int:
-        # Gauss-Legendre needs about one sample per sigma; this number gives errors of 1e-4 of the peak.
+        # About one Gauss-Legendre sample per sigma is needed; 0.95 per sigma errs by 1e-4 of the peak.
         return 1 if length < 0.02 * sigma else math.ceil(1.5 + 0.95 * length / sigma)
 
     return PointSpread(profile, math.ceil(4.0 * sigma), max(4.0, 8.0 * sigma), quadrature)
@@ -85,8 +85,8 @@ def integrated_gaussian(sigma: float) -> PointSpread:
 def bilinear_gaussian(sigma: float) -> PointSpread:
     """Return the point spread function of the thesis.
 
-    It places the charge on the four nearest pixels (Sease, eqs. 2.5 and 2.6) and blurs it by a 3 x 3 kernel
-    (Sease, eq. 2.9).
+    The point spread function places the charge on the four nearest pixels (Sease, eqs. 2.5 and 2.6) and blurs
+    it by a 3 x 3 kernel (Sease, eq. 2.9).
     """
     taps = np.exp(-0.5 * (np.array([-1.0, 0.0, 1.0]) / sigma) ** 2)
     taps /= taps.sum()
@@ -113,7 +113,7 @@ def _entries(positions: FloatArray) -> tuple[IntArray, Float32Array]:
 def _table(spread: PointSpread, size: int) -> tuple[Float32Array, Float32Array]:
     """Return the table (size * STEPS + 1, size) of charge fractions, and its differences between rows.
 
-    Successive rows are for sources 1/STEPS px apart.
+    Neighbouring table rows are for source positions that differ by 1/STEPS px.
     """
     positions = np.arange(size * STEPS + 2) / STEPS
     table = spread.profile(np.arange(size) - positions[:, None])
@@ -220,7 +220,7 @@ def path_lengths(camera: Pinhole, spread: PointSpread, vectors: FloatArray) -> F
 def touches(low: FloatArray, high: FloatArray, columns: int, rows: int, margin: float) -> BoolArray:
     """Return which boxes with corners `low` and `high` (..., 2) are within `margin` px of the detector.
 
-    A box with a NaN corner counts as outside.
+    A box with a NaN corner counts as outside the detector.
     """
     x = (high[..., 0] >= -margin) & (low[..., 0] <= columns - 1 + margin)
     y = (high[..., 1] >= -margin) & (low[..., 1] <= rows - 1 + margin)
@@ -266,7 +266,7 @@ OwnTimes = Callable[[FloatArray, IntArray], FloatArray]
 FASTEST = 0.25
 """Largest speed (px per line time) of a source; at 1 the source would move as fast as the rolling shutter."""
 SETTLED = 1e-4
-"""Convergence limit (line times) of the times at which a source's row is exposed."""
+"""Tolerance (line times) of the iteration for the time at which a source's row is exposed."""
 
 
 @dataclass(frozen=True, slots=True)

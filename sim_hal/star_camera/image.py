@@ -1,4 +1,4 @@
-"""The star camera's parameters, and the frames it takes of stars and moving sources.
+"""Parameters of the star camera, and the rendering of frames with stars and moving sources.
 
 The attitude during an exposure is interpolated between samples by a rotation at constant rate. Sease, eq.
 2.12, integrates one constant rate from the start of the exposure. This module uses samples of the true
@@ -201,7 +201,7 @@ class AttitudeHistory:
 
     @property
     def span(self) -> float:
-        """Time (s) from the first sample to the last."""
+        """Time (s) from the first attitude sample to the last."""
         return float(self.times[-1] - self.times[0])
 
     def at(self, times: FloatArray) -> FloatArray:

@@ -50,7 +50,7 @@ TRACK_ERROR = 1e-7
 NEAREST = 1.0
 """Shortest distance (m) at which an object is modelled as a point."""
 _FIRST_DURATION = 1000.0
-"""Minimum duration (s) over which an object's orbit is integrated."""
+"""Shortest time (s) over which an object's orbit is integrated."""
 _SAMPLES = 17
 """Number of samples of a great-circle track, whose chords err by 6e-5 rad at 20 deg/s over 1 s."""
 BAFFLE = np.radians(25.0)

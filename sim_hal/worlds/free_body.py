@@ -1,7 +1,7 @@
 """A free body in low Earth orbit, rotated by its coils and by the disturbance torques.
 
-The flight software assumes nominal properties of the craft. The true properties differ from them by random
-errors drawn from one seed, as a built satellite differs from its drawing. The torques on the body come from
+The flight software assumes nominal properties of the craft. The true properties of the craft have random
+errors drawn from one seed, as a built satellite differs from its design. The torques on the body come from
 the coils, the residual dipole, the gravity gradient, air drag and sunlight.
 
 - The air exerts F = -1/2 rho C_D A (n . v) v on the faces that meet the flow (Wertz 1978, eq. 17.61, with C_D
@@ -11,9 +11,9 @@ the coils, the residual dipole, the gravity gradient, air drag and sunlight.
 - Shading of one face by another is not modelled, because a box has none.
 
 Euler's equations are integrated in principal axes by the classical Runge-Kutta method. Every stage evaluates
-the torques that depend on the attitude, which are those of the dipole in the field and of the gravity
-gradient (Wertz 1978, eq. 17.28). With |w| dt = 0.01 the error of one step is 1e-13 rad. The code uses plain
-floats, because for three components numpy takes ten times as long.
+the torques that depend on the attitude, namely those of the dipole in the field and of the gravity gradient
+(Wertz 1978, eq. 17.28). With |w| dt = 0.01 the error of one step is 1e-13 rad. The code uses plain floats,
+because for three components numpy takes ten times as long.
 
 The rotation is integrated when the state is read and when the currents change. The times at which the state
 is read change the result by less than a microradian. The torques of air and sunlight and the residual dipole
@@ -51,7 +51,7 @@ TURN_PER_STEP = 0.01
 
 
 class Loads(NamedTuple):
-    """The loads on the body during a step.
+    """The dipole, gravity-gradient vector and torque that act on the body during a step.
 
     Attributes:
         dipole: magnetic dipole (3,) of the body, A m^2, principal axes.
@@ -74,7 +74,7 @@ class Rotation:
         self._of_torques = (1.0 / a, 1.0 / b, 1.0 / c)
 
     def step(self, state: State, dt: float, begin: Floats, end: Floats, loads: Loads) -> State:
-        """Return the state after `dt` s.
+        """Return the rotational state after `dt` s.
 
         The magnetic field changes from `begin` to `end` (3,), T, inertial axes.
         """
@@ -399,7 +399,10 @@ class FreeBody:
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
     ) -> None:
-        """Hold the body still until it is released; `utc` is the UTC at `start_ns`."""
+        """Create the world with a body that is held still until its release.
+
+        `utc` is the UTC at `start_ns`.
+        """
         errors, tip_off, weather = generators(seed)
         multiples = section.disturbances
         self.craft = built_craft(section, errors)
@@ -455,7 +458,7 @@ class FreeBody:
                 field_body=np.array(turned(self._to_body, turned(matrix(*self._state[:4]), self._field))),
                 specific_force_body=np.zeros(3),
             )
-            # The truth recorder and the inertial unit read the motion at the same times.
+            # The motion is cached because truth recorder and inertial unit read it at the same times.
             self._read = self._state, motion
         return motion
 
@@ -549,9 +552,9 @@ class FreeBody:
         self._pull, self._field = pull, field
 
     def _renew(self, time: float, middle: float) -> None:
-        """Evaluate the torques of air and sunlight and the residual dipole for the time `middle` s.
+        """Evaluate the torques of air and sunlight and the residual dipole for the time `middle` (s).
 
-        The attitude is extrapolated to that time.
+        The attitude is extrapolated to the time `middle`.
         """
         around = self.environment.at(middle)
         ahead = (middle - time) * np.array(turned(self._to_body, self._state[4:]))

@@ -8,8 +8,8 @@ modelled.
 
 The table `igrf.npz` holds the coefficients as integers in units of 0.01 nT. `tests/support/build_igrf.py`
 makes the table from the file that the package ppigrf ships. The package ppigrf itself is not used, because it
-needs pandas and takes 81 ms for one position instead of 3 ms. Its fields agree with this module within 0.06
-nT.
+needs pandas and takes 81 ms for one position instead of 3 ms. The fields of ppigrf and of this module agree
+within 0.06 nT.
 """
 
 from __future__ import annotations

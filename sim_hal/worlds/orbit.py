@@ -11,8 +11,9 @@ entry into the Earth's shadow by 0.2 s.
 
 The environment is evaluated at knots, 10 s apart, and interpolated by cubic splines. The interpolation errors
 of 2 mm and 1e-4 nT are far below the errors of the models. Sunlight changes within seconds in the penumbra,
-so it has a knot every second and is interpolated linearly. The knots of 1,000 s are computed at once. Random
-numbers are drawn in the order of the knots, so they do not depend on the times that are requested.
+so sunlight has a knot every second and is interpolated linearly. The knots of a chunk of 1,000 s are computed
+together. Random numbers are drawn in the order of the knots, so they do not depend on the times that are
+requested.
 
 The air density is an exponential profile (Vallado, Fundamentals of Astrodynamics, 4th ed. 2013, Table 8-4)
 with a day bulge. The apex of the day bulge is 30 deg east of the Sun in right ascension, and the density
@@ -169,8 +170,8 @@ def sun_position(julian_date: npt.ArrayLike) -> FloatArray:
 
     The position follows the "Low-precision formulas for the Sun" of the Astronomical Almanac, accurate to
     0.01 deg from 1950 to 2050. The series gives the longitude from the equinox of date, from which the drift
-    of the equinox since J2000 is subtracted. The obliquity is that of J2000. Passing UTC instead of TT
-    changes the Sun's direction by 3".
+    of the equinox since J2000 is subtracted. The obliquity of the ecliptic is that of J2000. Passing UTC
+    instead of TT changes the Sun's direction by 3".
     """
     days = np.asarray(julian_date, dtype=float) - J2000
     anomaly = np.radians(357.528 + 0.9856003 * days)
@@ -234,7 +235,7 @@ def log_density(position: FloatArray, sun: FloatArray, day_bulge: float = 1.0) -
 
     `position` (n, 3) and the Sun's position `sun` (n, 3) are geocentric, m, ICRS.
 
-        `day_bulge` scales the day bulge. If it is zero, the mean density applies in all directions.
+        `day_bulge` scales the day bulge. If `day_bulge` is zero, the mean density applies in all directions.
     """
     distance = np.linalg.norm(position, axis=-1)
     profile = np.interp(distance - EARTH_RADIUS, _PROFILE[:, 0], np.log(_PROFILE[:, 1]))
@@ -249,14 +250,14 @@ def log_density(position: FloatArray, sun: FloatArray, day_bulge: float = 1.0) -
 KNOT = 10.0
 """Time (s) between the knots of the environment's interpolation."""
 _CHUNK, _LIGHT_KNOTS = 100, 1_000
-"""Number of knots, and of sunlight knots, that are computed at once."""
+"""Number of environment knots and of sunlight knots in a chunk."""
 _SPAN = KNOT * _CHUNK
 _FIRST_ORBIT = 12_000.0
 """Duration (s) of the first integration of the orbit, which is doubled when needed."""
 RING_CURRENT = 20e-9
 """Mean field (T) of the ring current on a quiet day."""
 _TURBULENCE, _TURBULENCE_TIME = 0.1, 600.0
-"""Standard deviation of the random walk of the logarithmic air density, and its correlation time (s)."""
+"""Standard deviation and correlation time (s) of the random walk of the logarithmic air density."""
 _WALK_TIME = 3_000.0
 """Correlation time (s) of the residual dipole's random walk."""
 _STORM_TIMES = np.array([3.0, 7.0, 17.0]) * 3600.0

@@ -1,10 +1,10 @@
 """The testbed world: a rigid body on a thread in the field of a Helmholtz coil, controlled by torque coils.
 
-The model is that of Sease 2013, chapter 5. Its one degree of freedom is the angle theta about the thread,
-with J theta'' = (m x B) along the thread - k theta - c theta'. The testbed frame T has y down along the
-thread and the magnetic field along -z. The body axes coincide with those of T at theta = 0. The coil on body
-x gives the torque n A B I cos(theta) (Sease, eq. 5.4), the coil on body z gives n A B I sin(theta), and the
-coil on body y has no effect because its axis lies along the thread.
+The model is that of Sease 2013, chapter 5. The testbed has one degree of freedom, the angle theta about the
+thread, with J theta'' = (m x B) along the thread - k theta - c theta'. The testbed frame T has y down along
+the thread and the magnetic field along -z. The body axes coincide with those of T at theta = 0. The coil on
+body x gives the torque n A B I cos(theta) (Sease, eq. 5.4), the coil on body z gives n A B I sin(theta), and
+the coil on body y has no effect because its axis lies along the thread.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Testbed:
         currents: Callable[[], FloatArray],
         start_ns: int = 0,
     ) -> None:
-        """Hold the body at `angle` rad until it is released with `release_rate` rad/s."""
+        """Create the testbed with a body held at `angle` rad until its release with `release_rate` rad/s."""
         self._model = model
         self._currents = currents
         self._release_rate = release_rate
@@ -142,7 +142,10 @@ class Testbed:
 
 
 def make(inputs: WorldInputs) -> Testbed:
-    """Return the testbed of a configuration. Raises ConfigError if `simulation.release` is missing."""
+    """Return the testbed that a configuration describes.
+
+    Raises ConfigError if `simulation.release` is missing.
+    """
     model, angle, rate = model_of(as_testbed(inputs.config), inputs.section)
     return Testbed(model, angle, rate, inputs.currents, inputs.start_ns)
 
@@ -212,7 +215,7 @@ class CagedTestbed(Testbed):
         field: OrbitField,
         start_ns: int = 0,
     ) -> None:
-        """Hold the body at `angle` rad until it is released with `release_rate` rad/s."""
+        """Create the testbed with a body held at `angle` rad until its release with `release_rate` rad/s."""
         super().__init__(model, angle, release_rate, currents, start_ns)
         self._orbit, self._start_ns = field, start_ns
         self._bx, self._bz = field.at(0.0)
@@ -241,7 +244,7 @@ class CagedTestbed(Testbed):
 
 
 def make_caged(inputs: WorldInputs) -> CagedTestbed:
-    """Return the testbed with a field cage of a configuration.
+    """Return the caged testbed that a configuration describes.
 
     Raises ConfigError if the section `cage` or `simulation.cage` is missing.
     """

@@ -71,7 +71,7 @@ WORLDS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorldTruth:
-    """The quantities of the truth log other than the motion.
+    """Quantities of the truth log other than the motion: coil currents and energies.
 
     Attributes:
         current: mean coil currents (3,) that acted on the body, A.
@@ -89,7 +89,7 @@ class World(Protocol):
     """The body and its environment, advanced in time under the currents that the coils carry."""
 
     def release_at(self, time_ns: int) -> None:
-        """Release the body at `time_ns`, now or later; until then it is held still."""
+        """Release the body, which is held still until then, at `time_ns`, now or later."""
 
     def advance_to(self, time_ns: int) -> None:
         """Advance the state to `time_ns` under the present coil currents."""
@@ -236,7 +236,7 @@ class PacketLog(Protocol):
 
 
 class TruthRecorder:
-    """Recorder that writes the true state at 40 Hz, and that of an orbit at 1 Hz, to a packet log."""
+    """Recorder that writes the true state to a packet log, at 40 Hz for the body and 1 Hz for the orbit."""
 
     def __init__(self, log: PacketLog) -> None:
         self._log = log

@@ -57,7 +57,10 @@ class BasiliskWorld:
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
     ) -> None:
-        """Hold the body still until it is released. Raises ConfigError if Basilisk is not installed."""
+        """Create the world with a body that is held still until its release.
+
+        Raises ConfigError if Basilisk is not installed.
+        """
         if section.disturbances.gravity_gradient not in {0.0, 1.0}:
             raise ConfigError("simulation.free_body.disturbances.gravity_gradient", "is 0 or 1 in Basilisk")
         errors, tip_off, _ = generators(seed)
@@ -178,7 +181,7 @@ class BasiliskWorld:
         return np.array(self._scenario.field.envOutMsgs[0].read().magField_N)
 
     def _behind(self) -> float:
-        """Return the time (s) since Basilisk's last step."""
+        """Return the time (s) since the last integration step of Basilisk."""
         return (self.time_ns - self._start_ns - self._stepped_ns) * 1e-9
 
     def _date(self) -> float:
