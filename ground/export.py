@@ -79,10 +79,12 @@ _MAX_INTEGER = (1 << 63) - 1
 
 
 def write_database(run: Run, file: Path) -> list[Path]:
-    """Write a database with one table per packet type, replacing an old one. Raises OSError.
+    """Write an SQLite database with one table per packet type, which replaces an existing file.
 
-    The table `fields` has unit and meaning of each column. NaN becomes NULL, and a column with integers of
-    more than 63 bits becomes text, because SQLite has neither.
+    Raises OSError.
+
+    The table `fields` contains the unit and the meaning of each column. NaN becomes NULL, and a column with
+    integers of more than 63 bits becomes text, because SQLite supports neither.
     """
     made = file.with_name(f"{file.name}.part")
     made.unlink(missing_ok=True)

@@ -146,7 +146,7 @@ class FlightState:
 
     Attributes:
         time: mission time of the newest packet, s.
-        mode: label of the mode, empty until it is known.
+        mode: label of the flight's mode, empty until the mode is known.
         ended: reason for the end of the flight, empty before the end.
         events: newest events.
         faults: number of events whose severity is fault.

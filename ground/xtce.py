@@ -234,7 +234,7 @@ def _add_command(layout: Layout, types: Element, listed: Element) -> Element:
 
 
 def _add_verifiers(command: Element, layout: Layout) -> None:
-    """Add the stages of a command, which `verification` packets report."""
+    """Add the verification stages of a command, which `verification` packets report."""
     verifiers = SubElement(command, "VerifierSet")
     for kind, window, stages in _VERIFIERS:
         verifier = SubElement(verifiers, f"{kind}Verifier")

@@ -129,7 +129,7 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
 
 @dataclass(frozen=True, slots=True)
 class PosedCamera:
-    """A star camera, its clock, and a function that returns its attitude (4,), ICRS into camera."""
+    """A star camera, its clock, and a function from time (ns) to its attitude (4,), ICRS into camera."""
 
     clock: Clock
     frames: FrameSource
@@ -167,7 +167,7 @@ def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: Flo
 
 
 def fault_catalogue() -> tuple[str, str]:
-    """Return the syntax of faults, and the text of a list of all faults."""
+    """Return a text about the syntax of faults and a list of all faults as text."""
     return schedule.GRAMMAR, listing()
 
 

@@ -94,7 +94,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly unless a run is given, fit the constants, and print and write the results."""
+    """Fly unless the user gives a run, fit the constants, and print and write the results."""
     if options.out is not None and options.out.exists():
         raise UsageError(f"{options.out}: exists already: name another file")
     folder = Path(options.source)

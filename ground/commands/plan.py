@@ -320,7 +320,7 @@ def _target(option: str, text: str) -> PointingTarget:
 
 
 def _utc(text: str) -> datetime:
-    """Return the time in a text, UTC unless it has a time zone. Raises UsageError."""
+    """Return the time in a text, in UTC unless the text has a time zone. Raises UsageError."""
     try:
         found = datetime.fromisoformat(text)
     except ValueError as error:

@@ -153,7 +153,7 @@ def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, f
             )
         lens, exposure = camera_model(camera), exposure or camera.exposure
         if camera.lens is None and error is None:
-            # Only a calibrated lens has no tolerance of the field of view.
+            # The field of view has a tolerance unless the lens is calibrated.
             error = FOV_TOLERANCE * math.degrees(field_of_view(lens))
         settings = SolveSettings(
             detection=DetectionSettings(saturation=camera.saturation), likelihood=likelihood_settings(camera)

@@ -236,7 +236,7 @@ async def _errors_as_json(request: web.Request, handler: _Handler) -> web.Stream
 
 
 class _Pages:
-    """Answers to the requests of the page."""
+    """Handlers that answer the requests of the page."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -263,7 +263,7 @@ class _Pages:
         )
 
     async def series(self, request: web.Request) -> web.StreamResponse:
-        """Answer with a field over time: ?packet=&field=&component=&from=&to= (s) &points=."""
+        """Answer with a field over time, for the query ?packet=&field=&component=&from=&to= (s) &points=."""
         name, column = request.query.get("packet", ""), request.query.get("field", "")
         if name not in LAYOUTS or column not in (LAYOUTS[name].dtype.names or ()):
             raise UsageError(f"{name}.{column}: no such field")
@@ -307,12 +307,12 @@ class _Pages:
         return web.json_response({"words": self._console.forms.text(name, given)})
 
     async def command(self, request: web.Request) -> web.StreamResponse:
-        """Send a command and answer with its result."""
+        """Send a command to the flight, and answer with the result of the command."""
         name, given = await _command_of(request)
         return web.json_response(await asyncio.to_thread(self._console.forms.obey, name, given))
 
     async def live(self, request: web.Request) -> web.StreamResponse:
-        """Push the state of the flight at the time of the reader's cursor."""
+        """Push the flight's state at the time that the reader has chosen."""
         line = web.WebSocketResponse(heartbeat=10.0, max_msg_size=4096)
         await line.prepare(request)
         self._console.sockets.add(line)

@@ -372,7 +372,10 @@ def first_guess(record: Record) -> MotionConstants:
 def _gated(
     record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int], gate: float
 ) -> frozenset[int]:
-    """Return `restarts` and the samples beyond the gate. Raises IdentificationError if there are too many."""
+    """Return `restarts` and the samples beyond the gate.
+
+    Raises IdentificationError if there are too many restarts.
+    """
     passed = innovations(record, constants, noise, restarts, gate, with_gradient=False)
     if len(passed.restarts) > _MAX_RESTARTS * len(record.time):
         raise IdentificationError(

@@ -45,11 +45,11 @@ class PriorValue:
 
 @dataclass(frozen=True, slots=True)
 class PlantPrior:
-    """Values known before the flight.
+    """Prior values of the constants, which are known before the flight.
 
     Attributes:
         inertia: kg m^2.
-        dipole: n A of the coil on x per commanded ampere, m^2.
+        dipole: dipole per commanded ampere of the coil on body x, n A, m^2.
         field: T.
         magnetometer_error: relative standard deviation of the magnetometer's scale factor.
     """
@@ -191,7 +191,7 @@ def prior_of(config: TestbedConfig) -> PlantPrior:
 
 
 def configured_constants(config: TestbedConfig) -> MotionConstants:
-    """Return the constants per inertia of a configuration."""
+    """Return the constants per inertia that follow from a configuration."""
     plant = config.plant
     gain = plant.coil_turns * plant.coil_area * plant.field / plant.inertia
     stiffness, damping = plant.thread_stiffness / plant.inertia, plant.thread_damping / plant.inertia
@@ -199,7 +199,7 @@ def configured_constants(config: TestbedConfig) -> MotionConstants:
 
 
 def noise_of(config: TestbedConfig) -> MotionNoise:
-    """Return the noise of a configuration, from which a fit starts."""
+    """Return the noise levels of a configuration, with which a fit starts."""
     unit = config.inertial_unit
     return MotionNoise(max(config.estimation.current_noise, 1e-4), unit.angle_noise, unit.rate_noise)
 

@@ -142,7 +142,7 @@ def change_key(
 
     The new key is stored on the ground before it is sent, and replaces the old key when the satellite has
     confirmed it. If the result of an earlier change is unknown, a ping under that change's new key is sent
-    first. Raises FlightError without an answer.
+    first. Raises FlightError if no answer arrives.
     """
     old, name = vault.read(changed), f"{changed}-{NEXT}"
     if old is None:

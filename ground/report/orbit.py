@@ -59,7 +59,7 @@ def magnetometer_rates(run: Run) -> PacketArray:
 
 
 def detumbling(run: Run) -> Object | None:
-    """Return the periods of detumbling and the error of the magnetometer-only rate.
+    """Return the periods of detumbling and the error of the rate from the magnetometer alone.
 
     Returns None for a body without spin packets. The error is NaN without a truth log.
     """
@@ -275,7 +275,8 @@ def requirements(
 ) -> list[Object]:
     """Return each figure that the configuration's section `requirements` limits, with a verdict.
 
-    `detumbled`, `known` and `pointed` are the report's figures of detumbling, knowledge and pointing.
+    The arguments `detumbled`, `known` and `pointed` are the report's figures of detumbling, attitude
+    knowledge and pointing.
     """
     limits = config.requirements
     periods = detumbled["periods"][:1] if detumbled else []

@@ -22,7 +22,7 @@ Object = dict[str, Any]
 
 @dataclass(frozen=True)
 class ThreadMotion:
-    """Rotation about the testbed's thread.
+    """Rotation of the body about the testbed's thread.
 
     Attributes:
         time: mission times (n,), s.

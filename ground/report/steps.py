@@ -46,7 +46,7 @@ class StepCommand:
 
     Attributes:
         index: number of the step in the configuration.
-        time: time of the command, s.
+        time: mission time of the step command, s.
         start: q2 at the beginning of the step.
         target: commanded q2.
         duration: time until the step ends, s.
@@ -179,7 +179,7 @@ def _first_crossing(t: FloatArray, progress: FloatArray, level: float) -> float:
 
 
 def _interpolate(t: FloatArray, y: FloatArray, i: int, level: float) -> float:
-    """Return the time at which the line through samples i and i + 1 is at `level`."""
+    """Return the interpolated time at which the signal crosses `level` between samples i and i + 1."""
     return float(t[i] + (level - y[i]) / (y[i + 1] - y[i]) * (t[i + 1] - t[i]))
 
 

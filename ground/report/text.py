@@ -1,4 +1,4 @@
-"""The report as text, from the object that `ground.report.summary.summarise` returns."""
+"""Report as text, made from the object that `ground.report.summary.summarise` returns."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ def _limits(title: str, limit: str, judged: list[Object]) -> list[str]:
 
 
 def _power(power: Object, thesis: bool) -> list[str]:
-    """Return the lines of the coil power, with the consumption stated in the thesis if `thesis`."""
+    """Return the lines of the coil power, and if `thesis` is true the consumption stated in the thesis."""
     if power["source"] is None:
         return []
     currents = (

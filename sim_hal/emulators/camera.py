@@ -28,7 +28,7 @@ SAMPLE_NS = 10_000_000
 Expose = Callable[[int, FloatArray, FloatArray, "Sequence[SourceTrack]"], "Future[Image]"]
 """Function that renders a frame from its number, times (k,), s, camera attitudes (k, 4) and object tracks."""
 Moving = Callable[[int, FloatArray], "Sequence[SourceTrack]"]
-"""Function from the start (ns) of an exposure and times (k,), s, since the start to object tracks."""
+"""Function that returns object tracks, given an exposure's start (ns) and times (k,), s, since the start."""
 
 
 def no_objects(_: int, __: FloatArray) -> Sequence[SourceTrack]:

@@ -258,7 +258,7 @@ def _check_length(length: int) -> None:
 _BLOCK, _OLD_I2C_BLOCK = 5, 6
 
 FUNCTIONS = 0x00000001 | 0x00FF0000 | 0x02000000 | 0x0C000000
-"""Plain I2C; SMBus quick, byte, byte data, word data, process call and block write; I2C blocks."""
+"""Supported functions (I2C_FUNC_*): plain I2C, SMBus transfers except block reads, and I2C blocks."""
 
 
 def smbus(

@@ -127,7 +127,7 @@ class EmulatedAds1115:
     """An emulated ADS1115; the function `measure(channel)` returns the present voltage at an input.
 
     Attributes:
-        address: address of the converter on the I2C bus.
+        address: I2C address of the converter.
     """
 
     def __init__(self, address: int, now_ns: Callable[[], int], measure: Callable[[int], float]) -> None:

@@ -151,7 +151,7 @@ def _unplugged(bench: Bench, *_: object) -> Removal:
 
 
 def _baud(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
-    # The baud rate changes even if the line becomes too slow for the outputs, because no command checks it.
+    # The baud rate changes even if the line becomes too slow, because no command checks the new rate.
     with suppress(UnitError):
         bench.hardware.unit.change_baud_rate(round(given["rate"]), bench.now_ns())
     return no_removal
