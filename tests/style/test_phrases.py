@@ -34,6 +34,8 @@ REFUSED = {
 }
 """Patterns of inversions, hearsay words and idioms, each with what plain English says."""
 
+ANY = re.compile("|".join(REFUSED), re.IGNORECASE)
+
 TEXT_TOKENS = (tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING))
 
 
@@ -77,6 +79,11 @@ def refused_phrases(text: str) -> list[tuple[int, str, str]]:
     )
 
 
+def may_have_any(text: str) -> bool:
+    """Return whether a text has a refused phrase if code counts as text: most files have none."""
+    return bool(ANY.search(re.sub(r'[\s#"_]+', " ", text)))
+
+
 @pytest.mark.parametrize(
     ("source", "expected"),
     [
@@ -94,6 +101,7 @@ def test_phrases_are_found_in_strings_comments_and_names_of_tests_only(
     source: str, expected: list[tuple[int, str]]
 ) -> None:
     assert [(line, phrase) for line, phrase, _ in refused_phrases(texts_of_python(source))] == expected
+    assert may_have_any(source) or not expected
 
 
 def test_no_text_contains_a_refused_phrase() -> None:
@@ -118,6 +126,8 @@ def test_no_text_contains_a_refused_phrase() -> None:
         if name in EXEMPT or not path.exists():
             continue
         text = path.read_text(encoding="utf-8")
+        if not may_have_any(text):
+            continue
         found += [
             f"{name}:{line}: `{phrase}`; plain English: {plain}"
             for line, phrase, plain in refused_phrases(

@@ -103,26 +103,35 @@ class Orbiting:
             currents = np.where(self.watch.resting, 0.0, currents)
             self.watch.commanded(now_ns, currents)
             for _ in range(5):
-                torque = np.cross(0.65 * self.signs * currents, self._field)
-                self.rate = self.rate + 5e-3 * np.linalg.solve(
-                    INERTIAS, torque - np.cross(self.rate, INERTIAS @ self.rate)
-                )
-                self._field = self._field - 5e-3 * np.cross(self.rate, self._field)
+                torque = _cross(0.65 * self.signs * currents, self._field)
+                torque = torque - _cross(self.rate, MOMENTS * self.rate)
+                self.rate = self.rate + 5e-3 * torque / MOMENTS
+                self._field = self._field - 5e-3 * _cross(self.rate, self._field)
             seen = self._field + 5e-4 * self.signs * currents
             noise = 2.8e-4 * self._noise.standard_normal(3)
             self.response.observe_motion(now_ns + TICK_NS, self.rate + noise, seen)
             self.watch.observe_motion(now_ns + TICK_NS, self.rate + noise, seen)
 
 
-INERTIAS = np.diag([1.10e-3, 1.05e-3, 0.99e-3])
+MOMENTS: FloatArray = np.array([1.10e-3, 1.05e-3, 0.99e-3])
+INERTIAS = np.diag(MOMENTS)
 
 
-@pytest.mark.parametrize("axis", range(3))
-def test_of_a_free_body_a_reversed_coil_is_found_though_its_field_swamps_the_magnetometer(axis: int) -> None:
+def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the cross product (3,); numpy's takes several times as long for one pair."""
+    (a, b, c), (d, e, f) = first.tolist(), second.tolist()
+    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
+
+
+def test_of_a_free_body_no_sound_coil_is_found_reversed() -> None:
     sound = Orbiting(np.ones(3))
     sound.fly(60.0)
     assert sound.response.reversed_axes() == []
     assert np.abs(sound.response.gain - 1.0).max() < 0.3
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_of_a_free_body_a_reversed_coil_is_found_though_its_field_swamps_the_magnetometer(axis: int) -> None:
     signs = np.ones(3)
     signs[axis] = -1.0
     broken = Orbiting(signs)
