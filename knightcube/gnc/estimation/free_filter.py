@@ -103,8 +103,8 @@ class FreeMotion:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the torque (3,) N m, and the error dynamics (6, 33) without the columns of rate and axes.
 
-        `dipole` (3,) A m^2 is the sum of the coils' and the residual dipole moment. `sizes` (9,) N m are the
-        sizes of the disturbance torques.
+        `dipole` (3,) A m^2 is the sum of the coils' and the residual dipole moment. `sizes` (9,) are the
+        sizes (N m) of the disturbance torques.
         """
         to_body = attitude_matrix(quaternion)
         field, position = to_body @ around.field, to_body @ around.position

@@ -9,11 +9,11 @@ later measurements need are appended to the state (stochastic cloning, Roumeliot
 The filter estimates the age that the inertial unit's samples have at their time stamps. A sample is older
 than its time stamp because of the serial line, a driver's buffer or the filters inside the unit. During its
 age, a sampled attitude changes by rate times age, and a sampled rate by acceleration times age. The
-innovations therefore depend on the age. Only attitude samples correct the estimated age. Rate samples cannot,
-because the acceleration is mostly caused by the coils, which respond to the noise of earlier samples. An
-estimate of the age from rate samples would be an identification in closed loop and would drift with the noise
-while the attitude is held. A rate sample therefore treats the age as a considered parameter (Schmidt 1966):
-its variance and correlations enter the gains of all other states.
+innovations therefore depend on the age. Only attitude samples correct the estimated age. Rate samples do not
+correct it, because the acceleration is mostly caused by the coils, which respond to the noise of earlier
+samples. An estimate of the age from rate samples would be an identification in closed loop and would drift
+with the noise while the attitude is held. A rate sample therefore treats the age as a considered parameter
+(Schmidt 1966): its variance and correlations enter the gains of all other states.
 """
 
 from __future__ import annotations

@@ -213,7 +213,7 @@ class Replay:
         found = innovation(state, measurement, model.body.suspended, change)
         nis, gain, variance = normalised_square(found, covariance)
         used = 0.0 <= nis <= model.gate[len(found.value)]  # a NaN does not pass
-        # Changing the gain is allowed because Joseph's form is valid for any gain.
+        # The gain may be changed, because Joseph's form of the covariance update is valid for any gain.
         if is_rate and model.noise.unknown_current and nis > _RATE_ONLY[len(found.value)]:
             rate_gain = np.zeros_like(gain)
             rate_gain[RATE] = gain[RATE]

@@ -172,7 +172,7 @@ class HorizonSearch:
     def _continued(
         self, failed: PathProgram, asked: float, longest: float
     ) -> tuple[PathProgram, Trial | None]:
-        """Return a path over `asked` s, or longer, by continuation from horizons that can be solved.
+        """Return a path over at least `asked` s, by continuation from horizons at which a path was found.
 
         If the torque of the thread exceeds that of the coil, only the horizons of the body's swings are
         feasible. From a horizon with a known path, the horizon is changed in steps, each started from the

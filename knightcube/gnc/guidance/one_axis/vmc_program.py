@@ -157,7 +157,7 @@ class PathFamily:
         return np.asarray(self.still + horizon * self.drift + self.basis @ parameters)
 
     def observed(self, samples: SamplePoints) -> ObservedFamily:
-        """Return the family evaluated at `samples`."""
+        """Return the family of paths evaluated at `samples`."""
         matrices = samples.matrices
         return ObservedFamily(matrices @ self.still, matrices @ self.drift, matrices @ self.basis)
 
@@ -216,7 +216,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class FreeHorizon:
-    """A horizon to be optimised between `shortest` and `longest` s, with a time cost of `time_cost` W."""
+    """Settings of a program that also optimises the horizon: bounds (s) and time cost (W)."""
 
     shortest: float
     longest: float
@@ -281,7 +281,7 @@ class PathProgram:
         return self._bang
 
     def prey(self, horizon: float) -> Trial:
-        """Return the prey path over `horizon` s, on which all path control parameters are one."""
+        """Return the prey over `horizon` s, which is the path with all path control parameters one."""
         return Trial(np.zeros(self.family.size), horizon)
 
     def _whitened(self, family: PathFamily, horizon: float) -> PathFamily:
@@ -465,7 +465,7 @@ class _Variables:
         self.first = np.append(start.parameters, 0.0) if free else start.parameters
 
     def trial(self, x: FloatArray) -> Trial:
-        """Return the trial of the variables."""
+        """Return parameters and horizon of a path from the variables of the optimiser."""
         horizon = self.origin * math.exp(self.root * x[self.size]) if self.free else self.origin
         return Trial(x[: self.size].copy(), horizon)
 

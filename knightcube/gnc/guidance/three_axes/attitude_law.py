@@ -1,10 +1,10 @@
 """Attitude laws: the commanded attitude as a function of time, from two directions or a pointing target.
 
 A law aligns one body axis with a first direction exactly, and a second body axis with a second direction as
-closely as the first allows (TRIAD: Black 1964). Directions are inertial, fixed in the orbit's axes (nadir,
-velocity, normal), the Sun's, or that of a point on the ground. For a free roll the second direction is taken
-from the attitude at the start. It is held fixed in the inertial or in the orbital axes, whichever the first
-direction belongs to, so that the body does not rotate about the first direction.
+closely as the first allows (TRIAD: Black 1964). A direction is inertial, fixed in the orbital axes (nadir,
+velocity, normal), that of the Sun, or that of a point on the ground. For a free roll the second direction is
+taken from the attitude at the start. It is held fixed in the inertial or in the orbital axes, whichever the
+first direction belongs to, so that the body does not rotate about the first direction.
 
 The law of a pointing target aligns the pointing axis with the goal and the body axis `across` with a second
 direction: the velocity for goals below, nadir for the velocity itself, the celestial pole for the Sun. A
@@ -38,7 +38,7 @@ from knightcube.errors import UsageError
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 Direction = Callable[[Ephemeris, FloatArray], FloatArray]
-"""Function from an ephemeris and times (n,), s of the ephemeris, to unit vectors (n, 3), ICRS."""
+"""Function from an ephemeris and times (n,) in s to unit vectors (n, 3), ICRS."""
 DIFFERENCE = 1.0
 """Step of the central differences for rate and acceleration, s."""
 MINIMUM_SINE = 1e-3
@@ -92,11 +92,11 @@ class AttitudeReferences:
         )
 
     def until(self, count: int) -> AttitudeReferences:
-        """Return the first `count` instants."""
+        """Return the motion at the first `count` instants."""
         return self._part(slice(count))
 
     def since(self, position: int) -> AttitudeReferences:
-        """Return the instants from index `position` on."""
+        """Return the motion from the instant with the index `position` on."""
         return self._part(slice(position, None))
 
     def _part(self, part: slice) -> AttitudeReferences:

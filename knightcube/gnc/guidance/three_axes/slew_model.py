@@ -14,10 +14,10 @@ Paths are cubic Hermite curves (de Boor 1978, ch. IV), evaluated here because sc
 MiB of memory in each process that flies or plans a slew.
 
 The end of a slew is an attitude, which gives three equations, or the direction of a boresight with a free
-roll, which gives two. The body rate at the end gives three more. All are quadratic in the quaternion. An
-exclusion cone is a direction from which a body axis stays away during the slew. Field, position, and the
-cones of Sun, Earth and Moon are taken from the prediction of an orbit. Times of a slew count from `begin`, s
-of the ephemeris.
+roll, which gives two. The body rate at the end gives three more equations. All these equations are quadratic
+in the quaternion. An exclusion cone is a cone about a direction, such as the Sun's, that a body axis must not
+enter during the slew. Field, position, and the cones of Sun, Earth and Moon come from a predicted orbit.
+Times of a slew count from `begin`, s of the ephemeris.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class SlewEnvironment:
 
 
 EnvironmentAt = Callable[[FloatArray], SlewEnvironment]
-"""Function from times (n,), s after the start of a slew, to the environment."""
+"""Function from times (n,) in s after the start of a slew to the environment at these times."""
 
 
 def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
@@ -124,7 +124,7 @@ class SlewDynamics:
     """The motion of one satellite at n times, in units of `scale` s and of `unit` A m^2.
 
     With z = (m + residual, b, e, w, q), where b and e are quadratic in q, all terms of x' except a constant
-    are quadratic in z: 1/2 z . H z. One product therefore gives the derivatives at all times at once.
+    are quadratic in z: 1/2 z . H z. One matrix product therefore gives the derivatives at all times at once.
     """
 
     def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
@@ -191,7 +191,7 @@ class SlewDynamics:
     def _by_unknowns(self, turned: FloatArray) -> FloatArray:
         """Return the derivative (n, 16, 10) of z by state and dipole.
 
-        The next call overwrites the array.
+        The next call overwrites the returned array.
         """
         self._parts[:, _BE, _ATTITUDE] = turned
         return self._parts
@@ -354,7 +354,7 @@ class ConeConstraints:
     def __init__(self, cones: tuple[Cone, ...], margin: FloatArray, times: FloatArray) -> None:
         """Widen the cones by `margin` at `times` (n,) s, because the path between these times is not checked.
 
-        The margin, in rad, is a scalar or (cones, n).
+        The margin (rad) is a scalar or an array (cones, n).
         """
         angles = np.array([cone.angle for cone in cones]).reshape(-1, 1) + margin
         self._limits = np.cos(np.clip(angles, 0.0, np.pi))
@@ -496,8 +496,8 @@ def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float)
 
 
 NODES = 24
-"""Number of intervals of the dipole. The heat is within 0.1 % of the result with 48 intervals, the shortest
-time within 0.6 %."""
+"""Default number of collocation intervals. The heat differs by less than 0.1 % from that with 48 intervals,
+and the shortest time by less than 0.6 %."""
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
 _DEEP, _STILL = math.radians(5.0), 1e-4

@@ -204,7 +204,7 @@ def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> S
 
 
 def _refusal(task: SlewTask, tried: int) -> str:
-    """Return the reason why no path was found, and possible remedies."""
+    """Return the error message for a task without a path, with possible remedies."""
     text = f"no slew within the dipole limit{' and outside the cones' * bool(task.cones)} was found"
     text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"
     ends = np.linspace(task.horizon, task.longest, _ENDS)
@@ -219,7 +219,7 @@ def _refusal(task: SlewTask, tried: int) -> str:
 def _plan(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPlan | None:
     """Return the plan of a path; None if the integration along it fails."""
     equations, scale = found.equations, found.equations.scale
-    with np.errstate(over="ignore", invalid="ignore"):  # where the integration diverges
+    with np.errstate(over="ignore", invalid="ignore"):  # a diverging integration may overflow
         try:
             at = closed(task.craft, search.solver.unit, task.along, found.program, found.point)
         except PlanningError:
@@ -279,7 +279,7 @@ class SlewOrder:
     """A slew in orbit from one pointing target to another.
 
     Attributes:
-        craft: the model of the satellite.
+        craft: model of the satellite, in body axes.
         axes: the pointing axes, to which the targets refer.
         camera: body axis (3,) that stays outside the exclusion cones.
         start: the target that is held until the slew begins; a free roll is taken as zero.
@@ -357,7 +357,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
             else:
                 value = (0.0, plan.energy + order.time_cost * plan.horizon)
             compared.append((value, float(begin)))
-    # Without a window, or if no coarse slew was found, only the first start time is used.
+    # If there is no window or no coarse slew was found, the first start time is used.
     for begin in [begin for _, begin in sorted(compared)] or [first]:
         task = task_at(order, ephemeris, begin)
         try:

@@ -4,12 +4,12 @@ The motion is discretised by Hermite-Simpson collocation in its separated form, 
 Practical Methods for Optimal Control, 2010, 4.5). The dipole is linear on each interval, so that it is within
 its limits at all times if it is within them at the nodes. The states are unknowns at nodes and midpoints.
 
-The vector of unknowns and multipliers has 31 elements per interval: the state (7) and the dipole (3) of the
-first node, the multipliers of the midpoint's equations (7), the state of the midpoint (7) and the multipliers
-of the equations at the end of the interval (7). The elements of the start conditions precede all intervals,
-and those of the end conditions follow them. Each equation involves only neighbouring elements, so that the
-matrix is banded, and LAPACK factors it. The functions that use LAPACK import it, because the control process
-imports the job but does not run it.
+The vector of unknowns and Lagrange multipliers has 31 elements per interval: the state (7) and the dipole (3)
+of the first node, the multipliers of the midpoint's equations (7), the state of the midpoint (7) and the
+multipliers of the equations at the end of the interval (7). The elements of the start conditions precede all
+intervals, and those of the end conditions follow them. Each equation involves only neighbouring elements, so
+that the matrix is banded, and LAPACK factors it. The functions that use LAPACK import it, because the control
+process imports the job but does not run it.
 
 The limits, as inequalities g >= 0, form one vector: the lower and upper limits of the dipoles (2, k + 1, 3),
 then the cones (cones, 2 k). The interior point method is that of Wachter and Biegler, Math. Program. 106
@@ -96,7 +96,7 @@ class BandLayout:
 
 @lru_cache(maxsize=16)
 def band_layout(count: int, ends: int) -> BandLayout:
-    """Return the layout for `count` intervals and `ends` equations at the end."""
+    """Return the layout for `count` intervals and `ends` end conditions."""
     begins = 7 + STEP * np.arange(count + 1)
     states = np.empty((2 * count + 1, 7), dtype=np.int64)
     states[::2] = begins[:, None] + np.arange(7)
@@ -128,7 +128,7 @@ class Factors:
             raise PlanningError("the equations of the slew are singular")
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return the solution (size,) of a right-hand side (size,). Raises PlanningError unless finite."""
+        """Return the solution (size,) of a right-hand side (size,). Raises PlanningError if not finite."""
         from scipy.linalg.lapack import dgbtrs  # noqa: PLC0415 - see the top
 
         found, _ = dgbtrs(self._factors, _BAND, _BAND, right[:, None], self._pivots)
@@ -168,7 +168,7 @@ class LinearisedEquations:
         between: residuals (k, 14) of the intervals' equations.
         begun: residuals (7,) of the start conditions.
         ended: residuals (ends,) of the end conditions.
-        jacobian: (k, 14, WIDE) derivatives of the intervals' equations.
+        jacobian: derivatives (k, 14, WIDE) of the intervals' equations by the unknowns.
         ending: (ends, 7) derivatives of the end's equations by the last state.
     """
 
@@ -280,7 +280,7 @@ class Transcription:
         """Return the band matrix of the derivatives of `slope`.
 
         `state_part` (2 k + 1, 7, 7) and `dipole_part` (k + 1, 3) are added to the second derivatives by
-        states and by dipoles. They come from the barriers and from the convexification.
+        states and by dipoles. Both arguments contain the terms of the barriers and of the convexification.
         """
         h = self._step
         bend = self._bend(linear, multipliers[self.layout.equations])
@@ -328,7 +328,7 @@ class SlewLimits:
     cones: ConeConstraints
 
     def values(self, at: Trajectory) -> FloatArray:
-        """Return the values g of all limits. A negative value is a violated limit."""
+        """Return the values g of all limits. A negative value means that a limit is violated."""
         found: list[FloatArray] = [np.zeros(0)]
         if self.dipole is not None:
             found += [(at.dipoles + self.dipole).ravel(), (self.dipole - at.dipoles).ravel()]
@@ -392,7 +392,7 @@ _HEAVIER = 1.2
 _FAR = 0.03
 """Sum of the constraint violations beyond which the curvature of the equations is omitted."""
 _DAMPED = 3e-3
-"""Minimum convexification per unit of constraint violation up to one, which prevents too long steps far from
+"""Minimum convexification per unit of constraint violation (at most one). It prevents too long steps far from
 a feasible point."""
 _CONVEX = 1e-3, 1e4
 FIRST_BARRIER = 1e-3
@@ -508,7 +508,7 @@ class SlewProgram:
         limits, at = self._limits, point.at
         stiff = point.dual / point.slack
         off = limits.values(at) - point.slack
-        # The duals of the limits for a step of zero length.
+        # These are the dual variables of the limits for a step of zero length.
         toward = barrier / point.slack - stiff * off
         right = limits.pull(at, toward) - point.slope
         factors = Factors(band)

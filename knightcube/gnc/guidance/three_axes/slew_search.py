@@ -7,10 +7,10 @@ target, stays outside the cones and needs little heat has about a dozen unknowns
 from many random starts at once. The gravity gradient and other torques are left to the planner. The random
 starts are the same in every call.
 
-Without the dipole limit, a path that keeps the cones is found from most guesses in a dozen Newton steps. Its
-heat is a lower bound of the heat within the limit. A guess with large constraint violations after some steps
-is deferred, because most such guesses never converge. If no path over the requested horizon is found, a
-longer slew is shortened by continuation.
+Without the dipole limit, a path that keeps the cones is found from most guesses in a dozen Newton steps. The
+heat of such a path is a lower bound of the heat of paths within the dipole limit. A guess with large
+constraint violations after some steps is deferred, because most such guesses never converge. If no path over
+the requested horizon is found, a longer slew is shortened by continuation.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
 """Last barrier parameters of a path for a warm start, and of a final path."""
 MET, _FLOWN_MET = 1e-2, 3e-3
 """Constraint violations below which an iterate is accepted before it is optimal, as a warm start and as a
-path to fly. Many runs converge slowly. The final integration of the path removes the residuals."""
+path to fly. Early acceptance saves time, because many runs converge slowly. The final integration of the path
+removes the remaining violations."""
 _STEPS_FREE = 25
 """Maximum number of Newton steps for a path without the dipole limit."""
 _LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
@@ -65,7 +66,7 @@ successful runs."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedPath:
-    """A path that satisfies the equations."""
+    """A path that satisfies the equations of a slew."""
 
     program: SlewProgram
     point: Iterate
@@ -197,7 +198,7 @@ class SlewSolver:
 
 
 def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
-    """Return a path transferred to the grid and the horizon of other equations.
+    """Return a path interpolated on the grid and scaled to the horizon of other equations.
 
     The dipoles are scaled by the inverse square of the ratio of the horizons.
     """
@@ -213,15 +214,14 @@ def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
 
 
 _BEGINS, _SPREAD = 24, 0.4
-"""Number of random starts, and their standard deviation in units of the torque of half a rotation."""
+"""Number of random starts of the fit, and standard deviation of the random mode amplitudes."""
 _COSINES = 6
-"""Number of cosine terms of the torque as a function of time, per axis."""
+"""Number of cosine terms per axis of the torque as a function of time."""
 _ROUNDS = 12
 _END, _CONE, _HEAT = 4.0, 2.0, 0.05
-"""Weights of the end error (rad), of the depth inside a cone (as a cosine), and of the torque in units of
-half a rotation."""
+"""Weights in the fit of a guess: end error (per rad), depth inside a cone (as a cosine), and torque."""
 _ROOM = 0.03
-"""Margin of a guess to a cone, as a cosine."""
+"""Margin that a guess keeps from a cone, as a difference of cosines."""
 _DAMPED = 1.0
 _LONGEST_STEP = 4.0
 """Largest step of the fit, in units of the torque of half a rotation."""
@@ -373,7 +373,7 @@ class _MomentumFit:
         return to_rotation_vector(multiply(np.broadcast_to(end.quaternion, last.shape), conjugate(last)))
 
     def _cone_violations(self, q: FloatArray) -> FloatArray:
-        """Return the depths (m, cones n) of paths inside the cones, as cosines."""
+        """Return how deep m paths lie inside the cones, (m, cones n), as differences of cosines."""
         return np.maximum(0.0, _ROOM - self._kept.values(q[:, None, 1:])).reshape(len(q), -1)
 
     def _propagated(self, sums: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -403,14 +403,14 @@ def _unit(q: FloatArray) -> FloatArray:
 ENOUGH = 3
 """Number of paths without the dipole limit from which the best one is taken."""
 LONGER = 1.0, 1.4, 2.0, 2.8
-"""Factors on a horizon that does not suffice."""
+"""Factors by which a horizon is lengthened if no path over it is found."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
 """First and last ratio of successive horizons in the continuation to a shorter horizon. The three pairs are
 for the coarse grid, for the fine grid, and for the fine grid of a slew that is only stretched."""
 _CROSSED = 1.3
 """Ratio of the widening of a cone to the depth of a path inside this cone between two points."""
 _BEYOND = math.radians(0.02)
-"""Additional widening of a cone, rad."""
+"""Additional angle (rad) by which a crossed cone is widened."""
 _BETWEEN = 16
 """Intervals of the intermediate grid, for paths that do not converge from the coarse to the fine grid."""
 _LOST, _EASED_STEP = 1.5, 1.03
@@ -426,7 +426,7 @@ class HorizonContinuation:
     def __init__(self, task: SlewTask, solver: SlewSolver, budget: float) -> None:
         """Start no further continuation step after `budget` of work."""
         self._task, self._solver, self._budget = task, solver, budget
-        # Coarse paths from which no path on the fine grid was found.
+        # Paths on the coarse grid from which no path on the fine grid was found.
         self._lost: set[tuple[float, float, float]] = set()
 
     def within(self, start: SolvedPath) -> SolvedPath | None:
@@ -463,7 +463,7 @@ class HorizonContinuation:
         return None if best is None else self._refined(best, shortest, time_cost)
 
     def distinct(self, relaxed: list[SolvedPath]) -> list[SolvedPath]:
-        """Return the distinct relaxed paths, the cheapest first."""
+        """Return the distinct paths without dipole limit, the cheapest first."""
         ordered = sorted(relaxed, key=self._solver.energy)
         costs = [(found.horizon, self._solver.energy(found)) for found in ordered]
         return ordered[:1] + [
@@ -584,7 +584,7 @@ four unsuccessful guesses have a larger one (320 guesses, seed 41 of the bench `
 _STEPS_WITHOUT_PATH = 120
 """Newton steps without a path after which the other guesses over a horizon are deferred."""
 _WIDENED = 4
-"""Maximum number of times that cones are widened or dipoles reduced for one path."""
+"""Maximum number of corrections of one path by widening cones or reducing dipoles."""
 
 
 class SlewSearch:
@@ -598,7 +598,7 @@ class SlewSearch:
         self._coarse = min(task.nodes, coarse)
         self._further = _FURTHER_WITH_CONES if task.cones else _FURTHER
         self._widened = 0
-        self._known: list[float] = []  # heats, J, of the relaxed paths tried
+        self._known: list[float] = []  # heats (J) of the paths without dipole limit that were tried
         self.tried = 0
 
     def paths(self) -> Iterator[SolvedPath]:
