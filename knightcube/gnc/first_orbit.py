@@ -210,8 +210,8 @@ def _within(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the interval of distances in which chi-square is within `_DEGREES_95` of its minimum.
 
-    The first pair holds the outermost scanned points inside the interval. The second pair holds the
-    interpolated ends of the interval.
+    The first returned pair holds the outermost scanned distances inside the interval, the second pair the
+    interpolated ends.
     """
     excess = chi_square - chi_square.min() - _DEGREES_95
     first, last = (int(position) for position in np.flatnonzero(excess < 0.0)[[0, -1]])

@@ -196,5 +196,5 @@ class Detumbler:
         self._rate = None
         if self._before is not None:
             span_ns = time_ns - self._before[0]
-            if span_ns < 2 * self._schedule.period_ns:  # otherwise a window was missed
+            if span_ns < 2 * self._schedule.period_ns:  # after a missed window the rate stays unknown
                 self._rate = rate_across(self._before[1], field, span_ns * _SECOND)

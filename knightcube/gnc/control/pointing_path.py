@@ -349,7 +349,8 @@ class PlannedMotion:
 class MotionGains:
     """Gains K (n, 4, 6) about a motion, and the affine part k (n, 4, columns).
 
-    The first column of k improves the motion. Each further column compensates one disturbance torque.
+    The first column of k is the change of the controls that improves the motion. Each further column of k
+    compensates one disturbance torque.
     """
 
     gain: FloatArray

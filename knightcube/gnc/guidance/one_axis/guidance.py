@@ -94,7 +94,7 @@ class PathGuidance:
 
     @property
     def path(self) -> PolynomialPath | None:
-        """The path that is followed or whose end is held; None without one."""
+        """The path that is being followed, or whose end is being held; None without one."""
         return self._path
 
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:

@@ -52,8 +52,8 @@ ProgramAt = Callable[[float], PathProgram]
 
 SHORTEST_COST = 7.0
 """Time cost, in units of R Imax^2, with which the shortest horizon is found. An infinite cost would give the
-bang-bang path, whose energy is up to 1 % above the optimum at its horizon. With this cost, the horizon is
-about 0.3 % longer and the energy within 0.25 % of the optimum."""
+bang-bang path, whose energy is up to 1 % above the optimum at its horizon. With SHORTEST_COST, the horizon is
+about 0.3 % longer than the shortest horizon, and the energy is within 0.25 % of the optimum."""
 
 _SHORTEST_STRETCH = 1.015
 """Largest factor by which the time cost SHORTEST_COST may stretch a horizon although the requested horizon is
@@ -401,7 +401,7 @@ def _assemble(
 ) -> StepPlan:
     """Return the plan that belongs to a solution `trial` of the optimiser.
 
-    Raises PlanningError if it is not finite.
+    Raises PlanningError if the path is not finite.
     """
     energy, supplied = (program.spent(trial, cost) for cost in PathCost)
     peak = float(np.abs(program.ratios(trial)[0]).max()) * program.current_limit

@@ -347,8 +347,8 @@ class Cone:
 class ConeConstraints:
     """Exclusion cones at n times as inequalities g >= 0.
 
-    The value g is the cosine of the limit minus the cosine of the angle between body axis and direction. It
-    is a quadratic form of the attitude.
+    The value of g is the cosine of the cone's half angle minus the cosine of the angle between body axis and
+    direction. It is a quadratic form of the attitude.
     """
 
     def __init__(self, cones: tuple[Cone, ...], margin: FloatArray, times: FloatArray) -> None:
@@ -363,7 +363,7 @@ class ConeConstraints:
             -shown_curvature(np.broadcast_to(cone.axis, (size, 3)), cone.direction(times)) for cone in cones
         ]
         self.curvatures = np.array(found).reshape(self.count, size, 4, 4)
-        """(cones, n, 4, 4), the second derivative by the attitude."""
+        """Second derivative (cones, n, 4, 4) of the cone constraints by the attitude."""
 
     def values(self, q: FloatArray) -> FloatArray:
         """Return g (cones, n) at attitudes (n, 4), or g (m, cones, n) of m paths (m, 1, n, 4)."""

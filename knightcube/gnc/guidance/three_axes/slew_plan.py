@@ -100,7 +100,7 @@ def closed(
 
 
 def _integrated(motions: list[SlewDynamics], at: Trajectory, length: float) -> tuple[FloatArray, FloatArray]:
-    """Return the states (k, 7) in the middle and at the end of each interval, integrated from its start."""
+    """Return the states (k, 7) in the middle and at the end of k intervals, integrated from their starts."""
     x, h = at.states[:-1:2], length / _STEPS
     slope = (at.dipoles[1:] - at.dipoles[:-1]) / (2 * _STEPS)
     middle = x

@@ -52,7 +52,7 @@ class BandLayout:
     """Positions of states, dipoles and equations of a slew in the vector of unknowns and in the band matrix.
 
     Attributes:
-        states: (2 k + 1, 7) at nodes and midpoints.
+        states: indices (2 k + 1, 7) of the states at nodes and midpoints.
         dipoles: (k + 1, 3).
         equations: (k, 14).
         start: (7,).
@@ -169,7 +169,7 @@ class LinearisedEquations:
         begun: residuals (7,) of the start conditions.
         ended: residuals (ends,) of the end conditions.
         jacobian: derivatives (k, 14, WIDE) of the intervals' equations by the unknowns.
-        ending: (ends, 7) derivatives of the end's equations by the last state.
+        ending: derivatives (ends, 7) of the end conditions by the last state.
     """
 
     at: Trajectory
@@ -250,7 +250,7 @@ class Transcription:
     def slope(self, linear: LinearisedEquations, multipliers: FloatArray) -> FloatArray:
         """Return the derivative (size,) of the Lagrangian, with the residuals at the equations' positions.
 
-        The Lagrangian is the cost plus the `multipliers` times the equations. `multipliers` (size,) is read
+        The Lagrangian is the cost plus the equations weighted by `multipliers`. `multipliers` (size,) is read
         only at the positions of the equations.
         """
         at, layout = linear.at, self.layout
@@ -568,8 +568,8 @@ class NewtonRun:
     """An interior point iteration from an initial guess that can be interrupted and resumed.
 
     Attributes:
-        point: the newest iterate.
-        is_over: an optimum was found, or no further step exists.
+        point: newest iterate of the method.
+        is_over: whether an optimum was found or no further step is possible.
     """
 
     def __init__(
@@ -582,7 +582,7 @@ class NewtonRun:
     ) -> None:
         """Start from `guess` with the `multipliers` (size,) of the equations, None for zero.
 
-        The cost should be of the order of one. The barrier parameter falls from `first` to `last`.
+        The cost should be of the order of one. The barrier parameter decreases from `first` to `last`.
         """
         self.program, self._first, self._last, self.is_over = program, first, last, False
         self.point = program.begin(guess, multipliers, first)
@@ -602,7 +602,7 @@ class NewtonRun:
         """Return the optimum found within `maximum` more steps; None if none was found."""
         if self.is_over:
             return None
-        with np.errstate(over="ignore", invalid="ignore"):  # an overflow leads to a shorter step
+        with np.errstate(over="ignore", invalid="ignore"):  # an overflow only leads to a shorter step
             return self._run(maximum)
 
     def _run(self, maximum: int) -> Iterate | None:

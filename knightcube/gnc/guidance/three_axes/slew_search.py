@@ -252,7 +252,7 @@ def guesses(
     fit = _MomentumFit(curves, craft, start, end, kept, scale)
     found = []
     for states in fit.found():
-        # The dipoles are the smallest ones that make the required torque's component normal to the field.
+        # The dipoles are the smallest that produce the component of the required torque normal to the field.
         still = motion.flow(states, np.zeros((len(states), 3)))
         wanted = np.gradient(states[:, 4:], 1.0 / (len(states) - 1), axis=0) - still[:, 4:]
         field = motion.field(states[:, :4])
@@ -417,7 +417,7 @@ _LOST, _EASED_STEP = 1.5, 1.03
 """Ratio of the flown dipole to its limit above which a path is abandoned, and factor by which the horizon of
 another path above the limit is lengthened."""
 _PEAK = 0.9
-"""Ratio of the largest dipole to its limit at the horizon at which the continuation begins."""
+"""Ratio of the largest dipole to its limit on the first horizon of the continuation."""
 
 
 class HorizonContinuation:
