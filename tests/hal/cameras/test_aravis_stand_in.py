@@ -219,7 +219,8 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
 def test_the_camera_is_set_up_as_configured(rig: Rig) -> None:
     assert rig.camera.set == {
         "format": "Mono12", "region": (176, 160, 640, 480), "gain auto": "off", "gain": 6.0,
-        "exposure auto": "off", "exposure": 20_000.0, "mode": "continuous", "trigger": "Software", "started": True,
+        "exposure auto": "off", "exposure": 20_000.0, "mode": "continuous", "trigger": "Software",
+        "started": True,
     }  # fmt: skip
     assert rig.stream.given == [("buffer", 99)] * 4
     assert rig.interfaces == []
