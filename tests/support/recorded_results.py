@@ -30,8 +30,6 @@ def figures_of(value: Any, depth: int = 0) -> Any:
     """Return the numbers of a result as JSON: dataclasses and mappings by name, arrays as figures."""
     if isinstance(value, np.generic):
         value = value.item()
-    elif isinstance(value, range):
-        value = [value.start, value.stop, value.step]
     if value is None or isinstance(value, bool | int | float | str | Enum):
         return _plain(value)
     if isinstance(value, np.ndarray):

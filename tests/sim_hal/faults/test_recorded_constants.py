@@ -1,9 +1,0 @@
-"""The constants of `sim_hal.faults` are those of the record."""
-
-from __future__ import annotations
-
-from tests.support.recorded_constants import check_constants
-
-
-def test_the_constants_are_as_recorded() -> None:
-    check_constants(__file__)
