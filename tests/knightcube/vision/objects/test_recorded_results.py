@@ -66,3 +66,16 @@ def test_the_ends_of_streaks_are_as_recorded() -> None:
 def test_objects_among_streaks_are_as_recorded() -> None:
     report = detect_objects(streaked(), SMALL.pinhole, TURN, 1.0, ObjectSettings())
     check(__file__, "indicators", report)
+
+
+def test_a_bright_satellite_beside_a_star_is_as_recorded() -> None:
+    found = Shot(np.array([60.0, 300.0]), np.array([1.5, -1.0]), -0.5, np.zeros(3), knows=False).found()
+    check(__file__, "bright", [found.objects, found.solution])
+
+
+def test_a_faint_satellite_near_the_border_is_as_recorded() -> None:
+    check(__file__, "border", shot((4.0, 250.0), (1.0, 3.0), 5.5).objects)
+
+
+def test_stars_alone_are_as_recorded() -> None:
+    check(__file__, "alone", shot((-900.0, -900.0), (0.0, 0.0), 4.0).objects)

@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from knightcube.astro.arrays import Image
 from knightcube.astro.quaternion import from_rotation_vector, multiply
+from knightcube.reference.star_identification import DEFAULT_METHOD, method_of
 from knightcube.vision.camera.lens import CameraKnowledge, Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
@@ -24,6 +26,7 @@ from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.startracker.frames import SkyFrame, sky, sky_frame
 from tests.support.recorded_results import check
+from tests.support.star_lists import ListKind, draw, draw_random
 
 CAMERA = StarCameraModel(columns=512, rows=512, field_of_view=float(np.radians(16.0)))
 EXACT = SolveSettings(uncalibrated_lens=False)
@@ -131,3 +134,47 @@ def test_the_fit_in_the_image_is_as_recorded() -> None:
         fit_in_image(points, covariance, reference, camera, start, Unknowns(free)) for free in (False, True)
     ]
     check(__file__, "image fit", fits)
+
+
+def crowded() -> Image:
+    """Return a frame with close pairs, a saturated star, hot pixels, a cosmic ray and stray light."""
+    rng = np.random.default_rng(14)
+    row, column = np.indices((240, 260))
+    light = 300.0 + 0.5 * column + 60.0 * np.exp(-((row - 200.0) ** 2 + (column - 40.0) ** 2) / 800.0)
+    places = rng.uniform(15.0, 225.0, (30, 2))
+    places[1:8] = places[8:15] + rng.uniform(-4.0, 4.0, (7, 2))
+    for number, (x, y) in enumerate(places):
+        bell = np.exp(-0.5 * ((column - x) ** 2 + (row - y) ** 2) / 1.1**2)
+        light += (4e5 if number == 20 else 9e3 / (1.0 + 0.3 * number)) * bell / 7.6
+    light[rng.integers(0, 240, 25), rng.integers(0, 260, 25)] += 2500.0
+    light[100, 60:110] += 1500.0
+    return np.clip(light + rng.normal(0.0, 14.0, light.shape), 0, 4095).astype(np.uint16)
+
+
+def test_detections_in_a_crowded_frame_are_as_recorded() -> None:
+    found = detect(crowded(), DetectionSettings(saturation=4095.0))
+    check(__file__, "crowded", [found, found.stars()])
+
+
+def test_detections_in_a_crowded_frame_without_settings_are_as_recorded() -> None:
+    check(__file__, "crowded plain", [survey(crowded()), detect(crowded()).stars()])
+
+
+def test_stars_near_places_in_a_crowded_frame_are_as_recorded() -> None:
+    places = np.random.default_rng(14).uniform(15.0, 225.0, (30, 2))
+    trail = np.tile([2.0, 1.0], (30, 1))
+    settings = DetectionSettings(saturation=4095.0)
+    found = [measure_near(crowded(), places, settings), measure_near(crowded(), places, settings, trail)]
+    check(__file__, "crowded near", found)
+
+
+def test_an_image_of_floating_point_numbers_is_as_recorded() -> None:
+    check(__file__, "floating", detect(crowded().astype(np.float64) / 4095.0))
+
+
+def test_star_lists_are_identified_as_recorded() -> None:
+    rng = np.random.default_rng(15)
+    kind = ListKind(field_deg=14.0, noise_px=0.2, known_deg=0.1, faintest=6.0, false_stars=3, lost=0.1)
+    stars = sky().stars
+    lists = [draw(kind, stars, rng), draw(kind, stars, rng), draw_random(kind, 20, rng)]
+    check(__file__, "lists", [method_of(DEFAULT_METHOD)(one.field(), sky()) for one in lists])

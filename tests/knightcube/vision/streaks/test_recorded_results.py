@@ -97,3 +97,20 @@ def test_a_motion_through_a_calibrated_lens_is_as_recorded() -> None:
     lens = Lens(400, 400, pinhole.focal_length, (201.0, 198.5), 1e-3, 0.0)
     result = estimate_rate(one.pixels, lens, 0.2, prior_rate=one.rate, prior_sigma=1e-3, settings=SETTINGS)
     check(__file__, "lens", result)
+
+
+def test_a_crowded_frame_of_faint_stars_is_as_recorded() -> None:
+    check(__file__, "faint", found(scene(22, 1.2, 25.0, 1.0)))
+
+
+def test_a_frame_in_8_bits_is_as_recorded() -> None:
+    one = scene(23, 0.9, 50.0, bits=8, gain=16.0, pedestal=20.0)
+    check(__file__, "8 bits", found(one, LikelihoodSettings(saturation=255.0, gain=16.0)))
+
+
+def test_frames_without_a_motion_are_as_recorded() -> None:
+    rng = np.random.default_rng(24)
+    noise = rng.normal(100.0, 10.0, (300, 300)).astype(np.uint16)
+    pinhole = replace(SMALL, columns=300, rows=300).pinhole
+    frames = [noise, np.zeros((300, 300), np.uint16), np.full((300, 300), 4095, np.uint16)]
+    check(__file__, "no motion", [estimate_motion(frame, pinhole, 0.2, SETTINGS) for frame in frames])
