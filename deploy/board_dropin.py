@@ -1,8 +1,9 @@
-"""Print the drop-in that a configuration needs for a unit: its devices, network and bus.
+"""Print the systemd drop-in that gives a service access to the devices and networks of a configuration.
 
-Run by install.sh with the installed Python: board_dropin.py [--safe | --link] CONFIG; with --safe for
-knightcube-safe.service, with --link for knightcube-link.service (nothing where there is no link), else for
-knightcube.service. Exit status 2, and one line, for a wrong configuration.
+The script install.sh runs board_dropin.py [--safe | --link] CONFIG with the installed Python. By default the
+script prints the drop-in of knightcube.service, with --safe that of knightcube-safe.service, and with --link
+that of knightcube-link.service. With --link it prints an empty text if the configuration has no link. For an
+invalid configuration it prints one line and exits with status 2.
 """
 
 from __future__ import annotations
@@ -23,23 +24,24 @@ from hal.buses.i2c_bus import device_file
 from knightcube.errors import UsageError
 
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
-"""Driver classes of the devices that may be plugged in after the start, by kind."""
+"""Driver classes of serial lines, video devices and I2C buses that may be plugged in after the start of the
+service."""
 
 
 def dropin(config: Config) -> str:
-    """Return the drop-in of the flight's unit."""
+    """Return the drop-in of knightcube.service, which runs the flight."""
     lines = []
     if config.simulation is None:
         awaited = [device_unit(path) for path, _ in _nodes(config)]
         lines += ["[Unit]", *(f"{word}={unit}" for unit in awaited for word in ("Wants", "After"))]
     lines += ["[Service]", *_devices(config)]
-    if config.commands.udp is not None:  # a bench, on this machine alone
+    if config.commands.udp is not None:  # commands over UDP come only from this machine, a bench
         lines += _network([LOOPBACK])
     return _text(lines)
 
 
 def safe_dropin(config: Config) -> str:
-    """Return the drop-in of the safe state's unit, which accesses the coils and the command socket."""
+    """Return the drop-in of knightcube-safe.service, which accesses the coils and the command socket."""
     lines = ["[Service]", *(_bus(config) if config.simulation is None else [])]
     if config.commands.socket is not None:
         lines.append(f'Environment="KNIGHTCUBE_COMMANDS={config.commands.socket}"')
@@ -47,7 +49,7 @@ def safe_dropin(config: Config) -> str:
 
 
 def link_dropin(config: Config, root: Path = Path("/")) -> str:
-    """Return the drop-in of the link's unit, empty where the configuration has no link."""
+    """Return the drop-in of knightcube-link.service, or an empty text if the configuration has no link."""
     link = config.link
     if link is None:
         return ""
@@ -62,16 +64,18 @@ def link_dropin(config: Config, root: Path = Path("/")) -> str:
 
 
 def _line(device: str, root: Path) -> list[str]:
-    """Return the lines that open a serial line: one on the board alone in a /dev of the unit's own.
+    """Return the settings that give a service access to a serial line.
 
-    One that is plugged in, or not there yet, may return as a new node, which such a /dev would not show.
+    If the serial line is built into the board, the service gets a private /dev that contains only this line.
+    A pluggable or missing device may appear later as a new device file, which a private /dev would not
+    contain.
     """
     opened = allowed(device, SERIAL, root)
     return opened if len(opened) > 1 else [*opened, "PrivateDevices=yes", f"BindPaths={device}"]
 
 
 def device_unit(path: str) -> str:
-    """Return the name of systemd's unit of a device file (systemd.unit(5), "string escaping")."""
+    """Return the name of the systemd device unit for a device file (systemd.unit(5), "string escaping")."""
     kept = {ord(letter) for letter in string.ascii_letters + string.digits + ":_."}
     name = path.strip("/").encode()
     escaped = ["-" if byte == ord("/") else chr(byte) if byte in kept else f"\\x{byte:02x}" for byte in name]
@@ -79,11 +83,12 @@ def device_unit(path: str) -> str:
 
 
 def allowed(path: str, plugged: tuple[str, ...], root: Path = Path("/")) -> list[str]:
-    """Return the DeviceAllow lines of a device file, a udev name or the node itself.
+    """Return the DeviceAllow lines for a device file, which may be a symbolic link made by udev.
 
-    systemd resolves a file to one device number when the unit starts. A USB device may return under another
-    number, ttyUSB1 for ttyUSB0, so its driver's class is allowed; a device that does not exist yet is allowed
-    by the classes `plugged`. `root` holds proc and sys.
+    systemd resolves a file to one device number when the service starts. A USB device may reconnect under
+    another number, such as ttyUSB1 instead of ttyUSB0, so the class of the driver is allowed. For a device
+    that does not exist yet, the driver classes `plugged` are allowed. The folder `root` contains proc and
+    sys.
     """
     try:
         mode, number = (found := os.stat(path)).st_mode, found.st_rdev
@@ -97,14 +102,14 @@ def allowed(path: str, plugged: tuple[str, ...], root: Path = Path("/")) -> list
 
 
 def _driver_classes(major: int, root: Path) -> tuple[str, ...]:
-    """Return the driver name of a character device from /proc/devices."""
+    """Return the names in /proc/devices of the drivers of character devices with a major number."""
     listed = (root / "proc/devices").read_text(encoding="ascii").partition("Block devices:")[0]
     pairs = (words for line in listed.splitlines() if len(words := line.split()) == 2)
     return tuple(name for number, name in pairs if number == str(major))
 
 
 def _network(peers: Sequence[IPv4Network]) -> list[str]:
-    """Return the lines that open the network; IPAddressDeny=any of the unit stays in force for all others."""
+    """Return the settings that permit traffic to `peers`; the service file denies all other addresses."""
     opened = ["PrivateNetwork=no", "RestrictAddressFamilies=AF_INET"]
     return [*opened, *(f"IPAddressAllow={peer}" for peer in peers)]
 
@@ -115,14 +120,14 @@ def _text(lines: list[str]) -> str:
 
 
 def _nodes(config: Config) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the files of the configured devices, each with the classes in which it may appear."""
+    """Return the files of the configured devices, each with the driver classes of such a device."""
     nodes = [(device_file(config.coils.bus), I2C), (config.inertial_unit.device, SERIAL)]
     camera = config.camera.device if config.camera is not None else None
     return [*nodes, (camera.path, VIDEO)] if isinstance(camera, V4l2Device) else nodes
 
 
 def _devices(config: Config) -> list[str]:
-    """Return the lines that allow the real devices."""
+    """Return the settings that allow access to the real devices, empty for a simulation."""
     if config.simulation is not None:
         return []
     lines = _bus(config)
@@ -130,13 +135,13 @@ def _devices(config: Config) -> list[str]:
         lines += allowed(path, plugged)
     camera = config.camera.device if config.camera is not None else None
     if camera is not None and not isinstance(camera, V4l2Device):
-        # Aravis talks to USB3 Vision cameras by libusb, which asks udev for them.
+        # Aravis accesses USB3 Vision cameras through libusb, which finds the cameras through udev.
         lines += ["DeviceAllow=char-usb_device rw", "RestrictAddressFamilies=AF_NETLINK"]
     return lines
 
 
 def _bus(config: Config) -> list[str]:
-    """Return the lines that `coils-off` needs."""
+    """Return the settings that allow access to the I2C bus of the coils."""
     i2c = device_file(config.coils.bus)
     return [
         f"Environment=KNIGHTCUBE_I2C={i2c} KNIGHTCUBE_PWM=0x{config.coils.address:02x}",
@@ -145,7 +150,7 @@ def _bus(config: Config) -> list[str]:
 
 
 def main(words: list[str]) -> int:
-    """Print the drop-in of a configuration."""
+    """Print the drop-in for the configuration file in the arguments, and return the exit status."""
     make = {"--safe": safe_dropin, "--link": link_dropin}.get(words[0], dropin)
     try:
         sys.stdout.write(make(load(Path(words[-1]))))

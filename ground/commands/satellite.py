@@ -93,7 +93,7 @@ _RATE = 20_000.0
 _SILENCE_S = 60.0
 """Default time (s) without a packet after which a file command fails."""
 _TURN_S = 0.01
-"""Time (s) to wait for packets before transfer units that are due are sent."""
+"""Time (s) to wait for packets before the due protocol data units of file transfers are sent."""
 _SHOW_S = 1.0
 """Time (s) between two lines of progress."""
 _LINGER_S = 0.5
@@ -263,7 +263,7 @@ def _command_of(options: argparse.Namespace) -> Command:
 
 @dataclass(frozen=True, slots=True)
 class ParameterTable:
-    """A table of parameters as reported by a flight."""
+    """Parameter table that a flight has reported."""
 
     values: dict[str, float]
     crc: int
@@ -273,7 +273,7 @@ class ParameterTable:
 
     @classmethod
     def of(cls, row: np.void) -> ParameterTable:
-        """Return the parameter table in a packet."""
+        """Return the parameter table that the decoded packet `row` contains."""
         values = {
             key: float(row[field.name]) for key, field in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True)
         }
@@ -392,7 +392,7 @@ def _show(table: ParameterTable, before: ParameterTable, refused: str, as_json: 
 
 
 def _change(text: str) -> tuple[str, float]:
-    """Return name and value of NAME=VALUE. Raises UsageError."""
+    """Return the name and the value of an argument NAME=VALUE. Raises UsageError."""
     key, _, value = text.partition("=")
     if key not in PARAMETER_KEYS:
         raise UsageError(f"{key}: no such parameter: {', '.join(PARAMETER_KEYS)}")
@@ -403,7 +403,7 @@ def _change(text: str) -> tuple[str, float]:
 
 
 def _parameters_in(path: Path) -> dict[str, float]:
-    """Return the parameter table in a file.
+    """Return the parameter table that a YAML file contains.
 
     Raises ConfigError for an invalid table, and UsageError for an unreadable file.
     """

@@ -48,7 +48,10 @@ class Message:
 
 @dataclass(slots=True)
 class _Fault:
-    """A bus fault that acts `left` times, or until removed if `left` is None; `code` 0 is a bit flip."""
+    """A bus fault that acts `left` times, or until it is removed if `left` is None.
+
+    `code` 0 is a bit flip.
+    """
 
     code: int
     text: str
@@ -289,7 +292,7 @@ def smbus(
 
 def _block(bus: EmulatedI2cBus, address: int, reading: bool, head: bytes, size: int, data: bytes) -> bytes:
     """Execute a block transfer; an SMBus block on the bus begins with its length, an I2C block does not."""
-    # The old code of an I2C block read reads a block of the maximum length.
+    # The obsolete transfer code for I2C block reads always reads a block of the maximum length.
     length = _BLOCK_LIMIT if size == _OLD_I2C_BLOCK and reading else data[0]
     if not 1 <= length <= _BLOCK_LIMIT:
         raise OSError(errno.EINVAL, f"a block of {length} bytes")

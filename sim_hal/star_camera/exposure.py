@@ -6,12 +6,12 @@ quadrature. Because the point spread function is separable, the charge of all sa
 pixels is one product of two thin matrices, (rows, samples) by (samples, columns), so a large number of
 samples is cheap.
 
-A rolling shutter starts row r r line times after row 0. Light that reaches row r at time t is collected if
-the row time u = t - start - r * line_time is within the exposure. The integration over a source's path uses u
-as its variable: the source is on row y at the time start + u + y * line_time. The neighbouring rows see the
-source a few line times earlier or later, at another point of its path, so the image of the source is sheared
-and stretched. The quadrature converges as fast as for a global shutter, because no sample lies at the edge of
-the shutter's opening.
+With a rolling shutter, the exposure of row r begins r line times after the exposure of row 0. Light that
+reaches row r at time t is collected if the row time u = t - start - r * line_time is within the exposure. The
+integration over a source's path uses u as its variable: the source is on row y at the time start + u + y *
+line_time. The neighbouring rows see the source a few line times earlier or later, at another point of its
+path, so the image of the source is sheared and stretched. The quadrature converges as fast as for a global
+shutter, because the integrand has no step inside the integration interval.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def _table(spread: PointSpread, size: int) -> tuple[Float32Array, Float32Array]:
     """
     positions = np.arange(size * STEPS + 2) / STEPS
     table = spread.profile(np.arange(size) - positions[:, None])
-    # Each entry is normalised, so that the charge beyond the reach of the spread is not lost.
+    # Each row is normalised, so that charge beyond the reach of the point spread function is not lost.
     shares = np.asarray(table / table.sum(axis=1, keepdims=True), dtype=np.float32)
     return shares[:-1], np.diff(shares, axis=0)
 

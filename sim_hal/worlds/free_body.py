@@ -110,7 +110,7 @@ class Rotation:
         gx, gy, gz = a11 * x + a12 * y + a13 * z, a21 * x + a22 * y + a23 * z, a31 * x + a32 * y + a33 * z
         i1, i2, i3 = self._of_torques
         k1, k2, k3 = self._of_rates
-        # The gravity-gradient term r x (J r) has the same factors as the gyroscopic term w x (J w).
+        # In principal axes, r x (J r) and w x (J w) contain the same differences of the moments of inertia.
         return (
             0.5 * (w3 * q2 - w2 * q3 + w1 * q4),
             0.5 * (w1 * q3 - w3 * q1 + w2 * q4),
@@ -321,7 +321,10 @@ def sunlight_torque(faces: Sequence[Face], sun: Floats, light: float) -> Floats:
 
 
 class LoadModel:
-    """Model of the dipoles and torques of one craft; `multiples` scale its worst-case disturbances."""
+    """Model of the dipoles and torques of one craft.
+
+    `multiples` scale the worst-case disturbances of the craft.
+    """
 
     def __init__(self, craft: TrueCraft, multiples: Disturbances) -> None:
         self._faces = craft.faces
@@ -336,7 +339,7 @@ class LoadModel:
         self._walking = craft.walking_dipole
 
     def coil_dipole(self, currents: Floats) -> Floats:
-        """Return the coils' dipole (3,) A m^2 at currents (3,) A."""
+        """Return the dipole moment (3,), A m^2, of the coils at currents (3,), A."""
         return turned(self._coils, currents)
 
     def residual_dipole(self, around: OrbitEnvironment) -> Floats:
@@ -496,7 +499,7 @@ class FreeBody:
         )
 
     def _torques(self, around: OrbitEnvironment, state: State, acting: Floats) -> dict[str, FloatArray]:
-        """Return the torque (3,), N m, body axes, of each cause in `CAUSES`."""
+        """Return the torque (3,), N m, body axes, of each disturbance in `CAUSES`."""
         turn = matrix(*state[:4])
         attitude = quaternion.multiply(self._from_principal, np.array(state[:4]))
         to_body = matrix(*attitude.tolist())

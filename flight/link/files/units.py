@@ -1,10 +1,10 @@
-"""Encoding and decoding of CFDP class 2 units (CCSDS 727.0-B-5, section 5) and the packets that carry them.
+"""Encoding and decoding of CFDP class 2 protocol data units (CCSDS 727.0-B-5, section 5) in packets.
 
-A unit (protocol data unit) consists of a header and either file data or a directive. The header has version
-1, entity numbers of 2 bytes and transaction numbers of 4 bytes; the decoder also accepts other lengths. The
-units contain no CRC, because the frame that carries a unit is authenticated. The large-file option is not
-used. Each unit is sent in a space packet of variable length, with the same headers as the other packets and a
-16-bit CRC. The tables of packet definitions do not list the packets that carry units.
+A protocol data unit (PDU) consists of a header and either file data or a directive. The header has version 1,
+entity numbers of 2 bytes and transaction numbers of 4 bytes; the decoder also accepts other lengths. The PDUs
+contain no CRC, because the frame that carries a PDU is authenticated. The large-file option is not used. Each
+PDU is sent in a space packet of variable length, with the same headers as the other packets and a 16-bit CRC.
+The tables of packet definitions do not list the packets that carry PDUs.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYT
 from knightcube.errors import FlightError
 
 SEGMENT_BYTES = 900
-"""Maximum file data (bytes) in one unit, chosen so that the unit fits into a telecommand frame."""
+"""Maximum file data (bytes) in one PDU, chosen so that the PDU fits into a telecommand frame."""
 MOST_REQUESTS = 100
-"""Maximum number of gaps in one NAK unit, chosen so that the unit fits into a telecommand frame."""
+"""Maximum number of gaps in one NAK PDU, chosen so that the PDU fits into a telecommand frame."""
 HIGHEST_NUMBER = 2**32 - 1
 _ENTITY_BYTES, _NUMBER_BYTES = 2, 4
 _FIXED_BYTES = 4
@@ -32,7 +32,7 @@ _MOST_NAME_BYTES = 255
 
 
 class PduError(FlightError):
-    """Raised for bytes that are not a CFDP unit of class 2. The error text states the reason."""
+    """Raised for bytes that are not a CFDP PDU of class 2. The error text states the reason."""
 
 
 class Condition(IntEnum):
@@ -82,7 +82,7 @@ class Transaction:
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """Metadata unit: file size (bytes), file names at the sender and receiver, and checksum type."""
+    """Metadata PDU: file size (bytes), file names at the sender and receiver, and checksum type."""
 
     size: int
     source_name: str
@@ -92,7 +92,7 @@ class Metadata:
 
 @dataclass(frozen=True, slots=True)
 class FileData:
-    """File data unit: one segment of the file."""
+    """File data PDU: one segment of the file."""
 
     offset: int
     data: bytes
@@ -100,7 +100,7 @@ class FileData:
 
 @dataclass(frozen=True, slots=True)
 class Eof:
-    """EOF unit, sent after all data or if the sender cancels the transfer."""
+    """EOF PDU, sent after all data or if the sender cancels the transfer."""
 
     condition: int
     checksum: int
@@ -109,7 +109,7 @@ class Eof:
 
 @dataclass(frozen=True, slots=True)
 class Nak:
-    """NAK unit: request for missing byte ranges (begin, end). The range (0, 0) requests the metadata."""
+    """NAK PDU: request for missing byte ranges (begin, end). The range (0, 0) requests the metadata."""
 
     begin: int
     end: int
@@ -118,7 +118,7 @@ class Nak:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """Finished unit: report from the receiver that the transfer has ended."""
+    """Finished PDU: report from the receiver that the transfer has ended."""
 
     condition: int
     complete: bool
@@ -127,7 +127,7 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """ACK unit: acknowledgement of an EOF or Finished unit."""
+    """ACK PDU: acknowledgement of an EOF or Finished PDU."""
 
     code: int
     condition: int
@@ -141,7 +141,7 @@ _EOF = struct.Struct(">BII")
 
 
 def pack(transaction: Transaction, content: Content) -> bytes:
-    """Return a unit encoded as bytes."""
+    """Return a PDU encoded as bytes."""
     body, kind = _body(transaction, content)
     if isinstance(content, Nak | Finished) or (isinstance(content, Ack) and content.code == Code.EOF):
         kind |= _TO_SENDER
@@ -151,9 +151,9 @@ def pack(transaction: Transaction, content: Content) -> bytes:
 
 
 def unpack(data: bytes) -> tuple[Transaction, Content]:
-    """Return the transaction and content of the unit at the beginning of `data`.
+    """Return the transaction and content of the PDU at the beginning of `data`.
 
-    Raises PduError if the bytes are not a valid unit.
+    Raises PduError if the bytes are not a valid PDU.
     """
     if len(data) < _FIXED_BYTES or data[0] & 0b111 << 5 != _PDU_VERSION:
         raise PduError("the bytes are not a CFDP unit of version 1")
@@ -183,7 +183,7 @@ def unpack(data: bytes) -> tuple[Transaction, Content]:
 
 
 def _body(transaction: Transaction, content: Content) -> tuple[bytes, int]:
-    """Return the bytes after the header of a unit, and the file data flag for the header."""
+    """Return the bytes after the header of a PDU, and the file data flag for the header."""
     match content:
         case FileData(offset, data):
             return _LONG.pack(offset) + data, _FILE_DATA
@@ -243,9 +243,9 @@ def _fault(condition: int, entity: int) -> bytes:
 
 
 DOWN = 0x0973
-"""First 16 bits of a packet with a unit to the ground (type telemetry, APID 0x173)."""
+"""First 16 bits of a packet that carries a PDU to the ground (type telemetry, APID 0x173)."""
 UP = 0x1A28
-"""First 16 bits of a packet with a unit to the satellite (type telecommand, APID 0x228)."""
+"""First 16 bits of a packet that carries a PDU to the satellite (type telecommand, APID 0x228)."""
 PACKET_VERSION = 1
 
 _PACKET_HEADERS = struct.Struct(">HHHBq")
@@ -253,7 +253,7 @@ _MODULUS = 1 << 14
 
 
 class UnitPacker:
-    """Encoder that puts units into packets of one direction and counts the packets."""
+    """Encoder that puts CFDP PDUs into space packets of one direction and counts the packets."""
 
     def __init__(self, identifier: int) -> None:
         """Make packets whose first 16 bits are `identifier`, which is `DOWN` or `UP`."""
@@ -261,7 +261,7 @@ class UnitPacker:
         self._count = 0
 
     def pack(self, unit: bytes, time_ns: int) -> bytes:
-        """Return the packet that carries a unit."""
+        """Return the packet that carries a PDU."""
         length = SECONDARY_BYTES + len(unit) + CRC_BYTES - 1
         body = (
             _PACKET_HEADERS.pack(self._identifier, UNSEGMENTED | self._count, length, PACKET_VERSION, time_ns)
@@ -277,7 +277,7 @@ def is_unit(packet: bytes, identifier: int) -> bool:
 
 
 def unit_of(packet: bytes) -> bytes:
-    """Return the unit in a packet, or empty bytes if the packet is damaged."""
+    """Return the PDU in a packet, or empty bytes if the packet is damaged."""
     stated = int.from_bytes(packet[4:HEADER_BYTES], "big") + HEADER_BYTES + 1
     known = len(packet) == stated and packet[HEADER_BYTES : HEADER_BYTES + 1] == bytes((PACKET_VERSION,))
     return packet[HEADER_BYTES + SECONDARY_BYTES : -CRC_BYTES] if known and crc16(packet) == 0 else b""

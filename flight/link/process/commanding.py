@@ -1,4 +1,4 @@
-"""Delivery of commands to the control process, command verification (PUS service 1) and time-tagged commands.
+"""Command delivery to the control process, command verification (PUS service 1) and scheduled commands.
 
 The stages of a command are: accepted or refused, started, and completed or failed. Each command is sent from
 a separate socket, so that an answer cannot be assigned to the wrong command. The control process answers a
@@ -76,7 +76,7 @@ def request_of(packet: bytes) -> Request:
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """Command sent to the control process, with the SPI and counter of its frame."""
+    """Command sent to the control process, with SPI and counter of the frame that contained the command."""
 
     spi: int
     counter: int
@@ -246,7 +246,7 @@ def _remove(path: Path) -> None:
 
 MOST_ENTRIES = 32
 HIGHEST = 2**63 - 1
-"""Largest number in a stored schedule. If it is a UTC in ns, the time is in the year 2262."""
+"""Largest number in a stored schedule. As UTC in ns since 1970, this number is a time in the year 2262."""
 _LONGEST_FILE = 1 << 16
 
 _Count = Annotated[int, Meta(ge=0, le=HIGHEST)]
@@ -260,9 +260,9 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Schedule entry: a command in words and its due time.
 
     Attributes:
-        number: number of the entry.
+        number: number of the schedule entry, counted from 1, by which the entry can be deleted.
         at_ns: due time of the command, UTC in ns since 1970.
-        spi: SPI of the frame that contained the scheduling command.
+        spi: security parameter index (SPI) of the frame that contained the scheduling command.
         counter: counter of the frame that contained the scheduling command.
         command: command in words.
     """

@@ -1,16 +1,17 @@
-"""The planner of three-axis slews with coils alone: minimum energy, minimum time, or a time cost.
+"""The planner of three-axis slews with coils alone, for minimum energy, minimum time or a time cost.
 
-Coils make only torques normal to the field, so that a path is planned together with its dipoles. The whole
-motion is discretised by collocation and solved by an interior point method (`slew_program`), from several
-initial guesses (`slew_search`). The path found is then corrected until an integrator reaches the same end.
-Collocation on 24 intervals solves the motion to some thousandths of a degree. Each interval is integrated in
-small steps from its first node. The difference from the next node is removed with the factors of the last
-Newton step (multiple shooting by a chord method). Energy is the integral of the coils' heat, J. The planner
-is pure and deterministic.
+Coils cause only torques normal to the magnetic field, so a path is planned together with the dipole moments.
+The whole motion is discretised by collocation and solved by an interior point method (`slew_program`), from
+several initial guesses (`slew_search`). The path is then corrected until a Runge-Kutta integration of the
+motion reaches the end of the path. The collocation error on 24 intervals is a few thousandths of a degree.
+For the correction, each interval is integrated in small steps from the first node of the interval. The
+differences from the next nodes are removed with one factored Newton matrix (multiple shooting with the chord
+method). The energy of a slew is the heat produced in the coils, J. The planner is deterministic and has no
+side effects.
 
-`plan_order` plans a slew in orbit from one pointing target to another that starts within a window. The energy
-of a slew depends on the direction of the field during the slew, by a factor of ten along an orbit. Coarse
-slews are therefore planned from several start times, and the best one is planned in full.
+`plan_order` plans a slew in orbit from one pointing target to another that starts within a window. The
+direction of the field during the slew changes the energy of the slew by a factor of up to ten along an orbit.
+Coarse slews are therefore planned from several start times, and the best one is planned in full.
 """
 
 from __future__ import annotations
@@ -60,21 +61,22 @@ from knightcube.gnc.guidance.three_axes.slew_program import Iterate, SlewProgram
 from knightcube.gnc.guidance.three_axes.slew_search import GRIDS, GRIDS_WITH_CONES, SlewSearch, SolvedPath
 
 STRETCH = 3.0
-"""Longest slew of `plan_slew` without `longest`, as a multiple of `duration`."""
+"""Default of the longest duration to which `plan_slew` stretches a slew, as a multiple of the requested
+duration."""
 _STEPS = 4
-"""Number of Runge-Kutta steps per collocation interval, which must be even."""
+"""Number of Runge-Kutta steps per collocation interval, an even number."""
 _ROUNDS, _CLOSED, _LOST = 6, 1e-7, 1e-4
-"""Largest number of corrections of a path, and the node errors (half angles, rad) at which the corrections
-succeed and fail."""
+"""Largest number of corrections of a path, node error (half angle, rad) below which the corrections end, and
+node error above which they have failed."""
 
 
 def closed(
     craft: SlewCraft, unit: float, along: EnvironmentAt, program: SlewProgram, point: Iterate
 ) -> Trajectory:
-    """Return the trajectory near a solved `point` whose integration gives the states of its nodes.
+    """Return the trajectory near an iterate `point` that agrees with the integrated motion at all nodes.
 
-    `unit` A m^2 is the unit of the dipoles; `along` gives the environment. Raises PlanningError if the
-    equations at the point are singular or the corrections do not converge.
+    Dipoles are in units of `unit` A m^2, and the function `along` returns the environment at given times.
+    Raises PlanningError if the Newton matrix is singular or the corrections do not converge.
     """
     equations, at = program.equations, point.at
     layout, count, scale = equations.layout, equations.count, equations.scale
@@ -100,7 +102,7 @@ def closed(
 
 
 def _integrated(motions: list[SlewDynamics], at: Trajectory, length: float) -> tuple[FloatArray, FloatArray]:
-    """Return the states (k, 7) in the middle and at the end of k intervals, integrated from their starts."""
+    """Return the integrated states (k, 7) in the middle and at the end of k intervals."""
     x, h = at.states[:-1:2], length / _STEPS
     slope = (at.dipoles[1:] - at.dipoles[:-1]) / (2 * _STEPS)
     middle = x
@@ -117,22 +119,22 @@ def _integrated(motions: list[SlewDynamics], at: Trajectory, length: float) -> t
 
 
 _DENSE = 16
-"""Number of points at which cones are checked between two neighbouring nodes or midpoints of a path."""
+"""Number of times at which cones are checked between a node and the next midpoint of a path."""
 _ROOM = math.radians(0.005)
-"""Margin (rad) to a cone at the checked points. Between two checked points, a path comes closer by less than
-this margin."""
+"""Minimum angle (rad) to an exclusion cone at the checked times. Between two checked times, the angle to a
+cone decreases by less than this margin."""
 
 _OVER = 1.001
-"""Largest ratio of the flown dipoles to their limit in an accepted path."""
+"""Largest ratio of the flown dipole to the dipole limit along an accepted path."""
 _ASTRAY = 1.05
-"""Assumed ratio of dipole to limit for a path along which the integration fails."""
+"""Assumed ratio of the dipole to the dipole limit for a path whose integration fails."""
 
 _ENDS = 9
-"""Number of horizons at whose ends cones are checked for the message about a slew without a path."""
+"""Number of durations for which the error message states whether the slew would end inside a cone."""
 
 
 class SlewStatus(StrEnum):
-    """Whether the requested horizon was kept."""
+    """Whether the requested duration was kept or stretched."""
 
     OPTIMAL = "optimal"
     STRETCHED = "stretched"
@@ -140,16 +142,17 @@ class SlewStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewPlan:
-    """A path and its properties.
+    """A planned slew path with energy, peak dipole and clearances.
 
     Attributes:
-        path: the path.
-        status: whether the requested horizon was kept.
+        path: planned path.
+        status: whether the requested duration was kept or stretched.
         horizon_asked, horizon: requested and planned duration, s.
         energy: heat of the coils during the slew, J.
         peak: largest ratio of a coil's dipole moment to its limit.
-        clearance: smallest angle between the path and each cone, in the order of the task's cones, rad.
-        steps: number of Newton steps over all initial guesses.
+        clearance: smallest angle between the path and each exclusion cone, in the order of the task's cones,
+            rad.
+        steps: total number of Newton steps of the search.
     """
 
     path: SlewPath
@@ -163,9 +166,9 @@ class SlewPlan:
 
 
 def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
-    """Return the best plan found. Raises PlanningError with the reason if there is none.
+    """Return the best plan found for a slew task. Raises PlanningError with the reason if no path is found.
 
-    `near` is the path of a similar task over the same horizon, from which the search is warm-started.
+    If the path `near` of a similar task of the same duration is given, the search starts from it.
     """
     check(task)
     tried = 0
@@ -185,7 +188,7 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
 
 
 def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> SlewPlan | None:
-    """Return the plan of the first path that keeps limits and cones when integrated, else None."""
+    """Return the plan of the first path whose integration keeps the limits and cones, or None."""
     for path in paths:
         found: SolvedPath | None = path
         while found is not None:
@@ -217,7 +220,7 @@ def _refusal(task: SlewTask, tried: int) -> str:
 
 
 def _plan(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPlan | None:
-    """Return the plan of a path; None if the integration along it fails."""
+    """Return the plan of a path, or None if the integration along the path fails."""
     equations, scale = found.equations, found.equations.scale
     with np.errstate(over="ignore", invalid="ignore"):  # a diverging integration may overflow
         try:
@@ -246,16 +249,17 @@ def _plan(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPlan | N
 
 
 def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return the clearance (cones, n) rad of a path from each cone, at `_DENSE` times between two points."""
+    """Return the angles (cones, n), rad, by which a path stays outside each cone at n dense times."""
     dense = np.linspace(0.0, path.horizon, 2 * _DENSE * task.nodes + 1)
     shown = path.references(dense).quaternion
     return np.array([cone.clearance(shown, dense) for cone in task.cones]).reshape(-1, len(dense))
 
 
 def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return the clearance (cones, 2 nodes), rad, that a path lacks between each two neighbouring points.
+    """Return the violations (cones, 2 nodes), rad, of the margins to the cones between neighbouring points.
 
-    The required clearance is `_ROOM`, or the clearance of the start or of the end if that is smaller.
+    The required margin is `_ROOM`, or the angle between cone and path at the start or at the end if this
+    angle is smaller.
     """
     clear = _clearances(task, path)
     room = np.clip(np.minimum(clear[:, :1], clear[:, -1:]), 0.0, _ROOM)
@@ -264,13 +268,14 @@ def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
 
 
 LEAD = 2.0 * DIFFERENCE
-"""Prediction (s) needed before the first start and after the last end, because rates are differences."""
+"""Time (s) by which the ephemeris must begin before the first start and end after the last end, because rates
+are computed by central differences."""
 WINDOW_RANGE = (0.0, 2e4)
-"""Range of a window, s."""
+"""Permitted range of the window of start times, s."""
 _BEGINS = 12
-"""Number of equal parts into which a window is divided by the compared start times."""
+"""Number of equal parts of a window, between which start times are compared."""
 _COARSE = 12
-"""Number of collocation intervals of the coarse slews with which start times are compared."""
+"""Number of collocation intervals of the coarse plans by which start times are compared."""
 _NO_ROLL: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -280,13 +285,13 @@ class SlewOrder:
 
     Attributes:
         craft: model of the satellite, in body axes.
-        axes: the pointing axes, to which the targets refer.
+        axes: body axes that the targets align.
         camera: body axis (3,) that stays outside the exclusion cones.
-        start: the target that is held until the slew begins; a free roll is taken as zero.
-        goal: the target at the end; with a free roll only its direction counts.
-        horizon, longest: requested and longest duration of the slew, s.
-        window: duration of the interval in which the slew may begin, s.
-        time_cost: cost of time, W (see `SlewTask`).
+        start: pointing target that is held until the slew begins; a free roll is taken as zero.
+        goal: pointing target at the end; with a free roll, only the direction of the target counts.
+        horizon, longest: requested and longest permitted duration of the slew, s.
+        window: length of the time interval in which the slew may begin, s.
+        time_cost: weight of the slew duration in the cost, W (see `SlewTask`).
         angles: half angles of the exclusion cones of `sun`, `earth` and `moon`, rad.
         nodes: number of collocation intervals.
     """
@@ -305,7 +310,7 @@ class SlewOrder:
 
     @property
     def held(self) -> PointingTarget:
-        """The start target of the slew, with a given roll."""
+        """The start target of the slew, with a roll of zero if the roll is free."""
         is_free = self.start.goal is not Goal.INERTIAL and self.start.roll is None
         return replace(self.start, roll=0.0) if is_free else self.start
 
@@ -315,10 +320,11 @@ class OrderedSlew:
     """A planned slew in orbit.
 
     Attributes:
-        order: the order.
-        task: the task of the chosen start.
-        plan: the plan of the task.
-        begin: start of the slew, s of the ephemeris; from `knightcube.plan_slew` s after its `time`.
+        order: requested slew.
+        task: planning task for the chosen start time.
+        plan: planned path of the slew.
+        begin: start of the slew, s of the ephemeris; in a result of `knightcube.plan_slew`, s after the
+            argument `time`.
         compared: number of start times that were planned.
     """
 
@@ -330,11 +336,10 @@ class OrderedSlew:
 
 
 def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedSlew:
-    """Return the best slew that begins within the order's window, from `first` s of the ephemeris on.
+    """Return the best slew that begins in the window of `order`, which opens at `first` s of the ephemeris.
 
-    The ephemeris must reach from `LEAD` s before `first` to `LEAD` s after the longest slew from the end of
-    the window. Raises PlanningError with the last reason if there is none, UsageError for a window out of
-    range.
+    The ephemeris must begin `LEAD` s before `first`, and end `LEAD` s after the end of the longest slew.
+    Raises PlanningError with the last reason if no slew is found, and UsageError for a window out of range.
     """
     low, high = WINDOW_RANGE
     if not low <= order.window <= high:
@@ -369,7 +374,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
 
 
 def task_at(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> SlewTask:
-    """Return the task of a slew that begins at `begin` s of the ephemeris."""
+    """Return the planning task of a slew that begins at `begin` s of the ephemeris."""
     quaternion, rate = _motion(law_of(order.held, order.axes, _NO_ROLL, ephemeris, begin), ephemeris, begin)
     return SlewTask(
         order.craft,
@@ -386,7 +391,7 @@ def task_at(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> SlewTask:
 
 
 def end_law(goal: PointingTarget, axes: BodyAxes, ephemeris: Ephemeris, begin: float) -> EndLaw:
-    """Return the end of slews to a goal from `begin` s of the ephemeris, as a function of time."""
+    """Return the end conditions as a function of the duration, for slews from `begin` s of the ephemeris."""
     axis = axes.pointing
     if goal.goal is not Goal.INERTIAL and goal.roll is None:
         direction, _ = directions_of(goal)
@@ -407,7 +412,7 @@ def end_law(goal: PointingTarget, axes: BodyAxes, ephemeris: Ephemeris, begin: f
 
 
 def _motion(law: Attitudes, ephemeris: Ephemeris, time: float) -> tuple[FloatArray, FloatArray]:
-    """Return the attitude (4,) and the rate (3,) rad/s, body axes, of a law at a time, s."""
+    """Return the attitude (4,) and the body rate (3,), rad/s, that an attitude law commands at a time, s."""
     found = references(law, ephemeris, np.array([time]))
     return found.quaternion[0], found.rate[0]
 
@@ -433,32 +438,38 @@ def plan_slew(
 ) -> OrderedSlew:
     """Return the best slew of a satellite in orbit with torque coils alone, from one target to another.
 
-    Coils make no torque along the magnetic field, so path and dipoles are planned together, by collocation
-    with an interior point method, from several initial guesses. The model contains the rotating field, the
-    gravity gradient and the gyroscopic torque. The orbit is predicted by SGP4. A plan takes about a second.
+    Coils cause no torque along the magnetic field, so path and dipole moments are planned together. They are
+    discretised by collocation and optimised with an interior point method from several initial guesses. The
+    model includes the rotating magnetic field, the gravity gradient and the gyroscopic torque. The orbit is
+    predicted by SGP4. A plan takes about a second.
 
-    In the result, `plan.path` has attitude, rate and dipole at its `times`, s after the start of the slew;
-    `plan.energy` is the heat of the coils, J. `begin` is the start of the slew, s after `time`.
+    In the result, `plan.path` contains attitude, rate and dipole at the times `plan.path.times`, s after the
+    start of the slew. The energy `plan.energy` is the heat of the coils, J. The start `begin` of the slew is
+    in s after `time`.
 
     Args:
-        inertia: (3, 3) kg m^2, body axes.
-        dipole_limit: (3,) A m^2 of the coils, along the body axes.
-        heat: (3,) W/(A m^2)^2, heat of each coil per square of its dipole.
-        elements: the two lines of the orbit's element set.
-        time: start of the slew, or of the window; UTC without a time zone.
-        start: target that is held until the slew begins; a free roll is taken as zero.
-        goal: target at the end; with a free roll only its direction counts.
-        duration: duration of the slew, s.
-        longest: s to which the slew may be stretched if no slew over `duration` is found; None for three
-            times `duration`.
-        window: s, duration of the interval in which the slew may begin; the start time of minimum energy is
-            chosen.
-        time_cost: W; the duration is optimised too, for minimum energy plus `time_cost` times the duration;
-            infinity gives the shortest slew. None keeps the duration.
-        pointing_axis: (3,) unit vector, body axis that points to the targets.
-        across_axis: (3,) unit vector normal to it, from which a roll is measured.
-        camera_axis: (3,) unit vector, body axis that keeps the exclusion cones; None for `pointing_axis`.
-        cones: half angles (rad) of the exclusion cones; of the Earth beyond its limb.
+        inertia: inertia tensor (3, 3) in body axes, kg m^2.
+        dipole_limit: dipole limits (3,) of the coils along the body axes, A m^2.
+        heat: heating power of each coil per squared dipole moment (3,), W/(A m^2)^2.
+        elements: two lines of the two-line element set of the orbit.
+        time: UTC at the start of the slew or of the window, as a datetime without a time zone.
+        start: pointing target that is held until the slew begins; a free roll is taken as zero.
+        goal: pointing target at the end; with a free roll, only the direction of the target counts.
+        duration: requested duration of the slew, s.
+        longest: longest duration to which the slew may be stretched if no slew of `duration` is found, s.
+            None stands for three times `duration`.
+        window: length of the time interval in which the slew may begin, s. The start time of minimum energy
+            is chosen.
+        time_cost: weight of the slew duration in the cost, W. If it is given, the duration is optimised for
+            minimum energy plus `time_cost` times the duration. Infinity gives the shortest slew, and None
+            keeps the duration.
+        pointing_axis: unit vector (3,) of the body axis that points to the targets.
+        across_axis: unit vector (3,) of the body axis from which a roll is measured, normal to
+            `pointing_axis`.
+        camera_axis: unit vector (3,) of the body axis that stays outside the exclusion cones; None for
+            `pointing_axis`.
+        cones: half angles of the exclusion cones about the Sun and the Moon, and angle from the Earth's limb,
+            rad.
         nodes: number of collocation intervals, 8 to 96.
 
     Raises:

@@ -1,21 +1,23 @@
-"""A slew as a nonlinear program: collocation of the motion, and a primal-dual interior point method.
+"""A slew as a nonlinear program, discretised by collocation and solved by an interior point method.
 
-The motion is discretised by Hermite-Simpson collocation in its separated form, of fourth order (Betts,
-Practical Methods for Optimal Control, 2010, 4.5). The dipole is linear on each interval, so that it is within
-its limits at all times if it is within them at the nodes. The states are unknowns at nodes and midpoints.
+The motion is discretised by separated Hermite-Simpson collocation, which is of fourth order (Betts, Practical
+Methods for Optimal Control, 2010, section 4.5). The dipole is linear on each interval, so a dipole that keeps
+the limits at all nodes keeps them at all times. The unknowns are the states at nodes and midpoints of the
+intervals, and the dipoles at the nodes.
 
 The vector of unknowns and Lagrange multipliers has 31 elements per interval: the state (7) and the dipole (3)
 of the first node, the multipliers of the midpoint's equations (7), the state of the midpoint (7) and the
-multipliers of the equations at the end of the interval (7). The elements of the start conditions precede all
-intervals, and those of the end conditions follow them. Each equation involves only neighbouring elements, so
-that the matrix is banded, and LAPACK factors it. The functions that use LAPACK import it, because the control
-process imports the job but does not run it.
+multipliers of the equations at the end of the interval (7). The multipliers of the start conditions precede
+all intervals, and the multipliers of the end conditions follow all intervals. Each equation involves only
+neighbouring elements, so the Newton matrix is banded and is factored by LAPACK. LAPACK is imported only when
+it is used, because the control process imports this module without solving programs.
 
-The limits, as inequalities g >= 0, form one vector: the lower and upper limits of the dipoles (2, k + 1, 3),
-then the cones (cones, 2 k). The interior point method is that of Wachter and Biegler, Math. Program. 106
-(2006), with the curvature test of Chiang and Zavala (Math. Program. 2016) instead of a count of eigenvalues,
-and with second-order corrections. Without limits, the method is Newton's method. Far from a feasible point,
-the curvature of the equations is omitted (Gauss-Newton), because it would lead to bad steps.
+The vector of inequalities g >= 0 contains the lower and upper limits of the dipoles (2, k + 1, 3), followed
+by the exclusion cones (cones, 2 k), for k intervals. The interior point method is that of Wachter and
+Biegler, Math. Program. 106 (2006), with the curvature test of Chiang and Zavala (Math. Program. 2016) instead
+of a count of eigenvalues, and with second-order corrections. Without limits, the method is Newton's method.
+Far from a feasible point, the curvature of the equations is omitted (Gauss-Newton), because it would lead to
+bad steps.
 """
 
 from __future__ import annotations
@@ -37,29 +39,29 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
 )
 
 STEP = 31
-"""Number of unknowns and multipliers of one interval."""
+"""Number of elements (unknowns and multipliers) of one interval."""
 WIDE = STEP + 10
-"""Number of elements in the equations of one interval, including the state and the dipole of the next
-node."""
+"""Number of elements that the equations of one interval involve, including the state and the dipole of the
+next node."""
 EQUATIONS: IntArray = np.r_[10:17, 24:31]
-"""Positions of an interval's 14 equation multipliers among its 31 unknowns and multipliers."""
+"""Indices of the 14 multipliers of an interval among the 31 elements of the interval."""
 _BAND = 33
-_ROWS = 3 * _BAND + 1  # rows of LAPACK's band storage, with room for pivots
+_ROWS = 3 * _BAND + 1  # rows of LAPACK's band storage, including the rows that pivoting fills
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandLayout:
-    """Positions of states, dipoles and equations of a slew in the vector of unknowns and in the band matrix.
+    """Indices of a slew's states, dipoles and multipliers in the vector of unknowns and in the band matrix.
 
     Attributes:
-        states: indices (2 k + 1, 7) of the states at nodes and midpoints.
-        dipoles: (k + 1, 3).
-        equations: (k, 14).
-        start: (7,).
-        end: (ends,).
-        begins: index (k + 1,) of the first element of each interval and of the last node.
-        places, entries: indices of the elements of the band that the intervals fill, and of the block
-            elements that fill them.
+        states: indices (2 k + 1, 7) of the states at nodes and midpoints of k intervals.
+        dipoles: indices (k + 1, 3) of the dipoles at the nodes.
+        equations: indices (k, 14) of the multipliers of the intervals' equations.
+        start: indices (7,) of the multipliers of the start conditions.
+        end: indices (ends,) of the multipliers of the end conditions.
+        begins: indices (k + 1,) of the first element of each interval and of the last node.
+        places: indices of the elements of the flattened band matrix that the intervals fill.
+        entries: indices of the block elements that belong at `places`, in a flattened block of one interval.
     """
 
     states: IntArray
@@ -77,11 +79,11 @@ class BandLayout:
         return int(self.end[-1]) + 1
 
     def band(self, blocks: FloatArray, tail: FloatArray) -> FloatArray:
-        """Return the band matrix of the interval `blocks` (k, WIDE, WIDE) and the `tail`, and modify both.
+        """Return the band matrix of the `blocks` (k, WIDE, WIDE) and of the `tail`; both are modified.
 
-        The tail contains the state and the dipole of the last node, and the equations of the end.
+        The block `tail` is for the state and the dipole of the last node, and for the end conditions.
         """
-        # The block of a node shared by two intervals is added to that of the second interval.
+        # The contributions of two neighbouring blocks to their common node are summed in the second block.
         blocks[1:, :10, :10] += blocks[:-1, STEP:, STEP:]
         tail[:10, :10] += blocks[-1, STEP:, STEP:]
         filled = np.zeros(self.size * _ROWS)
@@ -89,14 +91,14 @@ class BandLayout:
         band = filled.reshape(self.size, _ROWS)
         row, column = np.indices(tail.shape)
         band[int(self.begins[-1]) + column, 2 * _BAND + row - column] = tail
-        for k in range(7):  # the equations of the start contain the first state only
+        for k in range(7):  # the start conditions contain the first state only
             band[k, 2 * _BAND + 7] = band[k + 7, 2 * _BAND - 7] = 1.0
         return band.T
 
 
 @lru_cache(maxsize=16)
 def band_layout(count: int, ends: int) -> BandLayout:
-    """Return the layout for `count` intervals and `ends` end conditions."""
+    """Return the layout of the unknowns of `count` intervals with `ends` end conditions."""
     begins = 7 + STEP * np.arange(count + 1)
     states = np.empty((2 * count + 1, 7), dtype=np.int64)
     states[::2] = begins[:, None] + np.arange(7)
@@ -117,10 +119,10 @@ def band_layout(count: int, ends: int) -> BandLayout:
 
 
 class Factors:
-    """The factors of a band matrix, for several right-hand sides."""
+    """LU factors of a band matrix, which solve systems of equations with several right-hand sides."""
 
     def __init__(self, band: FloatArray) -> None:
-        """Factor a `band` in place. Raises PlanningError if it is singular."""
+        """Factor the matrix `band` in place. Raises PlanningError if the matrix is singular."""
         from scipy.linalg.lapack import dgbtrf  # noqa: PLC0415 - see the top
 
         self._factors, self._pivots, info = dgbtrf(band, _BAND, _BAND, overwrite_ab=1)
@@ -128,7 +130,10 @@ class Factors:
             raise PlanningError("the equations of the slew are singular")
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return the solution (size,) of a right-hand side (size,). Raises PlanningError if not finite."""
+        """Return the solution (size,) for a right-hand side (size,).
+
+        Raises PlanningError if the solution is not finite.
+        """
         from scipy.linalg.lapack import dgbtrs  # noqa: PLC0415 - see the top
 
         found, _ = dgbtrs(self._factors, _BAND, _BAND, right[:, None], self._pivots)
@@ -145,7 +150,7 @@ _AXIS = np.arange(3)
 class Trajectory:
     """States (2 k + 1, 7) at nodes and midpoints, and dipoles (k + 1, 3) at nodes.
 
-    Times are in units of the horizon, dipoles in the unit of the motion.
+    Times are in units of the slew's duration, and dipoles in units of `SlewDynamics`.
     """
 
     states: FloatArray
@@ -161,15 +166,16 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedEquations:
-    """The equations linearised about a trajectory: their residuals and derivatives.
+    """The residuals of a slew's equations at a trajectory, and the derivatives of the residuals.
 
     Attributes:
-        at: the trajectory.
-        between: residuals (k, 14) of the intervals' equations.
-        begun: residuals (7,) of the start conditions.
-        ended: residuals (ends,) of the end conditions.
-        jacobian: derivatives (k, 14, WIDE) of the intervals' equations by the unknowns.
-        ending: derivatives (ends, 7) of the end conditions by the last state.
+        at: the trajectory about which the equations are linearised.
+        between: residuals (k, 14) of the collocation equations on k intervals.
+        begun: residuals (7,) of the start conditions, which fix the state at the start.
+        ended: residuals (ends,) of the end conditions, which are the attitude and rate errors at the end of
+            the slew.
+        jacobian: derivatives (k, 14, WIDE) of the collocation equations by the unknowns of each interval.
+        ending: derivatives (ends, 7) of the end conditions by the state at the end.
     """
 
     at: Trajectory
@@ -181,9 +187,10 @@ class LinearisedEquations:
 
 
 class Transcription:
-    """The equations of a slew from a state (7,) over `scale` s, the unit of time, on `count` intervals.
+    """The collocation equations of a slew of `scale` s from a start state (7,) on `count` intervals.
 
-    `unit` A m^2 is the unit of the dipoles; `weights` (3,) weight the squares of the dipoles in the cost.
+    Dipoles are in units of `unit` A m^2, and times in units of `scale` s. The cost weights the squares of the
+    dipoles with `weights` (3,).
     """
 
     def __init__(
@@ -207,13 +214,13 @@ class Transcription:
         self._step = 1.0 / count
 
     def cost(self, at: Trajectory) -> float:
-        """Return the exact integral of the weighted square of the dipole."""
+        """Return the cost: the exact integral of the weighted squares of the dipole components."""
         left, right = at.dipoles[:-1], at.dipoles[1:]
         squares = left * left + left * right + right * right
         return self._step / 3.0 * float(np.sum(squares @ self.weights))
 
     def remainders(self, at: Trajectory) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the residuals of the intervals (k, 14), of the start (7,) and of the end (ends,)."""
+        """Return the residuals of collocation (k, 14), start conditions (7,) and end conditions (ends,)."""
         x, h = at.states, self._step
         flow = self.motion.flow(x, at.all_dipoles())
         a, c, b = flow[:-1:2], flow[1::2], flow[2::2]
@@ -223,7 +230,7 @@ class Transcription:
         return np.concatenate([half, whole], axis=1), *self.ends_missed(at)
 
     def ends_missed(self, at: Trajectory) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals of the start (7,) and of the end (ends,)."""
+        """Return the residuals of the start conditions (7,) and of the end conditions (ends,)."""
         return at.states[0] - self.start, self._ending.miss(at.states[-1])
 
     def linear(self, at: Trajectory) -> LinearisedEquations:
@@ -248,10 +255,11 @@ class Transcription:
         return LinearisedEquations(at, *self.remainders(at), jacobian, ending)
 
     def slope(self, linear: LinearisedEquations, multipliers: FloatArray) -> FloatArray:
-        """Return the derivative (size,) of the Lagrangian, with the residuals at the equations' positions.
+        """Return the derivative (size,) of the Lagrangian by all unknowns and multipliers.
 
-        The Lagrangian is the cost plus the equations weighted by `multipliers`. `multipliers` (size,) is read
-        only at the positions of the equations.
+        The Lagrangian is the cost plus the equations weighted by `multipliers`, so the derivatives by the
+        multipliers are the residuals of the equations. Elements of `multipliers` (size,) at indices of
+        unknowns are ignored.
         """
         at, layout = linear.at, self.layout
         result = np.zeros(layout.size)
@@ -277,10 +285,10 @@ class Transcription:
         state_part: FloatArray,
         dipole_part: FloatArray,
     ) -> FloatArray:
-        """Return the band matrix of the derivatives of `slope`.
+        """Return the Newton matrix, which contains the derivatives of `slope`, as a band matrix.
 
-        `state_part` (2 k + 1, 7, 7) and `dipole_part` (k + 1, 3) are added to the second derivatives by
-        states and by dipoles. Both arguments contain the terms of the barriers and of the convexification.
+        The barrier and convexification terms `state_part` (2 k + 1, 7, 7) are added to the second derivatives
+        by the states, and the terms `dipole_part` (k + 1, 3) to the second derivatives by the dipoles.
         """
         h = self._step
         bend = self._bend(linear, multipliers[self.layout.equations])
@@ -306,7 +314,7 @@ class Transcription:
         return self.layout.band(block, tail)
 
     def _bend(self, linear: LinearisedEquations, multipliers: FloatArray) -> FloatArray:
-        """Return the curvature (2 k + 1, 10, 10) of the equations weighted by `multipliers` (k, 14)."""
+        """Return the second derivatives (2 k + 1, 10, 10) of the equations times `multipliers` (k, 14)."""
         at, h = linear.at, self._step
         half, whole = multipliers[:, :7], multipliers[:, 7:]
         y = np.zeros_like(at.states)
@@ -320,7 +328,7 @@ class Transcription:
 class SlewLimits:
     """The dipole limits and the exclusion cones of a slew.
 
-    `dipole` (3,) is in the unit of the motion, None for a slew without a dipole limit.
+    The dipole limit `dipole` (3,) is in units of `SlewDynamics`, or None for a slew without a dipole limit.
     """
 
     equations: Transcription
@@ -328,7 +336,7 @@ class SlewLimits:
     cones: ConeConstraints
 
     def values(self, at: Trajectory) -> FloatArray:
-        """Return the values g of all limits. A negative value means that a limit is violated."""
+        """Return the values of all inequalities g >= 0. A negative value means that the limit is violated."""
         found: list[FloatArray] = [np.zeros(0)]
         if self.dipole is not None:
             found += [(at.dipoles + self.dipole).ravel(), (self.dipole - at.dipoles).ravel()]
@@ -337,7 +345,7 @@ class SlewLimits:
         return np.concatenate(found)
 
     def pull(self, at: Trajectory, weights: FloatArray) -> FloatArray:
-        """Return the derivative (size,) of `weights` times the limits."""
+        """Return the derivative (size,) of the sum of all inequalities g multiplied by `weights`."""
         layout = self.equations.layout
         result = np.zeros(layout.size)
         dipoles, cones = self._parts(weights, at)
@@ -349,7 +357,7 @@ class SlewLimits:
         return result
 
     def along(self, at: Trajectory, change: FloatArray) -> FloatArray:
-        """Return the linear change of every limit for a step (size,)."""
+        """Return the change of every inequality g, to first order, for a `change` (size,) of the unknowns."""
         layout = self.equations.layout
         found: list[FloatArray] = [np.zeros(0)]
         if self.dipole is not None:
@@ -360,10 +368,10 @@ class SlewLimits:
         return np.concatenate(found)
 
     def stiffness(self, at: Trajectory, stiff: FloatArray, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return second derivatives due to limits, by states (2 k + 1, 7, 7) and by dipoles (k + 1, 3).
+        """Return second derivatives of the barrier by states (2 k + 1, 7, 7) and by dipoles (k + 1, 3).
 
-        `stiff` are the weights of the squared first derivatives of the limits, `bent` those of their second
-        derivatives.
+        The products of first derivatives of the inequalities g are weighted with `stiff`, and the second
+        derivatives of g with `bent`.
         """
         dipoles, cones = self._parts(stiff, at)
         _, weights = self._parts(bent, at)
@@ -376,7 +384,7 @@ class SlewLimits:
         return states, heavy
 
     def _parts(self, values: FloatArray, at: Trajectory) -> tuple[FloatArray, FloatArray]:
-        """Split values of all limits into those of the dipoles and those of the cones."""
+        """Return the parts of `values`, one per limit, that belong to the dipoles and to the cones."""
         nodes = 0 if self.dipole is None else 2 * at.dipoles.size
         dipoles = values[:nodes].reshape(2, -1, 3) if nodes else values[:0]
         return dipoles, values[nodes:].reshape(self.cones.count, len(at.states) - 1)
@@ -388,12 +396,12 @@ _HALVINGS = 7
 _CORRECTED, _CORRECTIONS = 4, 2
 """Number of step halvings with a second-order correction, and number of corrections per halving."""
 _HEAVIER = 1.2
-"""Weight of the equations in the merit function, relative to the largest multiplier."""
+"""Weight of the constraint violation in the merit function, relative to the largest Lagrange multiplier."""
 _FAR = 0.03
 """Sum of the constraint violations beyond which the curvature of the equations is omitted."""
 _DAMPED = 3e-3
-"""Minimum convexification per unit of constraint violation (at most one). It prevents too long steps far from
-a feasible point."""
+"""Minimum convexification far from a feasible point, which prevents too long steps. The value holds for a
+constraint violation of one and decreases in proportion to a smaller violation."""
 _CONVEX = 1e-3, 1e4
 FIRST_BARRIER = 1e-3
 
@@ -403,11 +411,11 @@ class Iterate:
     """An iterate of the interior point method.
 
     Attributes:
-        linear: the equations linearised about its trajectory.
-        multipliers: Lagrange multipliers (size,) at the indices of the equations.
-        slack, dual: slack variable and dual variable of every limit.
-        slope: (size,) derivative of the Lagrangian without the limits, with the residuals of the equations at
-            their positions.
+        linear: the equations linearised about the trajectory of the iterate.
+        multipliers: Lagrange multipliers of the equations, at their indices in the vector (size,) of all
+            elements.
+        slack, dual: slack variables and dual variables of the inequalities g >= 0.
+        slope: derivative (size,) of the Lagrangian without the inequalities, by all unknowns and multipliers.
     """
 
     linear: LinearisedEquations
@@ -424,9 +432,10 @@ class Iterate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NewtonStep:
-    """A Newton step: `change` of all unknowns (size,), and `dual` of the limits.
+    """A Newton step: the changes of unknowns and multipliers (`change`) and of the dual variables (`dual`).
 
-    `off` are the residuals of the slacks, and `factors` is the factorisation of the Newton matrix.
+    The attribute `off` contains the residuals g minus slack of the inequalities, and `factors` the factors of
+    the Newton matrix.
     """
 
     change: FloatArray
@@ -436,7 +445,7 @@ class NewtonStep:
 
 
 class SlewProgram:
-    """The nonlinear program: the cost is minimised subject to equations and limits."""
+    """The nonlinear program of a slew: minimise the cost subject to the collocation equations and limits."""
 
     def __init__(self, equations: Transcription, limits: SlewLimits) -> None:
         self.equations, self._limits = equations, limits
@@ -446,10 +455,10 @@ class SlewProgram:
         self.steps = 0
 
     def factors(self, point: Iterate) -> Factors:
-        """Return the factors for the smallest change that reduces the residuals. Raises PlanningError.
+        """Return the factors of a Newton matrix for the smallest change of a path that removes residuals.
 
-        The matrix omits the curvature of the equations. With the curvature, a step to the other side of a
-        flat optimum would also be small.
+        The matrix omits the second derivatives of the equations, because with them a large step across a flat
+        optimum would count as small. Raises PlanningError if the matrix is singular.
         """
         states, heavy = self._limits.stiffness(point.at, point.dual / point.slack, np.zeros_like(point.dual))
         stiff = states + _DAMPED * _EYE7, heavy + _DAMPED
@@ -462,7 +471,7 @@ class SlewProgram:
         return self._point(guess, multipliers, slack, barrier / slack)
 
     def lack(self, point: Iterate) -> tuple[float, float]:
-        """Return the sum of the constraint violations and the sum of the residuals of the slacks."""
+        """Return the sums of the absolute residuals of the equations and of the inequalities."""
         off = self._limits.values(point.at) - point.slack
         return float(np.abs(point.slope[self._equal]).sum()), float(np.abs(off).sum())
 
@@ -472,7 +481,7 @@ class SlewProgram:
         return Iterate(linear, multipliers, slack, dual, equations.slope(linear, multipliers))
 
     def error(self, point: Iterate, barrier: float) -> float:
-        """Return the largest residual of the optimality conditions at a barrier parameter."""
+        """Return the largest residual of the optimality conditions for a given barrier parameter."""
         worst = float(np.abs(point.slope - self._limits.pull(point.at, point.dual)).max())
         if point.slack.size:
             worst = max(worst, float(np.abs(self._limits.values(point.at) - point.slack).max()))
@@ -482,7 +491,7 @@ class SlewProgram:
     def moved(
         self, point: Iterate, barrier: float, convex: float, error: float
     ) -> tuple[Iterate | None, float]:
-        """Return the next iterate and the convexification used; the iterate is None if no step is found."""
+        """Return the next iterate and the next convexification; the iterate is None if no step is found."""
         lack = self.lack(point)[0]
         is_far = lack > _FAR
         minimum = _DAMPED * min(1.0, lack) if is_far else 0.0
@@ -504,16 +513,16 @@ class SlewProgram:
         return None, convex
 
     def _newton(self, point: Iterate, barrier: float, convex: float, band: FloatArray) -> NewtonStep | None:
-        """Return the Newton step of a `band` with `convex` added; None if the curvature is not positive."""
+        """Return the Newton step for the matrix `band`, or None if the curvature is not positive."""
         limits, at = self._limits, point.at
         stiff = point.dual / point.slack
         off = limits.values(at) - point.slack
-        # These are the dual variables of the limits for a step of zero length.
+        # The dual variables that a Newton step of zero length would give.
         toward = barrier / point.slack - stiff * off
         right = limits.pull(at, toward) - point.slope
         factors = Factors(band)
         change = factors.solve(right)
-        # d.H.d, from the equations just solved: H d = right - C' dl, C d = right.
+        # The curvature d.H.d along the step d follows from H d = right - C' dl and C d = right.
         equal, primal = self._equal, self._primal
         bend = right[primal] @ change[primal] - right[equal] @ change[equal]
         if bend <= 1e-8 * min(convex, 1.0) * float(change[primal] @ change[primal]):
@@ -521,7 +530,7 @@ class SlewProgram:
         return NewtonStep(change, toward - stiff * limits.along(at, change) - point.dual, off, factors)
 
     def _searched(self, point: Iterate, step: NewtonStep, barrier: float, error: float) -> Iterate | None:
-        """Return the iterate along a step that lowers the error or the merit; None if there is none."""
+        """Return an iterate along a Newton step that reduces the error or the merit function, or None."""
         equal, missed, layout = self._equal, point.slope[self._equal], self.equations.layout
         size = _share(point.slack, self._limits.along(point.at, step.change) + step.off)
         dual = point.dual + _share(point.dual, step.dual) * step.dual
@@ -559,7 +568,7 @@ class SlewProgram:
     def _merit(
         self, at: Trajectory, slack: FloatArray, barrier: float, weight: float, missed: FloatArray
     ) -> float:
-        """Return the merit: cost and barriers plus `weight` times the constraint violation."""
+        """Return the merit function: cost plus barriers plus `weight` times the constraint violation."""
         violation = float(np.abs(missed).sum() + np.abs(self._limits.values(at) - slack).sum())
         return self.equations.cost(at) + weight * violation - barrier * float(np.log(slack).sum())
 
@@ -568,8 +577,8 @@ class NewtonRun:
     """An interior point iteration from an initial guess that can be interrupted and resumed.
 
     Attributes:
-        point: newest iterate of the method.
-        is_over: whether an optimum was found or no further step is possible.
+        point: newest iterate of the interior point method.
+        is_over: whether the iteration has ended, at an optimum or because no further step is possible.
     """
 
     def __init__(
@@ -580,9 +589,10 @@ class NewtonRun:
         first: float = FIRST_BARRIER,
         last: float = 1e-8,
     ) -> None:
-        """Start from `guess` with the `multipliers` (size,) of the equations, None for zero.
+        """Start from the trajectory `guess` with Lagrange `multipliers` (size,), or with zero if None.
 
-        The cost should be of the order of one. The barrier parameter decreases from `first` to `last`.
+        The equations should be scaled so that the cost is of the order of one. The barrier parameter
+        decreases from `first` to `last`.
         """
         self.program, self._first, self._last, self.is_over = program, first, last, False
         self.point = program.begin(guess, multipliers, first)
@@ -590,7 +600,7 @@ class NewtonRun:
 
     @property
     def lack(self) -> float:
-        """The constraint violation, or zero after the barrier parameter has begun to decrease."""
+        """The constraint violation, or zero once the barrier parameter is below its initial value."""
         return 0.0 if 0.0 < self._barrier < self._first else self.missed
 
     @property
@@ -599,10 +609,10 @@ class NewtonRun:
         return sum(self.program.lack(self.point))
 
     def run(self, maximum: int) -> Iterate | None:
-        """Return the optimum found within `maximum` more steps; None if none was found."""
+        """Return the optimum found within `maximum` more Newton steps, or None if no optimum was found."""
         if self.is_over:
             return None
-        with np.errstate(over="ignore", invalid="ignore"):  # an overflow only leads to a shorter step
+        with np.errstate(over="ignore", invalid="ignore"):  # an overflow only makes the next step shorter
             return self._run(maximum)
 
     def _run(self, maximum: int) -> Iterate | None:
@@ -628,7 +638,7 @@ class NewtonRun:
 
 
 def _share(values: FloatArray, change: FloatArray) -> float:
-    """Return the largest fraction of a change, at most one, that keeps positive values positive."""
+    """Return the largest fraction of `change`, at most one, for which `values` remain positive."""
     falling = change < 0.0
     if not falling.any():
         return 1.0

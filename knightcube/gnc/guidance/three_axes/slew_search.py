@@ -1,16 +1,17 @@
-"""The search for the path of a slew: guesses on a coarse grid, paths within the limits, and refinement.
+"""The search for the path of a slew, from guesses on a coarse grid to a path on a fine grid.
 
-Initial guesses are curves of the angular momentum. Coils make no torque along the field, so the derivative of
-the inertial momentum is normal to the field everywhere. This condition is linear: the momenta that reach the
-end are a fixed curve plus any sum of modes. The attitude follows from the momentum. A curve that ends at the
-target, stays outside the cones and needs little heat has about a dozen unknowns. It is found by least squares
-from many random starts at once. The gravity gradient and other torques are left to the planner. The random
-starts are the same in every call.
+An initial guess is a curve of the angular momentum over time. Coils cause no torque along the magnetic field,
+so the derivative of the inertial angular momentum is always normal to the field. This condition is linear, so
+every momentum curve that reaches the end is the sum of a fixed curve and weighted modes. The attitude follows
+from the momentum by integration. A least-squares fit of about a dozen mode amplitudes finds curves that end
+at the target, stay outside the cones and need little heat. The fit is started from many random amplitudes at
+once. Gravity gradient and other disturbance torques are neglected in the guesses. The random starts are the
+same in every call.
 
-Without the dipole limit, a path that keeps the cones is found from most guesses in a dozen Newton steps. The
-heat of such a path is a lower bound of the heat of paths within the dipole limit. A guess with large
-constraint violations after some steps is deferred, because most such guesses never converge. If no path over
-the requested horizon is found, a longer slew is shortened by continuation.
+Without the dipole limit, most guesses converge in a dozen Newton steps to a path outside the exclusion cones
+(a relaxed path). The heat of a relaxed path is a lower bound of the heat of a path within the dipole limit. A
+guess with large constraint violations after some steps is deferred, because most such guesses never converge.
+If no path of the requested duration is found, a longer slew is shortened in steps (continuation).
 """
 
 from __future__ import annotations
@@ -51,29 +52,29 @@ from knightcube.gnc.guidance.three_axes.slew_program import (
 )
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
-"""Last barrier parameters of a path for a warm start, and of a final path."""
+"""Final barrier parameter of paths used only as warm starts, and of paths to be flown."""
 MET, _FLOWN_MET = 1e-2, 3e-3
-"""Constraint violations below which an iterate is accepted before it is optimal, as a warm start and as a
-path to fly. Early acceptance saves time, because many runs converge slowly. The final integration of the path
-removes the remaining violations."""
+"""Constraint violation below which an iterate that is not yet optimal is accepted as a warm start, and as a
+path to be flown. Early acceptance saves time, because many runs converge slowly. The final integration of the
+path removes the remaining violations."""
 _STEPS_FREE = 25
 """Maximum number of Newton steps for a path without the dipole limit."""
 _LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
-"""Stages of a run within the limits: Newton steps, and the constraint violation after the stage above which
-the run is abandoned. Half of the failing runs exceed the first bound, but only one in twenty of the
-successful runs."""
+"""Stages of an iteration with all limits: the number of Newton steps of each stage, and the constraint
+violation above which the iteration is abandoned after the stage. Half of the iterations that would fail
+exceed the bound of the first stage, but only one in twenty of those that would succeed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedPath:
-    """A path that satisfies the equations of a slew."""
+    """A path that satisfies the collocation equations of a slew."""
 
     program: SlewProgram
     point: Iterate
 
     @property
     def equations(self) -> Transcription:
-        """The equations of the path."""
+        """The collocation equations of the path."""
         return self.program.equations
 
     @property
@@ -83,15 +84,16 @@ class SolvedPath:
 
     @property
     def horizon(self) -> float:
-        """The duration, s."""
+        """The duration of the path, s."""
         return self.equations.scale
 
 
 class SlewSolver:
-    """A solver for the paths of one task; `unit` A m^2 is the unit of its dipoles.
+    """A solver for paths of one slew task. Dipoles are in units of `unit` A m^2.
 
-    `extra` (cones, 2 nodes) rad widens the cones at the points of the fine grid. `share` is the fraction of
-    the dipole limit that is used. `steps` counts the Newton steps, `work` the steps times their intervals.
+    The angles `extra` (cones, 2 nodes), rad, widen the cones at the points of the fine grid. Paths use at
+    most the fraction `share` of the dipole limit. The counter `steps` is the number of Newton steps, and
+    `work` the sum over these steps of the number of intervals.
     """
 
     def __init__(self, task: SlewTask) -> None:
@@ -114,29 +116,29 @@ class SlewSolver:
         return float((np.abs(found.at.dipoles) / self._limit).max())
 
     def is_kept(self, found: SolvedPath) -> bool:
-        """Return whether a path found without the dipole limit keeps the limit and the cones."""
+        """Return whether a path planned without the dipole limit keeps the dipole limit and the cones."""
         kept = self.kept(found.equations).values(found.at.states[1:, :4])
         return self.peak(found) <= 1.0 and bool(np.all(kept >= 0.0))
 
     def equations(self, scale: float, count: int) -> Transcription:
-        """Return the equations over `scale` s on `count` intervals."""
+        """Return the collocation equations of a slew of `scale` s on `count` intervals."""
         task = self._task
         start = np.concatenate([task.quaternion, scale * task.rate])
         return Transcription(task.craft, self.unit, task.along, start, task.end, count, scale, self._full)
 
     def free(self, equations: Transcription, guess: Trajectory) -> SolvedPath | None:
-        """Return the path without the dipole limit from an initial guess, converged to be flown."""
+        """Return the fully converged path without the dipole limit from an initial guess, or None."""
         return self.found(self.descent(equations, guess, LAST_BARRIER), _STEPS_FREE)
 
     def descent(self, equations: Transcription, guess: Trajectory, last: float = WALK_BARRIER) -> NewtonRun:
-        """Return the iteration from a guess to a path that keeps the cones, without the dipole limit."""
+        """Return an iteration that starts at a guess and imposes the cones but not the dipole limit."""
         equations.weights = self._full / max(equations.cost(guess), 1e-9)
         return NewtonRun(
             SlewProgram(equations, SlewLimits(equations, None, self.kept(equations))), guess, last=last
         )
 
     def limited(self, start: SolvedPath, count: int, time: float, last: float) -> SolvedPath | None:
-        """Return the path within all limits on `count` intervals over `time` s, warm-started from `start`."""
+        """Return a path of `time` s on `count` intervals within all limits, found from `start`, or None."""
         equations = self.equations(time, count)
         at, before = transferred(start, equations), start.equations.weights
         equations.weights = self._full / max(equations.cost(at), 1e-9)
@@ -149,7 +151,7 @@ class SlewSolver:
         return self._converged(equations, at, multipliers, (WALK_BARRIER if near else FIRST_BARRIER, last))
 
     def again(self, path: SlewPath) -> SolvedPath | None:
-        """Return the path within all limits near the path of a similar task."""
+        """Return a path within all limits, found from the path of a similar task, or None."""
         equations = self.equations(path.horizon, (len(path.times) - 1) // 2)
         states = np.concatenate([path.quaternion, path.horizon * path.rate], axis=1)
         at = Trajectory(states, path.dipole[::2] / self.unit)
@@ -163,7 +165,7 @@ class SlewSolver:
         multipliers: FloatArray | None,
         barriers: tuple[float, float],
     ) -> SolvedPath | None:
-        """Return the path within all limits from a trajectory, with barrier parameters from first to last."""
+        """Return a path within all limits, found by reducing the barrier parameter, or None."""
         limits = SlewLimits(equations, self.share * self._limit, self.kept(equations))
         descent = NewtonRun(SlewProgram(equations, limits), at, multipliers, *barriers)
         found = None
@@ -177,7 +179,7 @@ class SlewSolver:
         return found
 
     def found(self, descent: NewtonRun, maximum: int, enough: float = 0.0) -> SolvedPath | None:
-        """Return the path found within `maximum` more steps; None if there is none.
+        """Return the path found within `maximum` more Newton steps, or None.
 
         An iterate whose constraint violation is below `enough` is accepted before it is optimal.
         """
@@ -192,15 +194,15 @@ class SlewSolver:
         return SolvedPath(program, point)
 
     def kept(self, equations: Transcription) -> ConeConstraints:
-        """Return the cone constraints at all points of the equations except the first."""
+        """Return the cone constraints at all nodes and midpoints of the equations except the first node."""
         wider = self.extra if self.extra.shape[1] == 2 * equations.count else 0.0
         return ConeConstraints(self._task.cones, np.asarray(wider), equations.times[1:])
 
 
 def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
-    """Return a path interpolated on the grid and scaled to the horizon of other equations.
+    """Return a path interpolated on the grid of other equations and scaled to their duration.
 
-    The dipoles are scaled by the inverse square of the ratio of the horizons.
+    The dipoles are multiplied by the square of the old duration divided by the new duration.
     """
     at, own = start.at, start.equations
     dipoles = at.dipoles * (own.scale / equations.scale) ** 2
@@ -214,25 +216,26 @@ def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
 
 
 _BEGINS, _SPREAD = 24, 0.4
-"""Number of random starts of the fit, and standard deviation of the random mode amplitudes."""
+"""Number of random starts of the momentum fit, and standard deviation of the random mode amplitudes."""
 _COSINES = 6
 """Number of cosine terms per axis of the torque as a function of time."""
 _ROUNDS = 12
 _END, _CONE, _HEAT = 4.0, 2.0, 0.05
-"""Weights in the fit of a guess: end error (per rad), depth inside a cone (as a cosine), and torque."""
+"""Weights in the momentum fit: of the end error (per rad), of the depth inside a cone (per unit of cosine),
+and of the mode amplitudes."""
 _ROOM = 0.03
-"""Margin that a guess keeps from a cone, as a difference of cosines."""
+"""Margin of a guess to an exclusion cone, as a difference of cosines."""
 _DAMPED = 1.0
 _LONGEST_STEP = 4.0
-"""Largest step of the fit, in units of the torque of half a rotation."""
+"""Largest step of the mode amplitudes in an iteration of the momentum fit."""
 _WEAK, _WEAK_END = 1e-3, 0.03
-"""Relative heat below which a mode is discarded, and relative gain below which a direction of the momentum is
-discarded."""
+"""Heat of a mode, relative to the largest, below which the mode is discarded, and singular value, relative to
+the largest, below which a direction of the end momentum is not controlled."""
 _MISSED, _INSIDE_CONE = 0.1, 0.02
-"""End error (rad) and depth inside a cone (as a cosine) above which a guess is tried after the other
-guesses."""
+"""End error (rad) and depth inside a cone (as a difference of cosines) above which a guess is tried after all
+other guesses."""
 _SAME = 0.1
-"""Relative difference below which two momentum curves count as the same."""
+"""Relative difference of mode amplitudes below which two momentum curves count as equal."""
 
 
 def guesses(
@@ -244,15 +247,15 @@ def guesses(
     kept: ConeConstraints,
     scale: float,
 ) -> list[Trajectory]:
-    """Return guesses from a state (7,) to the end over `scale` s, the most promising first.
+    """Return initial guesses for a slew of `scale` s from a state (7,) to the end, the most promising first.
 
-    `around` is the environment at 2 k + 1 times; the cones of `kept` are kept.
+    The environment `around` is given at 2 k + 1 times. The guesses avoid the exclusion cones `kept`.
     """
     curves = _curves(craft, around, start, end, scale)
     fit = _MomentumFit(curves, craft, start, end, kept, scale)
     found = []
     for states in fit.found():
-        # The dipoles are the smallest that produce the component of the required torque normal to the field.
+        # The smallest dipole is used that produces the component of the required torque across the field.
         still = motion.flow(states, np.zeros((len(states), 3)))
         wanted = np.gradient(states[:, 4:], 1.0 / (len(states) - 1), axis=0) - still[:, 4:]
         field = motion.field(states[:, :4])
@@ -266,8 +269,9 @@ class _MomentumCurves:
     """Curves of the angular momentum at n times, kg m^2/s, ICRS axes.
 
     Attributes:
-        base: (n, 3) a curve that reaches the end of the slew.
-        modes: (d, n, 3) changes of the curve that keep its ends, in units of the torque of half a rotation.
+        base: momentum curve (n, 3) that reaches the end of the slew.
+        modes: changes (d, n, 3) of the momentum curve that preserve both ends; an amplitude of one
+            corresponds to the torque for half a rotation.
     """
 
     base: FloatArray
@@ -277,7 +281,7 @@ class _MomentumCurves:
 def _curves(
     craft: SlewCraft, around: SlewEnvironment, start: FloatArray, end: End, scale: float
 ) -> _MomentumCurves:
-    """Return the momenta from start to end, with modes whose heats are independent."""
+    """Return the momentum curves from start to end, with modes whose heats add up."""
     count = len(around.field)
     step, strength = scale / (count - 1), np.linalg.norm(around.field, axis=1)
     field = around.field / strength[:, None]
@@ -303,13 +307,13 @@ def _curves(
 
 
 def _momentum(craft: SlewCraft, q: FloatArray, rate: FloatArray) -> FloatArray:
-    """Return the momentum (3,) at an attitude (4,) and a rate (3,) rad/s, both vectors in ICRS axes."""
+    """Return the angular momentum (3,) of a body with attitude (4,) and rate (3,), rad/s, ICRS axes."""
     turned = attitude_matrix(q)
     return np.asarray(turned.T @ craft.inertia @ turned @ rate)
 
 
 class _MomentumFit:
-    """A least-squares fit (Levenberg-Marquardt) of the mode amplitudes of many random starts at once."""
+    """A Levenberg-Marquardt fit of the modes of momentum curves, from many random starts at once."""
 
     def __init__(
         self,
@@ -324,7 +328,7 @@ class _MomentumFit:
         self._scale, self._lighter = scale, np.linalg.inv(craft.inertia)
 
     def found(self) -> list[FloatArray]:
-        """Return the states (n, 7) of the distinct guesses, the most promising first."""
+        """Return the states (n, 7) of each distinct guess, the most promising guess first."""
         sums = self._fitted()
         q, momentum = self._propagated(sums)
         missed, crossed = self._end_errors(q), self._cone_violations(q)
@@ -340,7 +344,7 @@ class _MomentumFit:
         return states
 
     def _fitted(self) -> FloatArray:
-        """Return the mode amplitudes (m, d) of the least-squares fits."""
+        """Return the mode amplitudes (m, d) found by the m least-squares fits."""
         count = len(self._curves.modes)
         sums = _SPREAD * np.random.default_rng(16).normal(size=(_BEGINS, count))
         left = self._residuals(sums)
@@ -359,25 +363,25 @@ class _MomentumFit:
         return np.asarray(sums)
 
     def _residuals(self, sums: FloatArray) -> FloatArray:
-        """Return the weighted residuals (m, n) for mode amplitudes (m, d)."""
+        """Return the weighted residuals (m, n) of m fits for mode amplitudes (m, d)."""
         q, _ = self._propagated(sums)
         return np.concatenate(
             [_END * self._end_errors(q), _CONE * self._cone_violations(q), _HEAT * sums], axis=1
         )
 
     def _end_errors(self, q: FloatArray) -> FloatArray:
-        """Return the end-point errors (m, 3), rad, of paths (m, n, 4), as sines for a boresight."""
+        """Return the end errors (m, 3) of paths (m, n, 4): rotation vectors (rad) or boresight errors."""
         end, last = self._end, q[:, -1]
         if isinstance(end, BoresightEnd):
             return shown(last, np.broadcast_to(end.direction, (len(q), 3))) - end.axis
         return to_rotation_vector(multiply(np.broadcast_to(end.quaternion, last.shape), conjugate(last)))
 
     def _cone_violations(self, q: FloatArray) -> FloatArray:
-        """Return how deep m paths lie inside the cones, (m, cones n), as differences of cosines."""
+        """Return the depths (m, cones n) of m paths in the cones with margin, as differences of cosines."""
         return np.maximum(0.0, _ROOM - self._kept.values(q[:, None, 1:])).reshape(len(q), -1)
 
     def _propagated(self, sums: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return attitudes (m, n, 4) and momenta (m, n, 3) for amplitudes (m, d), by the midpoint rule."""
+        """Return attitudes (m, n, 4) by the midpoint rule and momenta (m, n, 3) for amplitudes (m, d)."""
         momentum = self._curves.base + np.tensordot(sums, self._curves.modes, 1)
         half = 0.5 * self._scale / (momentum.shape[1] - 1)
         middle = 0.5 * (momentum[:, 1:] + momentum[:, :-1])
@@ -390,7 +394,7 @@ class _MomentumFit:
         return q, momentum
 
     def _slope(self, q: FloatArray, momentum: FloatArray) -> FloatArray:
-        """Return q' (m, 4) at attitudes (m, 4) with momenta (m, 3)."""
+        """Return the time derivatives (m, 4) of quaternions (m, 4) for angular momenta (m, 3)."""
         rate = 0.5 * shown(q, momentum) @ self._lighter.T
         v, s = q[:, :3], q[:, 3:]
         return np.concatenate([cross(v, rate) + s * rate, -np.sum(v * rate, axis=1, keepdims=True)], axis=1)
@@ -401,36 +405,38 @@ def _unit(q: FloatArray) -> FloatArray:
 
 
 ENOUGH = 3
-"""Number of paths without the dipole limit from which the best one is taken."""
+"""Number of paths without the dipole limit from which the best path is chosen."""
 LONGER = 1.0, 1.4, 2.0, 2.8
-"""Factors by which a horizon is lengthened if no path over it is found."""
+"""Factors by which the requested duration is multiplied in turn until a path is found."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
-"""First and last ratio of successive horizons in the continuation to a shorter horizon. The three pairs are
-for the coarse grid, for the fine grid, and for the fine grid of a slew that is only stretched."""
+"""First and last ratio of successive durations in the continuation to shorter slews. The three pairs are for
+the coarse grid, for the fine grid, and for slews without a time cost on the fine grid."""
 _CROSSED = 1.3
-"""Ratio of the widening of a cone to the depth of a path inside this cone between two points."""
+"""Widening of a cone that a path crosses between two points, relative to the depth of the path inside the
+cone."""
 _BEYOND = math.radians(0.02)
-"""Additional angle (rad) by which a crossed cone is widened."""
+"""Additional widening (rad) of a cone that a path crosses between two points."""
 _BETWEEN = 16
-"""Intervals of the intermediate grid, for paths that do not converge from the coarse to the fine grid."""
+"""Number of intervals of an intermediate grid, used if a path does not converge on the fine grid from the
+coarse one."""
 _LOST, _EASED_STEP = 1.5, 1.03
-"""Ratio of the flown dipole to its limit above which a path is abandoned, and factor by which the horizon of
-another path above the limit is lengthened."""
+"""Ratio of the flown dipole to the dipole limit above which a path is abandoned, and additional factor by
+which the duration of other paths above the limit is lengthened."""
 _PEAK = 0.9
-"""Ratio of the largest dipole to its limit on the first horizon of the continuation."""
+"""Ratio of the largest dipole to the dipole limit that the first duration of the continuation aims at."""
 
 
 class HorizonContinuation:
-    """Continuation of the paths of one task over the horizon, the dipole limit and the cones."""
+    """Continuation of a task's paths while the duration, the dipole limit or the cones change in steps."""
 
     def __init__(self, task: SlewTask, solver: SlewSolver, budget: float) -> None:
-        """Start no further continuation step after `budget` of work."""
+        """Create a continuation that starts no further step when the solver's `work` exceeds `budget`."""
         self._task, self._solver, self._budget = task, solver, budget
         # Paths on the coarse grid from which no path on the fine grid was found.
         self._lost: set[tuple[float, float, float]] = set()
 
     def within(self, start: SolvedPath) -> SolvedPath | None:
-        """Return the path within the limits on the fine grid, from a coarse path found without limits."""
+        """Return a path on the fine grid within the limits, found from one without the dipole limit."""
         solver, nodes, time = self._solver, self._task.nodes, start.horizon
         if solver.is_kept(start):
             equations = solver.equations(time, nodes)
@@ -441,10 +447,9 @@ class HorizonContinuation:
         return None if coarse is None else self._finer(coarse, time, LAST_BARRIER)
 
     def shortened(self, relaxed: list[SolvedPath], shortest: float, time_cost: float) -> SolvedPath | None:
-        """Return the best path found by shortening the horizon as long as this reduces energy plus time cost.
+        """Return the best path found by shortening the slew as long as this reduces energy plus time cost.
 
-        The continuation starts from the relaxed path that needs the shortest horizon to keep the dipole
-        limit, at this horizon.
+        The continuation starts from the relaxed path that keeps the dipole limit over the shortest duration.
         """
         best: SolvedPath | None = None
         for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:
@@ -463,7 +468,7 @@ class HorizonContinuation:
         return None if best is None else self._refined(best, shortest, time_cost)
 
     def distinct(self, relaxed: list[SolvedPath]) -> list[SolvedPath]:
-        """Return the distinct paths without dipole limit, the cheapest first."""
+        """Return paths without the dipole limit, free of duplicates and in the order of their energy."""
         ordered = sorted(relaxed, key=self._solver.energy)
         costs = [(found.horizon, self._solver.energy(found)) for found in ordered]
         return ordered[:1] + [
@@ -473,10 +478,10 @@ class HorizonContinuation:
         ]
 
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
-        """Return a path near one that crosses cones between the points; None if there is none.
+        """Return a path with wider cones, found from a path that crosses cones between its points, or None.
 
-        `depths` (cones, 2 nodes) rad are the depths inside the cones between each two points. The cones at
-        the last point of the path are not widened.
+        The largest depths inside the cones between each two points are `depths` (cones, 2 nodes), rad. The
+        cones at the last point of the path are not widened.
         """
         wider = np.where(depths > 0.0, _CROSSED * depths + _BEYOND, 0.0)
         both = wider.copy()
@@ -486,10 +491,10 @@ class HorizonContinuation:
         return self._solver.limited(found, found.equations.count, found.horizon, LAST_BARRIER)
 
     def eased(self, found: SolvedPath, peak: float) -> SolvedPath | None:
-        """Return a path near one whose flown dipoles are `peak` times their limit; None if there is none.
+        """Return a path with smaller dipoles, found from a path whose flown dipole is `peak` times the limit.
 
-        The new path uses a smaller share of the dipole limit. If no such path exists or the horizon is free,
-        the new path has a longer horizon.
+        The new path uses a smaller fraction of the dipole limit. If no such path exists or the duration is
+        free, the new path takes longer. Returns None if no path is found.
         """
         task, solver, time = self._task, self._solver, found.horizon
         if peak > _LOST:
@@ -505,7 +510,7 @@ class HorizonContinuation:
         return solver.limited(found, task.nodes, time, LAST_BARRIER)
 
     def _refined(self, best: SolvedPath, shortest: float, time_cost: float) -> SolvedPath | None:
-        """Return the best path on the fine grid, by continuation from a coarse one."""
+        """Return the best path on the fine grid, found by continuation from a path on the coarse grid."""
         times = best.horizon * np.array([1.0, 1.02, 1.1])
         longer = (self._finer(best, float(time), WALK_BARRIER) for time in times)
         fine = next(filter(None, longer), None)
@@ -516,7 +521,7 @@ class HorizonContinuation:
         return self._solver.limited(fine, self._task.nodes, fine.horizon, LAST_BARRIER) or fine
 
     def _finer(self, coarse: SolvedPath, time: float, last: float) -> SolvedPath | None:
-        """Return the path on the fine grid over `time` s from a coarse one; None if there is none."""
+        """Return a path of `time` s on the fine grid, found from a path on the coarse grid, or None."""
         nodes, solver = self._task.nodes, self._solver
         key = (coarse.horizon, solver.energy(coarse), time)
         if key in self._lost:
@@ -532,7 +537,7 @@ class HorizonContinuation:
     def _walked(
         self, best: SolvedPath, shortest: float, time_cost: float, ratios: tuple[float, float]
     ) -> SolvedPath:
-        """Return the best path in a continuation to shorter horizons, down to the last ratio."""
+        """Return the best path found by shortening the slew in steps that become smaller."""
         (first, last), failed = ratios, 0.0
         while best.horizon > max(shortest, last * failed) and self._solver.work < self._budget:
             time = max(best.horizon / first, shortest, math.sqrt(best.horizon * failed))
@@ -544,11 +549,11 @@ class HorizonContinuation:
         return best
 
     def _fastest(self, found: SolvedPath) -> float:
-        """Return the approximate horizon, s, over which a relaxed path would keep the dipole limit."""
+        """Return the approximate duration, s, to which a path must be stretched to keep the dipole limit."""
         return found.horizon * math.sqrt(self._solver.peak(found) / _PEAK)
 
     def _begins(self, start: SolvedPath, shortest: float) -> list[float]:
-        """Return the horizons, s, at which continuation from a relaxed path may begin, the shortest first."""
+        """Return the durations, s, at which a continuation may begin, the shortest first."""
         time = max(self._fastest(start), shortest)
         times = [time, start.horizon] if time < start.horizon else [longer * time for longer in LONGER]
         if start.horizon == self._task.horizon and self._task.time_cost is None and start.horizon in times:
@@ -557,52 +562,54 @@ class HorizonContinuation:
         return [each for each in times if each <= task.longest and blocking_cone(task, each) is None]
 
     def _value(self, found: SolvedPath, time_cost: float) -> float:
-        """Return the cost of a path, J, or its duration, s, if only time counts."""
+        """Return the energy plus time cost of a path, J, or the duration, s, if only time counts."""
         return (
             found.horizon if math.isinf(time_cost) else self._solver.energy(found) + time_cost * found.horizon
         )
 
     def _over(self, start: SolvedPath, time: float) -> SolvedPath | None:
-        """Return the minimum-energy path within the limits over `time` s, from one over another horizon."""
+        """Return the minimum-energy path of `time` s within the limits, found from the path `start`."""
         return self._solver.limited(start, start.equations.count, time, WALK_BARRIER)
 
 
 GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3000))
-"""Number of intervals and budget of each successive search. The budget is the work, Newton steps times
-intervals, after which no further guess is tried. A work of 1,000 takes about 0.1 s. On ten intervals, paths
-around cones differ too much from paths on the fine grid."""
+"""Number of collocation intervals and budget of work of each successive search. No further guess is tried
+when the work, measured in Newton steps times intervals, exceeds the budget. A work of 1,000 takes about 0.1
+s. Ten intervals are too coarse for paths around cones, because such paths differ too much from paths on the
+fine grid."""
 _WALKS = 1.8
 """Work, relative to the budget of a search, after which the continuation ends with the best path so far."""
 _MAXIMUM_TRIED = 16
-"""Largest number of guesses over one horizon."""
+"""Largest number of guesses that are tried for one duration."""
 _LOOK = 8
-"""Number of Newton steps of every guess before its constraint violation is compared with the limit."""
+"""Number of Newton steps from a guess before the constraint violation is checked for the first time."""
 _FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (20, 0.4))
-"""Further stages of a guess: Newton steps, and the constraint violation before the stage above which the
-guess is deferred. After eight steps, four of five successful guesses have a violation below 1.5, and three of
-four unsuccessful guesses have a larger one (320 guesses, seed 41 of the bench `orbit_slews`)."""
+"""Further stages of the iteration from a guess: the number of Newton steps of each stage, and the constraint
+violation above which the guess is deferred instead of starting the stage. After eight steps, the violation is
+below 1.5 for four of five successful guesses, and above 1.5 for three of four unsuccessful guesses (320
+guesses, seed 41 of the bench `orbit_slews`)."""
 _STEPS_WITHOUT_PATH = 120
-"""Newton steps without a path after which the other guesses over a horizon are deferred."""
+"""Number of Newton steps without a path after which the remaining guesses for a duration are deferred."""
 _WIDENED = 4
 """Maximum number of corrections of one path by widening cones or reducing dipoles."""
 
 
 class SlewSearch:
-    """The search for the path of one task; `tried` counts the guesses."""
+    """The search for the path of one slew task. The attribute `tried` counts the guesses."""
 
     def __init__(self, task: SlewTask, coarse: int, budget: int) -> None:
-        """Search on `coarse` intervals; after `budget` of work no further guess is tried."""
+        """Create a search on `coarse` intervals that ends when the work exceeds `budget`."""
         self._task, self._budget = task, budget
         self.solver = SlewSolver(task)
         self._walker = HorizonContinuation(task, self.solver, _WALKS * budget)
         self._coarse = min(task.nodes, coarse)
         self._further = _FURTHER_WITH_CONES if task.cones else _FURTHER
         self._widened = 0
-        self._known: list[float] = []  # heats (J) of the paths without dipole limit that were tried
+        self._known: list[float] = []  # heats (J) of the tried paths without the dipole limit
         self.tried = 0
 
     def paths(self) -> Iterator[SolvedPath]:
-        """Yield paths within all limits at the nodes, the best first."""
+        """Yield paths that keep all limits at nodes and midpoints, the best path first."""
         time_cost = self._task.time_cost
         for batches in self._rungs():
             relaxed: list[SolvedPath] = []
@@ -618,28 +625,29 @@ class SlewSearch:
                 yield self._fresh(found)
 
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
-        """Return a path near one that crosses cones by `depths` (cones, 2 nodes) rad between the points.
+        """Return a path outside cones that `found` crosses by `depths` (cones, 2 nodes), rad.
 
-        None if there is none.
+        Returns None if no path is found or the path was corrected too often.
         """
         self._widened += 1
         return self._walker.widened(found, depths) if self._widened <= _WIDENED else None
 
     def eased(self, found: SolvedPath, peak: float) -> SolvedPath | None:
-        """Return a path near one whose flown dipoles are `peak` times their limit; None if there is none."""
+        """Return a path with smaller dipoles than `found`, whose dipole is `peak` times the limit."""
         self._widened += 1
         return self._walker.eased(found, peak) if self._widened <= _WIDENED else None
 
     def _fresh(self, found: SolvedPath) -> SolvedPath:
-        """Reset widened cones and the share of the dipole limit, and return the path."""
+        """Return the path after resetting the cones and the usable dipole limit of the solver."""
         self._widened, self.solver.share = 0, 1.0
         self.solver.extra = np.zeros_like(self.solver.extra)
         return found
 
     def _rungs(self) -> Iterator[Iterator[list[SolvedPath]]]:
-        """Yield relaxed paths over the requested horizon, over longer ones, and from deferred guesses.
+        """Yield paths without the dipole limit, first of the requested duration and then of longer durations.
 
-        Longer slews converge more often, because the field rotates more during the slew.
+        Paths from deferred guesses follow. Longer slews converge more often, because the field rotates more
+        during a longer slew.
         """
         deferred: list[NewtonRun] = []
         for longer in LONGER:
@@ -651,7 +659,7 @@ class SlewSearch:
         yield self._late(deferred)
 
     def _relaxed(self, horizon: float, deferred: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
-        """Yield batches of relaxed paths over a horizon; append other guesses to `deferred`."""
+        """Yield batches of paths without the dipole limit; append slowly converging guesses to `deferred`."""
         batch: list[SolvedPath] = []
         solver, patience = self.solver, self.solver.steps + _STEPS_WITHOUT_PATH
         equations = solver.equations(horizon, self._coarse)
@@ -686,7 +694,7 @@ class SlewSearch:
             yield batch
 
     def _late(self, deferred: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
-        """Yield relaxed paths from deferred guesses, those with the smallest violation first."""
+        """Yield paths without the dipole limit from deferred guesses, the smallest violation first."""
         for descent in sorted(deferred, key=lambda descent: descent.lack):
             if self.solver.work > self._budget:
                 break
@@ -695,7 +703,7 @@ class SlewSearch:
                 yield [found]
 
     def _cheapest(self, batch: list[SolvedPath]) -> list[SolvedPath]:
-        """Return paths within the limits over the requested horizon, the cheapest first."""
+        """Return paths of the requested duration within the limits, the path of least energy first."""
         kept: list[SolvedPath] = []
         energy = self.solver.energy
         for start in self._walker.distinct([start for start in batch if start.horizon <= self._task.horizon]):
