@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,7 +136,10 @@ def test_a_current_beyond_the_range_is_refused() -> None:
     flown = bench(peak=1.3)
     flown.strings.gain = 2.0
     flown.wait(1.2)
-    assert "current of string" in flown.driver.error()
+    error = flown.driver.error()
+    assert "current of string" in error
+    numbers = [float(number) for number in re.findall(r"-?\d+\.\d+", error)]
+    assert numbers == pytest.approx([1.024, -1.024, 1.024], abs=5e-3), "2.048 V of full scale by 2 V/A"
     assert flown.driver.latest() is None
 
 
