@@ -16,9 +16,8 @@ from collections.abc import Sequence
 from ipaddress import IPv4Network
 from pathlib import Path
 
-from flight.schema.consistency import LOOPBACK, peer_networks
 from flight.schema.devices import V4l2Device
-from flight.schema.reader import load
+from flight.schema.reader import LOOPBACK, load, peer_networks
 from flight.schema.sections import Config
 from hal.buses.i2c_bus import device_file
 from knightcube.errors import UsageError

@@ -1,22 +1,241 @@
 """Reads configurations: from YAML to a validated `flight.schema.sections.Config`.
 
-Each error is one line that names the file, the line, the value and its cure.
+Each error is one line that names the file, the line, the value and its cure. The module also checks that
+values of a configuration are consistent with each other, and defines the networks that the link accepts.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 
-from flight.schema.consistency import check_consistency
-from flight.schema.devices import Camera
-from flight.schema.document import ConfigError, convert, read_document, read_text
+from flight.schema.devices import Camera, SolarStringsSection
+from flight.schema.document import ConfigError, Document, convert, read_document, read_text
 from flight.schema.orbit import OrbitConfig
-from flight.schema.sections import Config
+from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
+from flight.schema.values import Quaternion, check_aim
 from knightcube.errors import UsageError
+
+Refuse = Callable[[str, str], None]
+"""Function that raises the error about a value; its arguments are the value's dotted name and the problem."""
+
+PIXEL_BITS = {
+    "GREY": range(8, 9),
+    "Mono8": range(8, 9),
+    "Y10": range(10, 11),
+    "Mono10": range(10, 11),
+    "Y12": range(12, 13),
+    "Mono12": range(12, 13),
+    "Y16": range(9, 17),
+    "Mono16": range(9, 17),
+}
+"""Permitted numbers of bits per pixel of each pixel format."""
+LOOPBACK = IPv4Network("127.0.0.0/8")
+_PREFIX = 24
+"""Default prefix length of the network whose hosts may send frames to the link."""
+
+
+def check_consistency(config: Config, document: Document) -> None:
+    """Raise ConfigError for values that contradict each other. Raises ConfigError."""
+
+    def refuse(dotted: str, problem: str) -> None:
+        raise document.error(dotted, problem)
+
+    if isinstance(config, TestbedConfig):
+        _check_testbed(config, refuse)
+    if isinstance(config, OrbitConfig):
+        _check_orbit(config, refuse)
+    _check_commands(config.commands, isinstance(config, TestbedConfig), refuse)
+    if config.link is not None:
+        _check_link(config.link, config.commands, refuse)
+    _check_coils(config, refuse)
+    unit = config.inertial_unit
+    # A reading waits for its control cycle, and the current computed from it flows until the next cycle.
+    least = 1.0 / unit.rate_hz + 2.0 / CONTROL_RATE_HZ
+    if unit.max_age < least:
+        problem = f"is {unit.max_age!r}: the rates of inertial unit and control loop require {least:g} s"
+        refuse("inertial_unit.max_age", problem)
+    telemetry = config.telemetry
+    if telemetry.budget_bytes < 2 * telemetry.segment_bytes:
+        refuse(
+            "telemetry.budget_bytes",
+            f"is {telemetry.budget_bytes}: must be at least twice `telemetry.segment_bytes`",
+        )
+    if config.camera is not None:
+        _check_camera(config.camera, refuse)
+        _check_length("camera.mounting", config.camera.mounting, refuse)
+    _check_length("inertial_unit.mounting", config.inertial_unit.mounting, refuse)
+    for index, camera in enumerate(config.wide_cameras):
+        _check_length(f"wide_cameras[{index}].mounting", camera.mounting, refuse)
+        first = config.wide_cameras[0]
+        for name in ("response", "decades", "bits", "pedestal"):
+            if (value := getattr(camera, name)) != (wanted := getattr(first, name)):
+                refuse(
+                    f"wide_cameras[{index}].{name}",
+                    f"is {value!r}: must be equal for all wide-angle cameras, the first has {wanted!r}",
+                )
+    if config.solar_strings is not None:
+        _check_strings(config, config.solar_strings, refuse)
+
+
+def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
+    if config.guidance.replan_period >= config.guidance.horizon:
+        refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
+    times = [step.at for step in config.steps]
+    _check_order("steps", times, refuse)
+    if config.duration <= times[-1]:
+        refuse("duration", f"is {config.duration!r}: must be later than the last target, at {times[-1]!r} s")
+
+
+def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
+    times = [step.at for step in config.targets]
+    _check_order("targets", times, refuse)
+    for index, step in enumerate(config.targets):
+        check_aim(f"targets[{index}]", step, step.point, refuse)
+        if step.point == "object" and not config.looks_for_objects():
+            refuse(f"targets[{index}].point", "is object: needs `camera` with `star_tracker` and `objects`")
+    axes = (config.pointing.axis, config.pointing.across)
+    for name, axis in zip(("axis", "across"), axes, strict=True):
+        if abs(math.hypot(*axis) - 1.0) > 1e-6:
+            refuse(f"pointing.{name}", f"has length {math.hypot(*axis):.6g}: give a unit vector")
+    cosine = sum(a * b for a, b in zip(*axes, strict=True))
+    if abs(cosine) > 1e-6:
+        degrees = math.degrees(math.acos(cosine))
+        refuse("pointing.across", f"is {degrees:.1f} deg from `pointing.axis`: must be 90 deg from it")
+
+
+def _check_order(section: str, times: list[float], refuse: Refuse) -> None:
+    if times[0] != 0.0:
+        refuse(f"{section}[0].at", f"is {times[0]!r}: the first target must be given at 0")
+    for index in range(1, len(times)):
+        if times[index] <= times[index - 1]:
+            refuse(f"{section}[{index}].at", f"is {times[index]!r}: targets must be in order of time")
+
+
+def _check_coils(config: Config, refuse: Refuse) -> None:
+    used = [c for pair in config.coils.channels for c in pair]
+    if len(set(used)) != len(used):
+        refuse("coils.channels", f"{used} use a channel of the PWM chip twice")
+    if config.power_monitor is not None and config.power_monitor.address == config.coils.address:
+        refuse(
+            "power_monitor.address",
+            f"is 0x{config.power_monitor.address:02x}, the address of the PWM chip: "
+            "set another address (0x45) by the monitor's address pins, and give it here",
+        )
+
+
+def _check_strings(config: Config, strings: SolarStringsSection, refuse: Refuse) -> None:
+    others = {config.coils.address} | ({config.power_monitor.address} if config.power_monitor else set())
+    inputs = set()
+    for index, string in enumerate(strings.strings):
+        place = f"solar_strings.strings[{index}]"
+        if string.address in others:
+            refuse(f"{place}.address", f"is 0x{string.address:02x}, the address of another chip on the bus")
+        if (string.address, string.channel) in inputs:
+            refuse(f"{place}.channel", f"is {string.channel}: this ADC channel measures another string")
+        inputs.add((string.address, string.channel))
+        if abs(math.hypot(*string.normal) - 1.0) > 1e-6:
+            refuse(f"{place}.normal", f"has length {math.hypot(*string.normal):.6g}: give a unit vector")
+
+
+def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
+    norm = math.sqrt(sum(c * c for c in quaternion))
+    if abs(norm - 1.0) > 1e-6:
+        refuse(dotted, f"has length {norm:.6g}: a quaternion must have length 1")
+
+
+def _check_commands(commands: Commands, on_testbed: bool, refuse: Refuse) -> None:
+    for index, step in enumerate(commands.timeline):
+        dotted = f"commands.timeline[{index}]"
+        given = [name for name in ("mode", "slew", "point", "clear") if getattr(step, name) is not None]
+        if len(given) != 1:
+            refuse(dotted, f"gives {given}: must give one of mode, slew, point, clear")
+        if step.point is not None and on_testbed:
+            refuse(f"{dotted}.point", "is a command for satellites: use `slew` for the testbed")
+        check_aim(dotted, step, step.point, refuse)
+    if not _is_loopback(commands):
+        problem = "accepts unprotected commands from other machines"
+        cure = "give a loopback address, and use `link` with keys"
+        refuse("commands.udp", f"{commands.udp} {problem}: {cure}")
+
+
+def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
+    if commands.socket is None:
+        refuse("link", "needs `commands.socket`, through which it passes commands to the flight")
+    if link.udp is None and link.tcp is None and link.serial is None:
+        refuse("link", "has no line: give `udp`, `tcp` or `serial`")
+    if link.telemetry_to is not None and link.udp is None:
+        refuse("link.telemetry_to", "goes with `link.udp`")
+    try:
+        peer_networks(link)
+    except ValueError as error:
+        refuse("link.peers" if link.peers else "link.udp" if link.udp else "link.tcp", str(error))
+
+
+def _check_camera(camera: Camera, refuse: Refuse) -> None:
+    if camera.exposure >= camera.period:
+        refuse("camera.exposure", "must be shorter than `camera.period`")
+    if camera.streak_exposure is not None:
+        least, most = camera.streak_exposure
+        if not least <= most < camera.period:
+            refuse("camera.streak_exposure", "must be a minimum and a maximum below `camera.period`")
+    if camera.objects is not None:
+        if camera.star_tracker is None:
+            refuse(
+                "camera.objects", "needs `camera.star_tracker`: objects are detected among identified stars"
+            )
+        if camera.objects.needed > camera.objects.within:
+            refuse("camera.objects.needed", f"is {camera.objects.needed}: must not be above `within`")
+    if camera.fine_period is not None and not camera.period <= camera.fine_period < camera.max_age:
+        refuse(
+            "camera.fine_period",
+            f"is {camera.fine_period:g}: must be at least `camera.period` ({camera.period:g}) and less than "
+            f"`camera.max_age` ({camera.max_age:g})",
+        )
+    if camera.device is not None:
+        pixel_format, possible = camera.device.pixel_format, PIXEL_BITS[camera.device.pixel_format]
+        if camera.bits not in possible:
+            span = f"{possible[0]}" if len(possible) == 1 else f"{possible[0]} to {possible[-1]}"
+            refuse("camera.bits", f"is {camera.bits}: pixels of {pixel_format} have {span} bits")
+
+
+def peer_networks(link: Link) -> tuple[IPv4Network, ...]:
+    """Return the networks from which the link accepts frames; without UDP and TCP there are none.
+
+    The sandbox of the systemd service (`deploy/board_dropin.py`) blocks packets of all other networks. Raises
+    ValueError for an invalid network, and for an address that requires `link.peers`.
+    """
+    hosts = [address.rpartition(":")[0] for address in (link.udp, link.tcp) if address is not None]
+    if hosts and link.peers is not None:
+        return tuple(map(IPv4Network, link.peers))
+    networks = []
+    for host in hosts:
+        try:
+            own = IPv4Address("127.0.0.1" if host == "localhost" else host)
+        except ValueError as error:
+            raise ValueError(
+                f"{host} is not an IPv4 address: list the permitted senders in `link.peers`"
+            ) from error
+        if own.is_unspecified:
+            raise ValueError(f"{host} listens on every network: list the permitted senders in `link.peers`")
+        networks.append(LOOPBACK if own.is_loopback else IPv4Network((own, _PREFIX), strict=False))
+    return tuple(dict.fromkeys(networks))
+
+
+def _is_loopback(commands: Commands) -> bool:
+    """Return whether unprotected UDP commands are disabled or accepted from this machine only."""
+    host = (commands.udp or "localhost:0").rpartition(":")[0]
+    try:
+        return host == "localhost" or IPv4Address(host).is_loopback
+    except ValueError:
+        return False
+
 
 T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from flight.app.accepted_config import requested_config
 from flight.app.devices import linux_camera, simulated_camera
 from flight.app.run import RunRequest
+from flight.app.service import requested_config
 from flight.schema.devices import Camera, camera_model
 from flight.schema.document import ConfigError, config_path
 from ground.commands.options import finite

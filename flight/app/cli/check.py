@@ -167,11 +167,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def check(options: argparse.Namespace) -> int:
     """Check a configuration, print the result, and return 1 if it is not ready to fly."""
-    from flight.app.accepted_config import accepted_config  # noqa: PLC0415
     from flight.app.cli.check import probe  # noqa: PLC0415
-    from flight.app.composition import body_kind  # noqa: PLC0415 - the whole flight hangs on these
     from flight.app.devices import check_settings  # noqa: PLC0415
-    from flight.app.flight import placing  # noqa: PLC0415
+    from flight.app.flight import body_kind, placing  # noqa: PLC0415
+    from flight.app.service import accepted_config  # noqa: PLC0415
 
     chosen = accepted_config(options.config, os.environ)
     path = chosen.path

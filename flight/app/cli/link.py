@@ -14,15 +14,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from flight.app.accepted_config import accepted_config
-from flight.app.service import StartRetry, StoppedError, retried_start
+from flight.app.service import StartRetry, StoppedError, accepted_config, retried_start
 from flight.link.process.commanding import ControlLine, Sent
 from flight.link.process.downlink import LogFollower
 from flight.link.process.station import Line, SerialLine, Station, StationSettings, TcpLine, UdpLine
 from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
-from flight.schema.consistency import peer_networks
 from flight.schema.document import ConfigError, config_path
-from flight.schema.reader import parse
+from flight.schema.reader import parse, peer_networks
 from flight.schema.sections import Link
 from hal.buses.clock import SystemClock
 from hal.buses.linux_process import ServiceManager

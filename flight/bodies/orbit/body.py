@@ -24,7 +24,7 @@ from flight.bodies.orbit.guidance import (
     PointingTargets,
     Sensor,
 )
-from flight.bodies.streak_methods import streak_estimator
+from flight.bodies.streak_methods import corner_estimator
 from flight.link import events
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import NAVIGATION, SPIN
@@ -263,7 +263,9 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     estimation = SatelliteEstimation(config, services, learned)
     control = SatelliteControl(config, estimation, services)
     view = OrbitView(control.field_detumbling, estimation.orbit_filter, estimation.environment, services)
-    return FlightBody(estimation, control, view, streak_estimator(config.camera))
+    camera = config.camera
+    corners = None if camera is None or camera.estimator == "likelihood" else corner_estimator(camera)
+    return FlightBody(estimation, control, view, corners)
 
 
 ORBIT = BodyKind(pointing_job.run, make)

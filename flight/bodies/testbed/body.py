@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flight.bodies.streak_methods import streak_estimator
+from flight.bodies.streak_methods import corner_estimator
 from flight.bodies.testbed.control import (
     BdotLaw,
     CageField,
@@ -224,7 +224,9 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     control = TestbedControl(config, reader, cage, services)
     estimation = TestbedEstimation(config, learned, reader, cage)
     view = ThreadView(reader, control.planning, services)
-    return FlightBody(estimation, control, view, streak_estimator(config.camera))
+    camera = config.camera
+    corners = None if camera is None or camera.estimator == "likelihood" else corner_estimator(camera)
+    return FlightBody(estimation, control, view, corners)
 
 
 def thread_reader(plant: SingleAxisPlant) -> ThreadReader:

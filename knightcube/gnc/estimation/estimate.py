@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import Quaternion, Vector
 from knightcube.gnc.estimation.measurements import MeanRateMeasurement
-from knightcube.gnc.estimation.rotation import Quaternion, Vector
 
 ATTITUDE, RATE, BIAS, DISTURBANCE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 PARAMETERS, LATENCY, FIELD_BIAS = slice(12, 15), 15, slice(16, 19)

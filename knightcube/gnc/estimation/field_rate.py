@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.rotation import (
+from knightcube.astro.quaternion import (
     Quaternion,
     Vector,
     added,

@@ -25,6 +25,18 @@ from typing import NamedTuple
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, tangent_basis
+from knightcube.astro.quaternion import (
+    Vector,
+    added,
+    compose,
+    exponential,
+    inverse,
+    logarithm,
+    matrix,
+    skew,
+    times,
+    twist,
+)
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     DISTURBANCE,
@@ -44,18 +56,6 @@ from knightcube.gnc.estimation.measurements import (
     RateMeasurement,
 )
 from knightcube.gnc.estimation.rigid_body import Accelerated
-from knightcube.gnc.estimation.rotation import (
-    Vector,
-    added,
-    compose,
-    exponential,
-    inverse,
-    logarithm,
-    matrix,
-    skew,
-    times,
-    twist,
-)
 
 LONGEST_LATENCY = 0.25
 """Largest plausible age (s) of an inertial unit's sample at its time stamp."""

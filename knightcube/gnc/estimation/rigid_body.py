@@ -24,7 +24,21 @@ from typing import NamedTuple
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, cross_matrices
-from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.astro.quaternion import (
+    Matrix,
+    Quaternion,
+    Vector,
+    attitude_matrix,
+    compose,
+    cross,
+    exponential,
+    from_rotation_vector,
+    matrix,
+    rows_of,
+    skew,
+    times,
+    twist,
+)
 from knightcube.errors import UsageError
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
@@ -34,19 +48,6 @@ from knightcube.gnc.estimation.estimate import (
     SIZE,
     FilterState,
     Parameters,
-)
-from knightcube.gnc.estimation.rotation import (
-    Matrix,
-    Quaternion,
-    Vector,
-    compose,
-    cross,
-    exponential,
-    matrix,
-    rows_of,
-    skew,
-    times,
-    twist,
 )
 
 

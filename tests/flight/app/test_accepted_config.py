@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from flight.app.accepted_config import (
+from flight.app.cli import main
+from flight.app.flight import fly
+from flight.app.run import RunRequest
+from flight.app.service import (
     FOLDER,
     GOOD_START_NS,
     Chosen,
@@ -17,9 +20,6 @@ from flight.app.accepted_config import (
     kept_configs,
     sum_file,
 )
-from flight.app.cli import main
-from flight.app.flight import fly
-from flight.app.run import RunRequest
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError, UnreadConfigError

@@ -11,8 +11,7 @@ from random import Random
 import pytest
 from hypothesis import given, settings
 
-from flight.app.accepted_config import FOLDER, accepted_config, kept_configs
-from flight.app.service import TRIALS, FlownRelease
+from flight.app.service import FOLDER, TRIALS, FlownRelease, accepted_config, kept_configs
 from flight.schema.document import ConfigError
 from tests.deploy.scripts import script
 from tests.support.damaged import Files, chances, fill, offer

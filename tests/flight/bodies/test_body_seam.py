@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from flight.app.composition import body_kind
+from flight.app.flight import body_kind
 from flight.loop.control_cycle import ATTITUDE_EVERY
 from flight.schema import reader
 from flight.schema.document import ConfigError

@@ -8,9 +8,8 @@ from ipaddress import IPv4Network
 import pytest
 
 from flight.link.commands import CommandPacker, Ping, open_udp
-from flight.schema.consistency import peer_networks
 from flight.schema.document import ConfigError
-from flight.schema.reader import parse
+from flight.schema.reader import parse, peer_networks
 from tests.support.flights import CONFIG
 
 ORBIT = CONFIG.parent / "orbit.yaml"

@@ -12,8 +12,8 @@ import pytest
 import yaml
 from hypothesis import given, settings
 
-from flight.app.composition import workers
 from flight.app.devices import coil_settings, unit_settings
+from flight.app.flight import workers
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
 from hal.interfaces.errors import DeviceError

@@ -99,7 +99,7 @@ BUSY: dict[str, Callable[[Any], Any]] = {
 def keep_busy() -> None:
     """Have the flight that this process opens keep its workers busy."""
     from flight.app import flight as opening  # noqa: PLC0415
-    from flight.app.composition import workers as made  # noqa: PLC0415
+    from flight.app.flight import workers as made  # noqa: PLC0415
 
     def workers(*arguments: Any) -> list[Worker]:
         return [replace(worker, function=BUSY[worker.function.__module__]) for worker in made(*arguments)]

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
-from flight.app.accepted_config import FlownConfig, sum_file
+from flight.app.service import FlownConfig, sum_file
 from knightcube.errors import UsageError
 from tests.hal.guardian.live_flight import ROOT, devices_running, write_config
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary

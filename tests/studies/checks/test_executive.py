@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from flight.app import flight as opening
-from flight.app.composition import workers
+from flight.app.flight import workers
 from flight.schema import reader as configuration
 from tests.hal.guardian.live_flight import ROOT
 from tests.studies.bench import bare_loop, busy_jobs
@@ -88,7 +88,7 @@ def test_every_worker_of_a_flight_is_kept_busy(name: str, monkeypatch: pytest.Mo
     monkeypatch.setattr("flight.app.flight.workers", workers)  # restores it at the end
     busy_jobs.keep_busy()
     config = configuration.load(ROOT / "config" / name)
-    made, plain = opening.workers(config), workers(config)  # type: ignore[attr-defined]  # one of its imports
+    made, plain = opening.workers(config), workers(config)
     assert [worker.name for worker in made] == [worker.name for worker in plain]
     assert len(made) >= 2
     for busy, worker in zip(made, plain, strict=True):

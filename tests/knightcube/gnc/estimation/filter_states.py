@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import compose, exponential
 from knightcube.gnc.estimation.estimate import FilterState, Parameters
-from knightcube.gnc.estimation.rotation import compose, exponential
 
 STATE = FilterState(
     exponential(0.3, -0.5, 0.8), (0.2, -0.3, 0.1), (1e-3, 0.0, -2e-3), (0.01, 0.02, -0.03), Parameters()

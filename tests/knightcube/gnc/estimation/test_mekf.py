@@ -9,6 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import (
+    compose,
+    exponential,
+    inverse,
+    logarithm,
+    skew,
+)
 from knightcube.gnc.estimation.estimate import SIZE, FilterState, Parameters
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
 from knightcube.gnc.estimation.mekf import (
@@ -20,13 +27,6 @@ from knightcube.gnc.estimation.mekf import (
     release_attitude,
 )
 from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody, Torquing, propagate
-from knightcube.gnc.estimation.rotation import (
-    compose,
-    exponential,
-    inverse,
-    logarithm,
-    skew,
-)
 from tests.knightcube.gnc.estimation.filter_states import STATE, moved
 from tests.knightcube.gnc.estimation.flights import FREE, RATE_COVARIANCE, SUSPENDED, TURN_COVARIANCE
 

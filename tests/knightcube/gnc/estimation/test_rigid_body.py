@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
-from knightcube.errors import UsageError
-from knightcube.gnc.estimation.estimate import Parameters
-from knightcube.gnc.estimation.rigid_body import RigidBody
-from knightcube.gnc.estimation.rotation import (
+from knightcube.astro.quaternion import (
     Quaternion,
     Vector,
     compose,
     exponential,
 )
+from knightcube.errors import UsageError
+from knightcube.gnc.estimation.estimate import Parameters
+from knightcube.gnc.estimation.rigid_body import RigidBody
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
 from tests.knightcube.gnc.estimation.flights import FREE
 from tests.support.consistency_worlds import DIPOLE, INERTIA, TESTBED_FIELD
