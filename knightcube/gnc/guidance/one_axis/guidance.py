@@ -1,7 +1,7 @@
-"""Guidance about one axis: accepts or rejects plans, follows the last accepted path, then holds its end.
+"""Guidance about one axis: checks plans, follows the last accepted path and then holds the end attitude.
 
 A plan is rejected, with its reason, when it is late, not finite, beyond the limits, out of order, for another
-target, or does not start at the estimated state. A rejected plan changes nothing.
+target, or does not start at the estimated state. A rejected plan does not change the commanded motion.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from knightcube.gnc.guidance.one_axis.vmc import StepPlan
 
 _CHECKED_POINTS = 600
 _SAME = 1e-6
-"""Largest accepted difference between the end of a path and the target, in q2 and in rate (rad/s)."""
+"""Largest accepted differences between the end of a path and the target, in the quaternion component q2 and
+in rate (rad/s)."""
 
 
 class GuidanceState(StrEnum):
@@ -40,7 +41,7 @@ class AcceptanceRules:
     """The conditions for the acceptance of a plan.
 
     Attributes:
-        late_after: longest accepted time from a plan's origin to its arrival, s.
+        late_after: longest accepted time from the start of a plan's path to the arrival of the plan, s.
         angle_tolerance: largest difference between the start angle of a plan and the estimated angle, rad.
         rate_tolerance: largest difference between the start rate of a plan and the estimated rate, rad/s.
         q2_limit: upper bound of |q2|; a relative excess of 1e-3 is accepted.
@@ -75,8 +76,8 @@ class PathGuidance:
     def __init__(self, plant: SingleAxisPlant, rules: AcceptanceRules, arrives: bool = True) -> None:
         """Create a guidance that checks plans against `plant` and the limits.
 
-        With `arrives`, paths must end at the target, which is then held. Without it, on a receding horizon, a
-        path that ends means that later plans are missing.
+        If `arrives` is true, paths must end at the target attitude, which is then held. If `arrives` is
+        false, the horizon recedes, and a path is only followed to the end if later plans are missing.
         """
         self._plant = plant
         self._rules = rules
@@ -89,12 +90,12 @@ class PathGuidance:
 
     @property
     def target_q2(self) -> float | None:
-        """The target attitude as q2; None before the first target."""
+        """The target attitude as quaternion component q2, or None before the first target."""
         return self._target_q2
 
     @property
     def path(self) -> PolynomialPath | None:
-        """The path that is being followed, or whose end is being held; None without one."""
+        """The path that is followed, or whose end attitude is held; None without one."""
         return self._path
 
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
@@ -136,8 +137,8 @@ class PathGuidance:
     ) -> PlanVerdict:
         """Follow `plan` from `origin_ns` if it satisfies the acceptance rules.
 
-        The estimated angle (rad) and rate (rad/s) are those at the origin of the plan. The current limit is
-        checked for the estimated `disturbance` (rad/s^2).
+        The arguments `angle` (rad) and `rate` (rad/s) are estimates for the start of the path. The current
+        limit is checked for the estimated `disturbance` (rad/s^2).
         """
         reason = (
             self._untimely(origin_ns, now_ns)
@@ -152,7 +153,7 @@ class PathGuidance:
         return PlanVerdict(True)
 
     def sample(self, now_ns: int) -> PathSample | None:
-        """Return the commanded motion now; None without a path."""
+        """Return the commanded motion at `now_ns`; None without a path."""
         return None if self._path is None else self._path.sample(now_ns)
 
     def state(self, now_ns: int) -> GuidanceState:
@@ -166,7 +167,7 @@ class PathGuidance:
         return self.state(now_ns) is GuidanceState.FOLLOWING
 
     def is_adrift(self, now_ns: int) -> bool:
-        """Return whether another attitude than the target is held because no plan arrived in time."""
+        """Return whether an attitude other than the target is held because no plan arrived in time."""
         if self._path is None or not self._path.has_ended(now_ns):
             return False
         if not self._arrives:
@@ -208,7 +209,7 @@ class PathGuidance:
     def _unflyable(self, path: PolynomialPath, plant: SingleAxisPlant) -> str:
         if not (math.isfinite(path.horizon) and path.horizon > 0.0):
             return f"not finite: its horizon is {path.horizon} s"
-        # The check is made just before the end, because the hold begins at the end itself.
+        # The path is checked until just before the end, because a held attitude begins exactly at the end.
         times = path.horizon * np.linspace(0.0, 1.0 - 1e-12, _CHECKED_POINTS)
         angle, rate, acceleration = path.motion(times)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):

@@ -1,21 +1,21 @@
-"""The single-axis plant, its coil power, and paths of its angle in time.
+"""The single-axis plant, the power of the coil, and polynomial paths of the angle.
 
 The plant is a rigid body on a thread, rotated by one torque coil in a fixed horizontal field. The equation of
 motion is Sease 2013, eq. (5.4), with the thread and a constant disturbance d added: J (w' - d) = n A B I
-cos(theta) - k theta - c w. Here theta is the angle about the thread and q2 = sin(theta/2). Planner, tracker
-and estimator share these relations, so that the tracker can follow the planned path. Functions with singular
-names (`current`) take floats and use `math` because they run in the 40 Hz loop; functions with plural names
-(`currents`) take arrays of one shape.
+cos(theta) - k theta - c w. In this equation theta is the angle about the thread, from which q2 =
+sin(theta/2). Planner, tracker and estimator use the same equations of motion, so that the tracker can follow
+the planned path. Functions with singular names (`current`) take floats and use `math` because they run in the
+40 Hz loop; functions with plural names (`currents`) take arrays of one shape.
 
 The coils are driven by pulse-width modulation with a period of 20 ms (Sease thesis, chapter 5). The time
 constant L/R of a coil, 0.1 ms, is short compared with the period, so a coil carries V/R while the H-bridge
-drives it, and otherwise no current. For a mean current I the supply delivers V |I| with V = R Imax, which the
-coil converts to heat. The cost R I^2 of Sease, eq. (5.1), is the heat of a steady current, which equals V |I|
+drives it, and otherwise no current. For a mean current I the supply delivers the power V |I| with V = R Imax,
+which heats the coil. The cost R I^2 of Sease, eq. (5.1), is the heat of a steady current, which equals V |I|
 times the duty cycle.
 
 The pseudospectral discretisation is that of Sease, eq. (5.8). The n nodes are -1, 1 and the roots of P'(x),
 where P is the Legendre polynomial of degree n - 1. Quadrature on the nodes is exact up to degree 2n - 3, and
-the differentiation matrix up to degree n - 1. A path is one polynomial in time of q2. Angle, rate and
+the differentiation matrix up to degree n - 1. A path is a single polynomial q2(t) of time. Angle, rate and
 acceleration follow exactly from q2 (Sease, eqs. (5.9) and (5.13), corrected), so the planner's limits also
 hold between the nodes. After its end, a path holds the last attitude, or continues at the end rate up to the
 angle where the coil loses its torque.
@@ -62,22 +62,22 @@ Q2_LIMIT = 0.68
 
 
 SQUARE_Q2_WITHOUT_AUTHORITY = 0.5
-"""Value of q2^2 at which the coil's axis lies along the field and cos(theta) = 1 - 2 q2^2 is zero (Sease, eq.
-(5.15), corrected)."""
+"""Value of q2^2 at which the axis of the coil is parallel to the field and cos(theta) = 1 - 2 q2^2 is zero
+(Sease, eq. (5.15), corrected)."""
 
 
 @dataclass(frozen=True, slots=True)
 class SingleAxisPlant:
-    """The constants of the motion about the thread.
+    """The parameters of the equation of motion about the thread.
 
     Attributes:
         inertia: J, kg m^2.
         torque_constant: torque per current n A B of the coil at theta = 0, N m/A.
-        resistance: of the coil, ohm.
-        current_limit: largest |I|, A.
-        stiffness: k of the thread, N m/rad.
+        resistance: resistance of the coil, ohm.
+        current_limit: largest absolute value of the coil current, A.
+        stiffness: torsional stiffness k of the thread, N m/rad.
         damping: c, N m s/rad.
-        disturbance: estimated angular acceleration d that the other terms do not explain, rad/s^2.
+        disturbance: estimated constant angular acceleration d in addition to the modelled torques, rad/s^2.
     """
 
     inertia: float
@@ -89,7 +89,7 @@ class SingleAxisPlant:
     disturbance: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raise UsageError for constants out of range."""
+        """Raise UsageError for parameters out of range."""
         for name in ("inertia", "torque_constant", "resistance", "current_limit"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -122,7 +122,7 @@ class SingleAxisPlant:
 
 
 def angle_of(q2: float) -> float:
-    """Return theta = 2 asin(q2) in rad."""
+    """Return the angle theta = 2 asin(q2), rad."""
     return 2.0 * math.asin(q2)
 
 
@@ -142,7 +142,7 @@ def q2_rate_of(q2: float, rate: float) -> float:
 
 
 def acceleration_of(q2: float, q2_rate: float, q2_acceleration: float) -> float:
-    """Return w' = 2 q2''/u + 2 q2 q2'^2/u^3 in rad/s^2, where u = sqrt(1 - q2^2)."""
+    """Return the acceleration w' = 2 q2''/u + 2 q2 q2'^2/u^3, rad/s^2, where u = sqrt(1 - q2^2)."""
     square = 1.0 - q2 * q2
     return 2.0 * (q2_acceleration + q2 * q2_rate * q2_rate / square) / math.sqrt(square)
 
@@ -150,7 +150,7 @@ def acceleration_of(q2: float, q2_rate: float, q2_acceleration: float) -> float:
 def motion_of(
     q2: FloatArray, q2_rate: FloatArray, q2_acceleration: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return theta, w and w' (n,) from q2 and its first two time derivatives (n,)."""
+    """Return angles, rates and accelerations (n,) from q2 (n,) and the first two time derivatives of q2."""
     square = 1.0 - q2 * q2
     root = np.sqrt(square)
     acceleration = 2.0 * (q2_acceleration + q2 * q2_rate * q2_rate / square) / root
@@ -160,7 +160,7 @@ def motion_of(
 def current_and_slopes(
     plant: SingleAxisPlant, q2: FloatArray, q2_rate: FloatArray, q2_acceleration: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the current (n,) in A and its partial derivatives by q2, q2' and q2'' (n,) each.
+    """Return the currents (n,), A, and the partial derivatives (n,) of the current by q2, q2' and q2''.
 
     The current follows from Sease, eq. (5.6), with the exact w' and with the torques of thread and
     disturbance.
@@ -219,12 +219,12 @@ class PathCost(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LglRule:
-    """Nodes with quadrature weights and differentiation matrix, as read-only arrays.
+    """Legendre-Gauss-Lobatto nodes with quadrature weights and differentiation matrix.
 
     Attributes:
-        nodes: nodes (n,) in ascending order from -1 to 1.
+        nodes: Legendre-Gauss-Lobatto nodes (n,) in ascending order from -1 to 1.
         weights: quadrature weights (n,), whose sum is 2.
-        differentiation: matrix (n, n) from values to derivatives on the nodes.
+        differentiation: matrix (n, n) that maps values on the nodes to derivatives on the nodes.
         barycentric: weights (n,) of barycentric Lagrange interpolation through the nodes.
     """
 
@@ -234,7 +234,7 @@ class LglRule:
     barycentric: FloatArray
 
     def interpolation(self, points: FloatArray) -> FloatArray:
-        """Return the matrix (m, n) from values on the nodes to values at `points` (m,) in [-1, 1]."""
+        """Return the matrix (m, n) that maps values on the nodes to values at `points` (m,) in [-1, 1]."""
         difference = np.asarray(points, dtype=float)[:, None] - self.nodes
         hit = difference == 0.0
         terms = self.barycentric / np.where(hit, 1.0, difference)
@@ -244,7 +244,7 @@ class LglRule:
 
 @lru_cache(maxsize=32)
 def lgl_rule(count: int) -> LglRule:
-    """Return the rule of `count` nodes.
+    """Return the Legendre-Gauss-Lobatto rule with `count` nodes.
 
     Raises UsageError for fewer than two nodes.
     """
@@ -273,7 +273,7 @@ def lgl_rule(count: int) -> LglRule:
 
 @dataclass(frozen=True, slots=True)
 class CubicPrey:
-    """The cubic q_p(t) = C0 + C1 t + C2 t^2 + C3 t^3, with t in s (Sease, eq. (5.35))."""
+    """The cubic prey path q_p(t) = C0 + C1 t + C2 t^2 + C3 t^3, with t in s (Sease, eq. (5.35))."""
 
     c0: float
     c1: float
@@ -284,22 +284,22 @@ class CubicPrey:
     def between(
         cls, start: float, start_slope: float, end: float, end_slope: float, horizon: float
     ) -> CubicPrey:
-        """Return the cubic from `start` to `end` in `horizon` s with end slopes q2' (1/s)."""
+        """Return the cubic from `start` to `end` in `horizon` s with given slopes q2' (1/s) at both ends."""
         c2 = (3.0 * (end - start) - (2.0 * start_slope + end_slope) * horizon) / horizon**2
         c3 = (end_slope - start_slope - 2.0 * c2 * horizon) / (3.0 * horizon**2)
         return cls(start, start_slope, c2, c3)
 
     def q2(self, time: FloatArray) -> FloatArray:
-        """Return q_p (n,) at `time` (n,) s (5.35)."""
+        """Return the prey path q_p (n,) at `time` (n,), s (Sease, eq. (5.35))."""
         return np.asarray(self.c0 + time * (self.c1 + time * (self.c2 + time * self.c3)))
 
     def q2_rate(self, time: FloatArray) -> FloatArray:
-        """Return q_p' (n,) in 1/s at `time` (n,) s (5.36)."""
+        """Return the derivative q_p' (n,), 1/s, of the prey path at `time` (n,), s (Sease, eq. (5.36))."""
         return np.asarray(self.c1 + time * (2.0 * self.c2 + time * 3.0 * self.c3))
 
 
 FARTHEST = angle_of(Q2_LIMIT)
-"""Largest angle (rad) up to which a path continues at its end rate."""
+"""Largest angle (rad) to which a path is continued at the end rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,7 +323,7 @@ class PathSample:
 
 @dataclass(frozen=True, slots=True)
 class PolynomialPath:
-    """A path that starts at `origin_ns` and lasts `horizon` s.
+    """A polynomial path of the angle that starts at `origin_ns` and lasts `horizon` s.
 
     Attributes:
         origin_ns: monotonic time of the start of the path, ns.
@@ -343,9 +343,9 @@ class PolynomialPath:
     def through(
         cls, node_q2: FloatArray, horizon: float, origin_ns: int = 0, end_rate: float = 0.0
     ) -> PolynomialPath:
-        """Return the polynomial path through q2 (N,) on the N Legendre-Gauss-Lobatto nodes of `horizon` s.
+        """Return the polynomial path through the values q2 (N,) on N Legendre-Gauss-Lobatto nodes.
 
-        The path coasts at `end_rate` rad/s after the horizon.
+        After `horizon` s, the path continues at `end_rate` rad/s.
         """
         count = node_q2.size
         columns = np.zeros((count, 3))
@@ -361,15 +361,15 @@ class PolynomialPath:
         return cls(origin_ns, 0.0, (), angle)
 
     def starting_at(self, origin_ns: int) -> PolynomialPath:
-        """Return the same path, starting at `origin_ns`."""
+        """Return a copy of the path that starts at `origin_ns`."""
         return replace(self, origin_ns=origin_ns)
 
     def has_ended(self, now_ns: int) -> bool:
-        """Return whether the horizon has passed at `now_ns`."""
+        """Return whether the path has ended at `now_ns`."""
         return (now_ns - self.origin_ns) * 1e-9 >= self.horizon
 
     def sample(self, now_ns: int) -> PathSample:
-        """Return the commanded motion at `now_ns`: the start before the origin, a coast after the end."""
+        """Return the commanded motion at `now_ns`, which rests before the start and coasts after the end."""
         elapsed = (now_ns - self.origin_ns) * 1e-9
         if elapsed >= self.horizon:
             return self._coast(elapsed - self.horizon)
@@ -387,7 +387,7 @@ class PolynomialPath:
         return PathSample(angle_of(q2), rate_of(q2, q2_rate), acceleration_of(q2, q2_rate, q2_acceleration))
 
     def motion(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return theta, theta', theta'' (n,) at `times` (n,) s after the origin, NaN where |q2| > 1."""
+        """Return angle, rate and acceleration (n,) at `times` (n,), s after the start; NaN where |q2| > 1."""
         coasted = self.end_angle + self.end_rate * (times - self.horizon)
         farthest = max(FARTHEST, abs(self.end_angle))
         angle = np.clip(coasted, -farthest, farthest)
@@ -404,7 +404,7 @@ class PolynomialPath:
         return angle, rate, acceleration
 
     def _coast(self, since: float) -> PathSample:
-        """Return the commanded motion `since` seconds after the end of the path."""
+        """Return the commanded motion at `since` s after the end of the path."""
         angle = self.end_angle + self.end_rate * since
         farthest = max(FARTHEST, abs(self.end_angle))
         if abs(angle) > farthest:
@@ -414,5 +414,5 @@ class PolynomialPath:
 
 @lru_cache(maxsize=8)
 def _chebyshev_fit(count: int) -> FloatArray:
-    """Return the matrix (N, N) from values on N nodes to Chebyshev coefficients of the polynomial."""
+    """Return the matrix (N, N) that maps values on N nodes to Chebyshev coefficients of the polynomial."""
     return np.asarray(np.linalg.inv(chebyshev.chebvander(lgl_rule(count).nodes, count - 1)), dtype=float)

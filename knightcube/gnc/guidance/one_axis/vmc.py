@@ -1,17 +1,17 @@
-"""The planner of paths about one axis: minimum energy by virtual motion camouflage.
+"""The planner of minimum-energy paths about one axis by virtual motion camouflage.
 
 The method is that of Sease 2013, eqs. (5.8) to (5.15), corrected. NLopt optimises the free path control
-parameters under |I| <= Imax and |q2| <= a bound at every time. If no path over the requested horizon keeps
-the limits, the horizon is stretched to the shortest feasible one and the status of the plan is STRETCHED.
-With a time cost the horizon is optimised too. Energy is the integral of R I^2 in J, without the factor 1/2 of
-Sease, eq. (5.1).
+parameters under |I| <= Imax and |q2| <= a bound at every time. If no path over the requested horizon
+(duration) keeps the limits, the horizon is stretched to the shortest feasible horizon, and the plan has the
+status STRETCHED. With a time cost, the horizon is optimised as well. Energy is the integral of R I^2 in J,
+without the factor 1/2 of Sease, eq. (5.1).
 
 All three searches for a horizon minimise energy plus a time cost between a shortest and a longest horizon. If
 the time cost is far above the coil's power and the shortest horizon is the requested one, the solution is the
 requested horizon if a path over it keeps the limits, and otherwise the shortest feasible horizon. In this way
 no infeasible program has to be solved.
 
-The planner is pure and deterministic: the same arguments give the same plan in any process.
+The planner is deterministic, so that the same arguments give the same plan in any process.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ from knightcube.gnc.guidance.one_axis.vmc_program import (
 )
 
 ProgramAt = Callable[[float], PathProgram]
-"""Function from a horizon (s) to the nonlinear program that is whitened about the prey of this horizon."""
+"""Function from a horizon (s) to a nonlinear program whose variables are whitened about the prey path over
+this horizon."""
 
 SHORTEST_COST = 7.0
 """Time cost, in units of R Imax^2, with which the shortest horizon is found. An infinite cost would give the
@@ -63,7 +64,8 @@ _START_BELOW = 1.7
 _GROW_TO = 1.4
 _RETRY = 1.4
 ALONG_LIMIT = 0.99
-"""Ratio of a path's largest value to a limit, above which the path counts as running along the limit."""
+"""Ratio of the largest current or |q2| of a path to the limit above which the path counts as running along
+the limit."""
 _ATTEMPTS = 10
 _AT_BOUND = 1e-9
 _ANCHORS = (0.85, 0.7, 0.5, 0.35, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
@@ -75,12 +77,12 @@ _TIME_COST_CHANGE = 0.03
 
 @dataclass(slots=True)
 class HorizonSearch:
-    """A search for the horizon of a path.
+    """A search for a path and for the horizon (duration) of the path.
 
     Attributes:
-        program_at: builds programs.
-        warm: difference (N,) between an earlier path and its prey on the nodes, for a warm start; None to
-            start from the prey.
+        program_at: function that returns the nonlinear program for a horizon, s.
+        warm: difference (N,) on the nodes between an earlier path and the prey path of the earlier problem,
+            for a warm start; None to start from the prey path.
         evaluations: number of evaluations of the cost so far.
     """
 
@@ -125,12 +127,12 @@ class HorizonSearch:
     def with_time_cost(
         self, guess: float, shortest: float, longest: float, time_cost: float
     ) -> tuple[PathProgram, Trial | None]:
-        """Return the path of minimum energy plus `time_cost` W times its horizon, initially `guess` s.
+        """Return the path that minimises energy plus `time_cost` W times the horizon, from a `guess`, s.
 
-        The derivative of the minimum energy by the horizon is the partial derivative at the optimum over this
-        horizon. A tried horizon is a lower bound of the optimum if a longer horizon reduces the total cost,
-        otherwise an upper bound. The next horizon follows from E ~ 1/T^3, which holds for a slew without
-        limits. Only the last program imposes the limits.
+        The derivative of the minimum energy by the horizon equals the partial derivative at the optimal path
+        (envelope theorem). A tried horizon is a lower bound of the optimum if a longer horizon reduces the
+        total cost, otherwise an upper bound. The next horizon follows from E ~ 1/T^3, which holds for a slew
+        without limits. Only the last solution imposes the limits of current and angle.
         """
         low, high, time = shortest, longest, min(max(guess, shortest), longest)
         time_cost = min(time_cost, SHORTEST_COST * self.program_at(time).bang_power)
@@ -160,7 +162,7 @@ class HorizonSearch:
         return self.within(time, longest)
 
     def _at_requested(self, program: PathProgram, trial: Trial, asked: float) -> tuple[PathProgram, Trial]:
-        """Return a path over `asked` s instead of a slightly longer one, if there is such a path.
+        """Return a path over `asked` s instead of a slightly longer path, if a path over `asked` s exists.
 
         The search starts from the longer path.
         """
@@ -200,7 +202,7 @@ class HorizonSearch:
         return stretched or (failed, None)
 
     def over(self, time: float, apart: FloatArray | None) -> tuple[PathProgram, Trial | None]:
-        """Return the program over `time` s and a path within its limits, started at prey plus `apart`."""
+        """Return the program over `time` s, and a path within the limits found from prey plus `apart`."""
         program = self.program_at(time)
         trial = None if apart is None else program.limited(program.beside_prey(apart, time))
         if trial is None:
@@ -212,7 +214,7 @@ class HorizonSearch:
         return program, trial
 
     def _resumed(self, program: PathProgram, warm: FloatArray, asked: float, longest: float) -> Trial | None:
-        """Return the path found by a warm start; None if that fails.
+        """Return the path found by a warm start, or None if the warm start fails.
 
         If the earlier path ran along a limit, the limits are imposed at once.
         """
@@ -263,18 +265,19 @@ class PlanStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepPlan:
-    """A path and its properties.
+    """A planned path with energy, peak current and status.
 
     Attributes:
-        path: planned path, whose origin is zero until guidance starts it.
-        status: optimal at the requested horizon, or stretched to the shortest feasible one.
+        path: planned path, which starts at time zero until guidance sets the start time.
+        status: whether the requested horizon was kept or stretched to the shortest feasible horizon.
         horizon_asked, horizon: requested and planned duration, s; equal with a time cost.
         energy: integral of R I^2 along the path, J.
         supplied: integral of V |I| along the path, J.
-        peak_current: largest |I| on a dense grid, A.
+        peak_current: largest absolute coil current along the path, A.
         evaluations: number of evaluations of the cost.
         target_q2: q2 at the end.
-        nu: path control parameters (N,) relative to the prey over `horizon`.
+        nu: path control parameters (N,) of virtual motion camouflage, relative to the prey path over
+            `horizon`.
         node_times: (N,) s.
         node_q2: (N,).
     """
@@ -321,9 +324,9 @@ def plan(
     feasible horizon on `nodes` nodes, and at most 1.5 % longer than the bang-bang time.
 
     With `time_cost` in W the path minimises energy plus time cost, over horizons from SHORTEST_WITH_TIME_COST
-    s to `max_stretch` times `horizon`; `horizon` is then the initial guess. `last` is the path followed until
-    now, with its origin relative to the new start. The remainder of this path is the initial guess. `cost`
-    selects the energy that is minimised.
+    s to `max_stretch` times `horizon`; `horizon` is then the initial guess. The path followed until now is
+    `last`, with an origin relative to the start of the new path. The remainder of this path is the initial
+    guess. `cost` selects the energy that is minimised.
 
     Raises PlanningError if an argument is not finite or outside its limits, or if no allowed horizon is
     feasible.
@@ -369,10 +372,12 @@ def plan(
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
-    """Return the difference (N,) on the nodes between the rest of `last` and its prey; None without a rest.
+    """Return the difference (N,) on the nodes between the rest of path `last` and the prey path of the rest.
 
-    Adding the difference to another prey gives a path between the boundary states of this prey, which need
-    not lie on `last`.
+    None without a rest.
+
+    The sum of this difference and another prey path is a path between the boundary states of the other prey
+    path, which need not lie on `last`.
     """
     if last is None:
         return None
@@ -381,7 +386,7 @@ def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
     if not 0.0 < left <= last.horizon:
         return None
     times = 0.5 * left * (lgl_rule(nodes).nodes + 1.0)
-    # The last time is just before the end of the path, because the coast begins at the end.
+    # The last sample is taken just before the end of the path, because the coast begins exactly at the end.
     angle, rate, _ = last.motion(elapsed + times * (1.0 - 1e-12))
     q2 = np.sin(0.5 * angle)
     slope = 0.5 * rate * np.cos(0.5 * angle)
@@ -399,7 +404,7 @@ def _assemble(
     evaluations: int,
     end_rate: float,
 ) -> StepPlan:
-    """Return the plan that belongs to a solution `trial` of the optimiser.
+    """Return the plan for a solution `trial` of the optimiser.
 
     Raises PlanningError if the path is not finite.
     """
@@ -463,9 +468,9 @@ def _check(
 
 @dataclass(frozen=True, slots=True)
 class PlanJob:
-    """A job of the planner's worker: a path between two states (q2 and rad/s) in `horizon` seconds.
+    """A planning job for a path between two states (q2 and rate, rad/s) in `horizon` s.
 
-    `number` counts the jobs; the path starts at `origin_ns`. `last` is the path followed until now, with its
+    The job has a `number`, and the path starts at `origin_ns`. The path followed until now is `last`, with an
     origin relative to `origin_ns`. The other attributes are arguments of `plan`.
     """
 
@@ -485,7 +490,10 @@ class PlanJob:
 
 
 def run(job: PlanJob) -> StepPlan:
-    """Return the plan for `job` (module-level, so that a worker can import it); raises PlanningError."""
+    """Return the plan for `job`.
+
+    Raises PlanningError. The function is at module level, so that a worker process can import it.
+    """
     return plan(
         job.plant,
         job.start_q2,

@@ -1,20 +1,20 @@
 """The nonlinear programs of virtual motion camouflage (Sease, eqs. (5.8) to (5.14)), solved with SLSQP.
 
-The paths are q2 = q_r + v (q_p - q_r) on N nodes, where q_p is the prey and q_r the reference point (Sease,
-eqs. (5.10) to (5.12)). A path is the polynomial of degree N - 1 through its node values, so q2', q2'' and the
-current are exact between nodes too. The path control parameter v is 1 at both ends; v_2 and v_(N-1) follow
-from the boundary rates by q' = D q at the ends (Sease, eq. (5.11), corrected). N - 4 path control parameters
-are free.
+A path has the values q2 = q_r + v (q_p - q_r) on N nodes, where q_p is the prey path and q_r the reference
+point (Sease, eqs. (5.10) to (5.12)). A path is the polynomial of degree N - 1 through its node values, so
+q2', q2'' and the current are exact between nodes too. The path control parameter v is 1 at both ends. The
+parameters v_2 and v_(N-1) follow from the boundary rates by q' = D q at the ends (Sease, eq. (5.11),
+corrected). N - 4 path control parameters are free.
 
-The prey is an affine function of the horizon T, and for a fixed prey the path is an affine function of v - 1.
-The paths are therefore written as prey(T) + M y. The columns of M are the changes that preserve the ends and
-their slopes, scaled by (q_p - q_r) and whitened. Every optimisation here thus has affine trajectories and
-well-conditioned variables.
+The prey path is an affine function of the horizon T, and for a fixed prey path the path is an affine function
+of v - 1. Paths are therefore parametrised as prey(T) + M y with parameters y. The columns of M are whitened
+changes of a path, scaled by (q_p - q_r), that preserve the values and slopes at both ends. Trajectories are
+therefore affine functions of the optimisation variables, and the variables are well conditioned.
 
 Two programs share cost and limits: minimum energy at a fixed horizon, and minimum energy plus the time cost
-of the horizon. The limits hold at every time and not only at the nodes. They are imposed at the points of a
-dense grid at which the previous solution exceeded them, until no point exceeds them (the exchange method of
-semi-infinite programming).
+of the horizon. The limits hold at every time and not only at the nodes. The limits are imposed at those
+points of a dense grid at which the previous solution exceeded a limit, until no limit is exceeded (the
+exchange method of semi-infinite programming).
 """
 
 from __future__ import annotations
@@ -42,36 +42,36 @@ DENSE_POINTS = 769
 
 @dataclass(frozen=True, slots=True)
 class SamplePoints:
-    """Points (m,) at which paths are evaluated, with matrices (3, m, N) from nodes to q2 and derivatives."""
+    """Points (m,) at which paths are evaluated, with matrices (3, m, N) that give q2, q2' and q2'' there."""
 
     points: FloatArray
     matrices: FloatArray
 
     @classmethod
     def at(cls, rule: LglRule, points: FloatArray) -> SamplePoints:
-        """Return the samples of polynomials on `rule` at `points` (m,) in [-1, 1]."""
+        """Return the matrices for `points` (m,) in [-1, 1] and polynomials on the nodes of `rule`."""
         value = rule.interpolation(points)
         slope = value @ rule.differentiation
         return cls(points, np.stack([value, slope, slope @ rule.differentiation]))
 
     def take(self, index: IntArray) -> SamplePoints:
-        """Return the samples at the points with the indices `index`."""
+        """Return the evaluation matrices at those points that have the indices `index`."""
         return SamplePoints(self.points[index], self.matrices[:, index])
 
 
 @dataclass(frozen=True, slots=True)
 class Discretisation:
-    """Matrices that depend only on the number of nodes.
+    """Matrices of the pseudospectral discretisation, which depend only on the number of nodes.
 
     Attributes:
         rule: the N nodes.
-        cost: samples on the 2 N nodes on which the energy is integrated. With only N nodes, the optimiser
-            would exploit the quadrature error, because I^2 has about twice the degree of the path.
+        cost: evaluation matrices on the 2 N nodes on which the energy is integrated. With only N nodes, the
+            optimiser would exploit the quadrature error, because I^2 has about twice the degree of the path.
         cost_weights: quadrature weights (2 N,) of the energy, whose sum is 2.
-        dense: samples at which the limits are checked, denser towards the ends like the extrema of
-            polynomials.
-        free: matrix (N, N - 4) from changes at the free nodes to changes at all nodes that keep the ends and
-            end slopes.
+        dense: evaluation matrices at the points at which limits are checked; the points are denser towards
+            the ends, like the extrema of polynomials.
+        free: matrix (N, N - 4) that maps changes at the free nodes to changes at all nodes that preserve
+            values and slopes at both ends.
     """
 
     rule: LglRule
@@ -108,19 +108,19 @@ class BoundaryStates:
     end_slope: float
 
     def prey(self, horizon: float) -> CubicPrey:
-        """Return the prey path over `horizon` s."""
+        """Return the cubic prey path between the boundary states over `horizon` s."""
         return CubicPrey.between(self.start, self.start_slope, self.end, self.end_slope, horizon)
 
 
 @dataclass(frozen=True, slots=True)
 class PathFamily:
-    """The family of paths between two states on N nodes, still + T * drift + basis @ y with parameters y.
+    """The family of paths between two states on N nodes: still + T * drift + basis @ y for parameters y.
 
     Attributes:
-        grid: the discretisation.
-        still: prey (N,) with zero end slopes, which does not depend on the horizon.
-        drift: change (N,) of the prey per second of horizon, due to its end slopes.
-        basis: change of the node values for each parameter (N, N - 4).
+        grid: pseudospectral discretisation of the paths.
+        still: part (N,) of the prey path with zero slopes at both ends, which does not depend on the horizon.
+        drift: change (N,) of the prey path per second of horizon, due to the slopes at both ends.
+        basis: change (N, N - 4) of the values on the nodes per unit of each parameter.
     """
 
     grid: Discretisation
@@ -130,7 +130,7 @@ class PathFamily:
 
     @classmethod
     def around(cls, boundary: BoundaryStates, horizon: float, reference: float, count: int) -> PathFamily:
-        """Return the family with y = v - 1 on the free nodes, v measured against the prey over `horizon`."""
+        """Return the family with parameters y = v - 1 on the free nodes, for the prey path over `horizon`."""
         grid = discretisation(count)
         fraction = 0.5 * (grid.rule.nodes + 1.0)
         still = CubicPrey.between(boundary.start, 0.0, boundary.end, 0.0, 1.0).q2(fraction)
@@ -145,52 +145,54 @@ class PathFamily:
 
     @property
     def farthest_end(self) -> float:
-        """The larger |q2| of the two ends of the paths."""
+        """The larger absolute value of q2 at the two ends of the paths."""
         return float(np.abs(self.still[[0, -1]]).max())
 
     def remixed(self, mixing: FloatArray) -> PathFamily:
-        """Return the same paths under new parameters: y_old = mixing @ y_new, mixing (N - 4, N - 4)."""
+        """Return the family with new parameters y_new, where y_old = mixing (N - 4, N - 4) @ y_new."""
         return PathFamily(self.grid, self.still, self.drift, self.basis @ mixing)
 
     def nodes(self, parameters: FloatArray, horizon: float) -> FloatArray:
-        """Return q2 on the nodes (N,)."""
+        """Return the values q2 (N,) of a path on the nodes."""
         return np.asarray(self.still + horizon * self.drift + self.basis @ parameters)
 
     def observed(self, samples: SamplePoints) -> ObservedFamily:
-        """Return the family of paths evaluated at `samples`."""
+        """Return the family of paths evaluated at the points of `samples`."""
         matrices = samples.matrices
         return ObservedFamily(matrices @ self.still, matrices @ self.drift, matrices @ self.basis)
 
 
 @dataclass(frozen=True, slots=True)
 class ObservedFamily:
-    """A family of paths evaluated at m points: q2, dq2/ds and d2q2/ds2, affine in horizon and parameters."""
+    """A path family at m points, with q2, dq2/ds and d2q2/ds2 affine in horizon and parameters."""
 
     still: FloatArray
     drift: FloatArray
     basis: FloatArray
 
     def trajectory(self, parameters: FloatArray, horizon: float) -> FloatArray:
-        """Return q2, q2' (1/s) and q2'' (1/s^2) as an array (3, m)."""
+        """Return q2, q2' (1/s) and q2'' (1/s^2) of a path at the m points, as an array (3, m)."""
         return time_scale(horizon) * (self.still + horizon * self.drift + self.basis @ parameters)
 
     def aging(self, trajectory: FloatArray, horizon: float) -> FloatArray:
-        """Return the derivative of `trajectory` (3, m) with respect to the horizon.
+        """Return the derivative (3, m) of q2, q2' and q2'' with respect to the horizon.
 
-        A longer horizon changes the prey and lowers the factors from s-derivatives to time derivatives.
+        A longer horizon changes the prey path, and reduces the factors that convert derivatives by s to time
+        derivatives.
         """
         slower = np.array([[0.0], [-1.0], [-2.0]]) / (horizon * time_scale(horizon))
         return np.asarray(self.drift + slower * trajectory)
 
 
 def time_scale(horizon: float) -> FloatArray:
-    """Return the factors (3, 1) from derivatives by s in [-1, 1] to time derivatives over `horizon` s."""
+    """Return the factors (3, 1) that convert derivatives by s in [-1, 1] to time derivatives."""
     per_second = 2.0 / horizon
     return np.array([[1.0], [per_second], [per_second * per_second]])
 
 
 LIMIT_TOLERANCE = 3e-4
-"""Largest accepted relative excess over a limit on the dense grid; between its points it stays below 1e-3."""
+"""Largest accepted relative excess over a limit on the dense grid. Between the grid points, the relative
+excess then stays below 1e-3."""
 
 IMPOSED_MARGIN = 2e-4
 """Relative margin by which an imposed limit is tightened, so that peaks between the imposed points keep the
@@ -208,7 +210,7 @@ _IMPOSE_EVERY = 16
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A point of the search space: the parameters (N - 4,) of a path and its horizon (s)."""
+    """A point of the search space: the parameters (N - 4,) of a path and the horizon (s) of the path."""
 
     parameters: FloatArray
     horizon: float
@@ -216,7 +218,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class FreeHorizon:
-    """Settings of a program that also optimises the horizon: bounds (s) and time cost (W)."""
+    """Settings for optimising the horizon as well: bounds of the horizon (s) and time cost (W)."""
 
     shortest: float
     longest: float
@@ -225,7 +227,7 @@ class FreeHorizon:
 
 @dataclass(frozen=True, slots=True)
 class ImposedLimits:
-    """The imposed limits (m,): index on the dense grid, sign, and whether q2 or the current is limited."""
+    """The m imposed limits: index on the dense grid, sign, and whether q2 or the current is limited."""
 
     index: IntArray
     sign: FloatArray
@@ -233,19 +235,21 @@ class ImposedLimits:
 
     @classmethod
     def at(cls, chosen: BoolArray, ratios: FloatArray) -> ImposedLimits:
-        """Return the limits at the `chosen` points (2, dense).
+        """Return the limits to impose at the points that the mask `chosen` (2, dense) selects.
 
-        Row 0 is the limit of the current and row 1 that of q2, each with the sign of `ratios` (2, dense).
+        The first row selects limits of the current and the second row limits of q2. The signs of `ratios` (2,
+        dense) tell whether the upper or the lower limit is imposed.
         """
         row, index = np.nonzero(chosen)
         return cls(index, np.sign(ratios[row, index]), row == 1)
 
 
 class PathProgram:
-    """The program of one plant and one family of paths between two states, with cost and limits.
+    """The nonlinear program for a plant and a family of paths between two states, with cost and limits.
 
     Attributes:
-        family: paths between the two states, whitened about the prey at the given horizon.
+        family: paths between the two states, with parameters whitened about the prey path over the given
+            horizon.
         evaluations: number of evaluations of the cost, over all solutions.
     """
 
@@ -259,10 +263,10 @@ class PathProgram:
     ) -> None:
         self._plant = plant
         self._cost = cost
-        # The ends are given, and an end at the limit leaves no margin.
+        # The ends of the path are given, so an end close to the limit of q2 reduces the margin.
         self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * family.farthest_end)
-        # An iterate may pass the singularity at |q2| = 0.707.
-        # Above its limit, q2 is clamped so that the current stays finite.
+        # Iterates of the optimiser may exceed |q2| = 0.707, where the computed current is infinite.
+        # A value of q2 above the limit is clamped, so that the current stays finite.
         self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
         self._weights = 0.5 * family.grid.cost_weights
         self._bang = plant.resistance * plant.current_limit**2
@@ -281,13 +285,14 @@ class PathProgram:
         return self._bang
 
     def prey(self, horizon: float) -> Trial:
-        """Return the prey over `horizon` s, which is the path with all path control parameters one."""
+        """Return the prey path over `horizon` s, for which all path control parameters are one."""
         return Trial(np.zeros(self.family.size), horizon)
 
     def _whitened(self, family: PathFamily, horizon: float) -> PathFamily:
-        """Return the family whose Gauss-Newton Hessian of the energy at the prey is the unit matrix.
+        """Return the family with parameters in which the energy has a unit Gauss-Newton Hessian.
 
-        SLSQP starts from the unit matrix, so its first step is the Gauss-Newton step.
+        SLSQP starts with a unit matrix as Hessian, so the first step is the Gauss-Newton step at the prey
+        path.
         """
         observed = family.observed(family.grid.cost)
         prey = observed.trajectory(np.zeros(family.size), horizon)
@@ -297,7 +302,7 @@ class PathProgram:
         return family.remixed(np.linalg.inv(np.linalg.qr(jacobian, mode="r")))
 
     def _current(self, trajectory: FloatArray, horizon: float) -> tuple[FloatArray, FloatArray]:
-        """Return the current (m,) and its slopes (3, m) by q2 and its s-derivatives."""
+        """Return currents (m,) and the derivatives (3, m) of the current by q2, dq2/ds and d2q2/ds2."""
         q2 = trajectory[0]
         held = np.minimum(np.maximum(q2, -self._q2_cap), self._q2_cap)
         current, *slopes = current_and_slopes(self._plant, held, trajectory[1], trajectory[2])
@@ -307,7 +312,7 @@ class PathProgram:
         return current, stacked
 
     def energy(self, trial: Trial) -> tuple[float, FloatArray, float]:
-        """Return the integral of the power in J, its gradient (N - 4,), and its derivative by the horizon.
+        """Return the energy (J), the gradient (N - 4,) of the energy, and the derivative by the horizon.
 
         For heat, the integral is that of Sease, eq. (5.8), without the factor 1/2 of eq. (5.1).
         """
@@ -330,7 +335,7 @@ class PathProgram:
     def excess(
         self, limits: ImposedLimits, points: ObservedFamily, trial: Trial
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return excesses (m,) over the limits, gradients (m, N - 4) and derivatives (m,) by the horizon."""
+        """Return excesses (m,) over limits, with gradients (m, N - 4) and derivatives (m,) by horizon."""
         trajectory = points.trajectory(trial.parameters, trial.horizon)
         current, slopes = self._current(trajectory, trial.horizon)
         value = np.where(limits.is_q2, trajectory[0] / self._q2_limit, current / self._plant.current_limit)
@@ -341,18 +346,18 @@ class PathProgram:
         return limits.sign * value - 1.0, _contract(slopes, points.basis), aged
 
     def ratios(self, trial: Trial) -> FloatArray:
-        """Return the signed ratios (2, dense) of current and q2 to their limits on the dense grid."""
+        """Return current and q2 on the dense grid, divided by the limits, as an array (2, dense)."""
         nodes = self.family.nodes(trial.parameters, trial.horizon)
         trajectory = time_scale(trial.horizon) * (self.family.grid.dense.matrices @ nodes)
         current, _ = self._current(trajectory, trial.horizon)
         return np.stack([current / self._plant.current_limit, trajectory[0] / self._q2_limit])
 
     def beside_prey(self, apart: FloatArray, horizon: float) -> Trial:
-        """Return the path that differs by `apart` (N,) from the prey on the nodes; its ends stay the same."""
+        """Return the path between the same ends that differs by `apart` (N,) from the prey path."""
         return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
 
     def from_prey(self, trial: Trial) -> FloatArray:
-        """Return the difference (N,) of a path from its prey on the nodes, as `beside_prey` takes it."""
+        """Return the difference (N,) on the nodes between a path and the prey path over its horizon."""
         return np.asarray(self.family.basis @ trial.parameters)
 
     def unlimited(self, start: Trial) -> Trial | None:
@@ -364,14 +369,14 @@ class PathProgram:
         if converged:
             return trial
         # If the start is the optimum, NLopt reports that rounding limits progress, which is not a failure.
-        # In this case half the square of the whitened gradient, the remaining energy saving, is small.
+        # At the optimum, the energy that can still be saved, half the squared whitened gradient, is small.
         _, gradient, _ = self.energy(trial)
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 
     def limited(self, start: Trial, free: FreeHorizon | None = None) -> Trial | None:
         """Return the minimum-energy path within the limits, from `start`; None when none was found.
 
-        With `free` the horizon is free and its time cost is added to the energy.
+        If `free` is given, the horizon is optimised too, and the time cost is added to the energy.
         """
         ratios = self.ratios(start)
         every = np.arange(ratios.shape[1]) % _IMPOSE_EVERY == _IMPOSE_EVERY // 2
@@ -385,20 +390,20 @@ class PathProgram:
             if worst <= 1.0 + LIMIT_TOLERANCE:
                 return trial if converged else None
             if not math.isfinite(worst) or np.any(np.abs(latest[chosen]) > 1.0 + LIMIT_TOLERANCE):
-                return None  # an imposed limit is still exceeded
+                return None  # the optimiser has not satisfied an imposed limit
             added = _peaks(latest) & ~chosen
             ratios = np.where(added, latest, ratios)
             chosen = chosen | added
         return None
 
     def _energy_tolerance(self, horizon: float) -> float:
-        """Return the tolerance of the energy (J), which is 1e-8 of the energy at the current limit."""
+        """Return the tolerance of the energy (J): 1e-8 of the energy that the largest current takes."""
         return 1e-8 * self._bang * horizon
 
     def _minimise(
         self, start: Trial, limits: ImposedLimits | None, free: FreeHorizon | None
     ) -> tuple[Trial, bool]:
-        """Run SLSQP once from `start`; return where it ended, and whether it converged."""
+        """Run SLSQP once from `start`, and return the final point and whether the run converged."""
         variables = _Variables(start, self.family.size, free)
         size, time_cost = variables.size, variables.time_cost
         last = variables.first
@@ -427,7 +432,7 @@ class PathProgram:
         try:
             found = np.asarray(solver.optimize(last))
         except _SOLVER_STOPS:
-            # Trivial and infeasible problems end in this way, after a line search of negligible length.
+            # Trivial and infeasible problems raise this error, after a line search of negligible length.
             return variables.trial(last), False
         return variables.trial(found), solver.last_optimize_result() in _CONVERGED
 
@@ -448,14 +453,14 @@ class PathProgram:
 
 
 class _Variables:
-    """The variables of the optimiser: the path's parameters and, if the horizon is free, its logarithm.
+    """The variables of the optimiser: the parameters of the path and, if it is free, the scaled log horizon.
 
     The logarithm log(T/T0) is scaled so that the time cost has, like the whitened energy, a curvature of
     about one.
 
     Attributes:
-        first: the initial values.
-        root: the scale of the logarithm; zero for a fixed horizon.
+        first: initial values of the variables.
+        root: scale factor of the logarithm of the horizon; zero for a fixed horizon.
     """
 
     def __init__(self, start: Trial, size: int, free: FreeHorizon | None) -> None:
@@ -465,12 +470,12 @@ class _Variables:
         self.first = np.append(start.parameters, 0.0) if free else start.parameters
 
     def trial(self, x: FloatArray) -> Trial:
-        """Return parameters and horizon of a path from the variables of the optimiser."""
+        """Return the parameters and the horizon of the path that the variables `x` describe."""
         horizon = self.origin * math.exp(self.root * x[self.size]) if self.free else self.origin
         return Trial(x[: self.size].copy(), horizon)
 
     def bound(self, solver: nlopt.opt) -> None:
-        """Keep a free horizon within its bounds."""
+        """Set the bounds of a free horizon in the optimiser `solver`."""
         if self.free is not None:
             bounds = self.free.shortest, self.free.longest
             low, high = (math.log(bound / self.origin) / self.root for bound in bounds)

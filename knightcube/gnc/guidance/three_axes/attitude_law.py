@@ -1,10 +1,11 @@
 """Attitude laws: the commanded attitude as a function of time, from two directions or a pointing target.
 
-A law aligns one body axis with a first direction exactly, and a second body axis with a second direction as
-closely as the first allows (TRIAD: Black 1964). A direction is inertial, fixed in the orbital axes (nadir,
-velocity, normal), that of the Sun, or that of a point on the ground. For a free roll the second direction is
-taken from the attitude at the start. It is held fixed in the inertial or in the orbital axes, whichever the
-first direction belongs to, so that the body does not rotate about the first direction.
+An attitude law aligns one body axis exactly with a first direction, and a second body axis with a second
+direction as closely as possible (TRIAD: Black 1964). A direction can be fixed in inertial axes, fixed in the
+orbital axes (nadir, velocity, orbit normal), or point to the Sun or to a place on the ground. If the roll is
+free, the second direction follows from the attitude at the start of the law. The second direction is then
+fixed in the same axes, inertial or orbital, as the first direction, so that the body does not rotate about
+the first direction.
 
 The law of a pointing target aligns the pointing axis with the goal and the body axis `across` with a second
 direction: the velocity for goals below, nadir for the velocity itself, the celestial pole for the Sun. A
@@ -40,7 +41,7 @@ from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTar
 Direction = Callable[[Ephemeris, FloatArray], FloatArray]
 """Function from an ephemeris and times (n,) in s to unit vectors (n, 3), ICRS."""
 DIFFERENCE = 1.0
-"""Step of the central differences for rate and acceleration, s."""
+"""Time step of the central differences that give rate and acceleration, s."""
 MINIMUM_SINE = 1e-3
 """Smallest sine of the angle between the two directions; nearly parallel directions do not determine the
 roll."""
@@ -48,7 +49,10 @@ roll."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeReference:
-    """The commanded attitude (4,), rate (3,) rad/s and acceleration (3,) rad/s^2 at one time, in its axes."""
+    """The commanded attitude (4,), rate (3,), rad/s, and acceleration (3,), rad/s^2, at one time.
+
+    Rate and acceleration are in the axes of the commanded attitude.
+    """
 
     quaternion: FloatArray
     rate: FloatArray
@@ -72,14 +76,14 @@ class AttitudeReferences:
     acceleration: FloatArray
 
     def position(self, time: float) -> tuple[int, float]:
-        """Return the index of the instant before a time, s, and the fraction of the step since it."""
+        """Return the index of the last instant before a time, s, and the fraction of the step passed."""
         begin, step = float(self.times[0]), float(self.times[1] - self.times[0])
         position = (time - begin) / step
         k = min(max(math.floor(position), 0), len(self.times) - 2)
         return k, min(max(position - k, 0.0), 1.0)
 
     def at(self, time: float) -> AttitudeReference:
-        """Return the commanded motion at a time, s, clamped to the times."""
+        """Return the commanded motion at a time, s, which is clamped to the range of the given times."""
         k, share = self.position(time)
         near = k + round(share)
         since = (share - round(share)) * float(self.times[1] - self.times[0])
@@ -92,11 +96,11 @@ class AttitudeReferences:
         )
 
     def until(self, count: int) -> AttitudeReferences:
-        """Return the motion at the first `count` instants."""
+        """Return the commanded motion at the first `count` instants only."""
         return self._part(slice(count))
 
     def since(self, position: int) -> AttitudeReferences:
-        """Return the motion from the instant with the index `position` on."""
+        """Return the commanded motion without the instants before the index `position`."""
         return self._part(slice(position, None))
 
     def _part(self, part: slice) -> AttitudeReferences:
@@ -109,7 +113,7 @@ class AttitudeReferences:
 class AttitudeLaw:
     """A law that aligns body `axis` (3,) with `first`, and body axis `across` (3,) with `second`.
 
-    The second alignment is as close as the exact first alignment allows.
+    The alignment with `first` is exact, and the alignment with `second` is as close as possible.
     """
 
     axis: FloatArray
@@ -125,12 +129,11 @@ class AttitudeLaw:
 
 
 Attitudes = Callable[[Ephemeris, FloatArray], FloatArray]
-"""Function from an ephemeris and times (n,) s to commanded attitudes (n, 4): of an `AttitudeLaw` or an
-`approach`."""
+"""Function from an ephemeris and times (n,), s, to commanded attitudes (n, 4), such as an `AttitudeLaw`."""
 
 
 def references(attitudes: Attitudes, ephemeris: Ephemeris, times: FloatArray) -> AttitudeReferences:
-    """Return attitude, rate and acceleration at times (n,) s, by central differences over a second."""
+    """Return commanded attitudes, and rates and accelerations by central differences, at times (n,), s."""
     before, now, after = (attitudes(ephemeris, times + shift) for shift in (-DIFFERENCE, 0.0, DIFFERENCE))
     back = to_rotation_vector(multiply(before, conjugate(now)))
     ahead = to_rotation_vector(multiply(after, conjugate(now)))
@@ -138,27 +141,27 @@ def references(attitudes: Attitudes, ephemeris: Ephemeris, times: FloatArray) ->
 
 
 def nadir(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
-    """Return the directions (n, 3) of the Earth's centre."""
+    """Return the unit vectors (n, 3) from the satellite to the Earth's centre."""
     return _unit(-ephemeris.position_at(times))
 
 
 def velocity(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
-    """Return the directions (n, 3) of the inertial velocity."""
+    """Return the unit vectors (n, 3) along the inertial velocity."""
     return _unit(ephemeris.velocity_at(times))
 
 
 def orbit_normal(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
-    """Return the directions (n, 3) of the orbit's angular momentum."""
+    """Return the unit vectors (n, 3) along the angular momentum of the orbit."""
     return _unit(np.cross(ephemeris.position_at(times), ephemeris.velocity_at(times)))
 
 
 def sun(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
-    """Return the directions (n, 3) of the Sun."""
+    """Return the unit vectors (n, 3) to the Sun."""
     return ephemeris.sun_at(times)
 
 
 def inertial(vector: FloatArray) -> Direction:
-    """Return the law of an inertially fixed direction (3,)."""
+    """Return the function for a direction (3,) that is fixed in inertial axes."""
     fixed = _unit(np.asarray(vector, dtype=float))
 
     def at(_: Ephemeris, times: FloatArray) -> FloatArray:
@@ -168,7 +171,7 @@ def inertial(vector: FloatArray) -> Direction:
 
 
 def orbital(vector: FloatArray) -> Direction:
-    """Return the law of a direction (3,) fixed in the orbital axes: along-track, minus normal, nadir."""
+    """Return the function for a direction (3,) in orbital axes (along-track, minus normal, nadir)."""
     fixed = _unit(np.asarray(vector, dtype=float))
 
     def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
@@ -178,10 +181,10 @@ def orbital(vector: FloatArray) -> Direction:
 
 
 def ground(latitude: float, longitude: float, height: float = 0.0) -> Direction:
-    """Return the law of a point on the ground.
+    """Return the function for the direction to a point on the ground.
 
-    `latitude` and `longitude` are geodetic, rad; `height` is in m above WGS 84. Raises UsageError for values
-    out of range.
+    The geodetic coordinates are `latitude` and `longitude`, rad, and `height`, m above the WGS 84 ellipsoid.
+    Raises UsageError for values out of range.
     """
     if not (abs(latitude) <= 0.5 * np.pi and np.isfinite(longitude) and np.isfinite(height)):
         raise UsageError(
@@ -216,9 +219,10 @@ def free_roll(
 
 
 def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direction:
-    """Return the law of an object in `direction` (3,) at `since` s that moves on a straight line.
+    """Return the function for the direction to an object that moves on a straight line.
 
-    `velocity` (3,) 1/s is its relative velocity divided by its distance; zero for a fixed direction.
+    At the time `since`, s, the object is in `direction` (3,). The relative velocity of the object divided by
+    the distance is `velocity` (3,), 1/s, which is zero for a fixed direction.
     """
 
     def at(_: Ephemeris, times: FloatArray) -> FloatArray:
@@ -232,7 +236,7 @@ def following(
 ) -> AttitudeLaw:
     """Return the law that aligns `axis` (3,) with a `passing` object and does not rotate about `axis`.
 
-    The roll is that of the attitude (4,) after the shortest rotation of `axis` to `direction`.
+    The law starts with the attitude (4,) after the shortest rotation that aligns `axis` with `direction`.
     """
     shown = attitude_matrix(quaternion)
     normal = np.cross(direction, velocity)
@@ -246,10 +250,11 @@ def following(
 def approach(
     attitudes: Attitudes, quaternion: FloatArray, rate: FloatArray, begin: float, end: float
 ) -> Attitudes:
-    """Return the transition from an attitude (4,) and a body rate (3,) rad/s to a law.
+    """Return the commanded transition from an attitude (4,) and a body rate (3,), rad/s, to an attitude law.
 
-    The transition lasts from `begin` to `end` s. The remaining rotation is a quintic that starts with the
-    body's own rate and ends at rest relative to the law. Raises UsageError unless `end` is after `begin`.
+    The transition lasts from `begin` to `end` s. The rotation vector relative to the law is a quintic
+    polynomial of time, which starts with the rate of the body and ends at zero rate. Raises UsageError unless
+    `end` is after `begin`.
     """
     if not end > begin:
         raise UsageError(f"an approach from {begin} to {end} s: the end must be after the start")
@@ -260,12 +265,11 @@ def approach(
         left = to_rotation_vector(multiply(quaternion, conjugate(start[1])))
         law_rate = to_rotation_vector(multiply(start[2], conjugate(start[0]))) / (2.0 * DIFFERENCE)
         shown = attitude_matrix(from_rotation_vector(left)) @ law_rate
-        # The polynomial also covers times before the start, for central differences at the start.
+        # The polynomial is also evaluated before the start, because central differences at the start need it.
         share = np.minimum((np.asarray(times) - begin) / (end - begin), 1.0)[:, None]
         rest = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
         drift = (end - begin) * share * (1.0 - share) ** 3 * (1.0 + 3.0 * share)
-        # The inverse of the left Jacobian of the rotation group relates the relative rate to the derivative
-        # of `left`.
+        # The inverse left Jacobian of the rotation group gives the derivative of the rotation vector `left`.
         angle, relative = float(np.linalg.norm(left)), rate - shown
         second = 1.0 / 12.0 if angle < 1e-2 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
         crossed = np.cross(left, relative)
@@ -285,7 +289,7 @@ def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArra
     """Return `vector` (3,) rotated by the shortest rotation from unit vector `start` to `end`."""
     axis = np.cross(start, end)
     cosine = float(start @ end)
-    if cosine < -1.0 + 1e-9:  # opposite directions, for which any normal axis can be used
+    if cosine < -1.0 + 1e-9:  # opposite directions can be rotated about any axis normal to them
         return vector
     return np.asarray(cosine * vector + np.cross(axis, vector) + axis * (axis @ vector) / (1.0 + cosine))
 
@@ -313,12 +317,12 @@ def _unit(vector: FloatArray) -> FloatArray:
 
 
 POLE = inertial(np.array([0.0, 0.0, 1.0]))
-"""The Sun never comes within 66 deg of the celestial pole."""
+"""The Sun is always at least 66 deg from the celestial pole, so the two directions are never parallel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyAxes:
-    """The pointing axis (3,), and the axis (3,) `across` from which a given roll is measured."""
+    """The pointing axis (3,) of a body, and the body axis `across` (3,) from which a roll is measured."""
 
     pointing: FloatArray
     across: FloatArray
@@ -327,7 +331,7 @@ class BodyAxes:
 def law_of(
     target: PointingTarget, axes: BodyAxes, quaternion: FloatArray, ephemeris: Ephemeris, time: float
 ) -> Attitudes:
-    """Return the law of a target; a free roll is that of the attitude (4,) at `time` s of the ephemeris."""
+    """Return the attitude law of a target; a free roll follows from an attitude (4,) at `time`, s."""
     if target.goal is Goal.INERTIAL:
         fixed = normalise(np.array(target.numbers))
         return lambda _, times: np.broadcast_to(fixed, (len(times), 4))
@@ -339,7 +343,10 @@ def law_of(
 
 
 def directions_of(target: PointingTarget) -> tuple[Direction, Direction]:
-    """Return the direction of a goal, and the direction of zero roll. INERTIAL goals have neither."""
+    """Return the functions for the direction of a goal and for the direction that defines zero roll.
+
+    An INERTIAL goal has a quaternion instead of these directions.
+    """
     if target.goal is Goal.GROUND:
         return ground(*target.numbers), velocity
     return {

@@ -1,6 +1,7 @@
-"""Pointing targets: the goals that a configuration or a command can give a satellite.
+"""Pointing targets that a configuration or a command can give a satellite.
 
-A target is a plain value in configurations, packets and jobs. `attitude_law` computes its attitude law.
+A target is an immutable value that configurations, packets and jobs contain. The module `attitude_law`
+computes the attitude law of a target.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ from enum import IntEnum
 from knightcube.errors import UsageError
 
 _LENGTH = 1e-3
-"""Largest deviation of the length of a commanded quaternion from one."""
+"""Largest accepted deviation of the length of a commanded quaternion from one."""
 
 
 class Goal(IntEnum):
-    """The goals of pointing; the values are those of the command packet.
+    """The pointing goals, with the values that represent them in the command packet.
 
     NADIR, VELOCITY and SUN take no numbers, INERTIAL takes a quaternion, and GROUND takes latitude and
     longitude.
@@ -31,12 +32,12 @@ class Goal(IntEnum):
 
     @property
     def label(self) -> str:
-        """Name of the goal in messages, configurations and commands."""
+        """Name of the pointing goal in messages, configurations and commands."""
         return self.name.lower()
 
     @classmethod
     def named(cls, label: str) -> Goal:
-        """Return the goal of a label. Raises UsageError for an unknown label."""
+        """Return the pointing goal with the name `label`. Raises UsageError for an unknown name."""
         for goal in cls:
             if goal.label == label:
                 return goal
@@ -44,7 +45,7 @@ class Goal(IntEnum):
 
 
 NUMBERS = {Goal.INERTIAL: (4,), Goal.GROUND: (2,), Goal.OBJECT: (0, 2)}
-"""Permitted numbers of arguments of each goal, the largest last. Other goals have no arguments."""
+"""Permitted numbers of arguments for goals that have arguments, the largest number last."""
 ROLLS = {
     Goal.INERTIAL: "an inertial attitude has its roll in its quaternion",
     Goal.OBJECT: "an object is followed with a free roll",
@@ -58,11 +59,12 @@ class PointingTarget:
 
     Attributes:
         goal: what to point at.
-        numbers: arguments of the goal. INERTIAL has an attitude quaternion (4,), ICRS into body; GROUND has
-            latitude and longitude, rad; OBJECT has right ascension and declination, rad, of the field to
-            search, or no numbers for the present field of view. Other goals have no numbers.
-        roll: rotation about the pointing axis, rad; None leaves it free. For some goals a roll cannot be
-            given (`ROLLS`).
+        numbers: numerical arguments of the goal. The goal INERTIAL has an attitude quaternion (4,) from ICRS
+            into body axes. The goal GROUND has latitude and longitude, rad. The goal OBJECT has right
+            ascension and declination, rad, of the field to search, or no arguments for the present field of
+            view. Other goals have no arguments.
+        roll: rotation about the pointing axis, rad; None leaves it free. A roll cannot be given for the goals
+            in `ROLLS`.
     """
 
     goal: Goal
@@ -70,7 +72,7 @@ class PointingTarget:
     roll: float | None = None
 
     def __post_init__(self) -> None:
-        """Raise UsageError for values that define no attitude."""
+        """Raise UsageError for arguments that do not define an attitude."""
         wanted = NUMBERS.get(self.goal, (0,))
         if len(self.numbers) not in wanted:
             counts = " or ".join(map(str, wanted))
@@ -90,7 +92,7 @@ class PointingTarget:
 
     @property
     def text(self) -> str:
-        """The target as text, for events."""
+        """Description of the pointing target for event messages."""
         text = self.goal.label
         if self.goal is Goal.GROUND:
             text += " {:.4f} {:.4f} deg".format(*map(math.degrees, self.numbers))

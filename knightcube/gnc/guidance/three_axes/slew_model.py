@@ -1,23 +1,23 @@
-"""The task of a slew with coils: motion, path in time, end conditions, exclusion cones and environment.
+"""The task of the slew planner: equations of motion, end conditions, exclusion cones and environment.
 
-The state (7,) is attitude and body rate, the control (3,) the coils' dipole m. With the field b = A(q) B and
-    the direction of the position e = A(q) r in body axes, the motion is
+The state (7,) consists of attitude and body rate, and the control (3,) is the dipole moment m of the coils.
+With the field b = A(q) B and the direction of the position e = A(q) r in body axes, the motion is
 
     q' = 1/2 [w, 0] q,    J w' = (m + residual) x b + 3 mu / r^3 e x J e + d - w x J w
 
 where d is the sum of the torques of `knightcube.astro.earth.disturbance`: a constant torque in body axes, and
-the torques c x A(q) v by air and sunlight, which depend on the attitude. The torque has no component along
-the field, so only some paths are feasible. All derivatives are exact: A(q) v is a quadratic form of q, with
-Davenport's matrix as its curvature.
+the torques c x A(q) v by air and sunlight, which depend on the attitude. The torque of the coils has no
+component along the field, so not every path is feasible. All derivatives are analytic, because A(q) v is a
+quadratic form of q whose second derivatives are twice Davenport's matrix.
 
 Paths are cubic Hermite curves (de Boor 1978, ch. IV), evaluated here because scipy.interpolate would take 20
 MiB of memory in each process that flies or plans a slew.
 
 The end of a slew is an attitude, which gives three equations, or the direction of a boresight with a free
 roll, which gives two. The body rate at the end gives three more equations. All these equations are quadratic
-in the quaternion. An exclusion cone is a cone about a direction, such as the Sun's, that a body axis must not
-enter during the slew. Field, position, and the cones of Sun, Earth and Moon come from a predicted orbit.
-Times of a slew count from `begin`, s of the ephemeris.
+in the quaternion. An exclusion cone is a cone about a direction, such as the direction to the Sun, that a
+body axis must not enter during the slew. Field, position, and the cones of Sun, Earth and Moon are computed
+along a predicted orbit. Times of a slew count from `begin`, s of the ephemeris.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class SlewCraft:
         limit: dipole limit (3,) of each coil, A m^2.
         weights: heating power of each coil per squared dipole moment (3,), W/(A m^2)^2.
         residual: residual dipole moment (3,) of the satellite, A m^2.
-        torque, air, light: sizes (3,) of the constant, the air and the sunlight torque, N m.
+        torque, air, light: sizes (3,) of the torques that are constant, due to air, and due to sunlight, N m.
     """
 
     inertia: FloatArray
@@ -64,7 +64,7 @@ class SlewCraft:
     light: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def facing(self, sizes: FloatArray) -> SlewCraft:
-        """Return the satellite with disturbance torques of the given sizes (9,) N m."""
+        """Return the satellite model with disturbance torques of the given sizes (9,), N m."""
         return replace(self, torque=sizes[CONSTANT], air=sizes[AIR], light=sizes[LIGHT])
 
 
@@ -75,7 +75,7 @@ class SlewEnvironment:
     Attributes:
         field: (n, 3) T.
         position: (n, 3) m.
-        pressures: pressures of air and sunlight; None without torques by air and sunlight.
+        pressures: pressures of air and sunlight, or None if torques by air and sunlight are not modelled.
     """
 
     field: FloatArray
@@ -83,13 +83,13 @@ class SlewEnvironment:
     pressures: Pressures | None = None
 
     def part(self, which: IntArray) -> SlewEnvironment:
-        """Return the environment at the times with the indices `which`."""
+        """Return the environment at those times that have the indices `which`."""
         found = self.pressures
         pressed = None if found is None else Pressures(found.air[which], found.light[which])
         return SlewEnvironment(self.field[which], self.position[which], pressed)
 
     def gradient(self) -> tuple[FloatArray, FloatArray]:
-        """Return unit vectors (n, 3) of the position, and the gravity gradients 3 mu / r^3 (n,), 1/s^2."""
+        """Return unit vectors (n, 3) along the positions, and gravity gradients 3 mu / r^3 (n,), 1/s^2."""
         radius = np.linalg.norm(self.position, axis=1)
         return self.position / radius[:, None], 3.0 * GRAVITATIONAL_PARAMETER / radius**3
 
@@ -99,9 +99,9 @@ EnvironmentAt = Callable[[FloatArray], SlewEnvironment]
 
 
 def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the body components A(q) v (n, 3).
+    """Return the components A(q) v (n, 3) of vectors v in body axes.
 
-    If q is not a unit quaternion, they are proportional to |q|^2.
+    If q is not a unit quaternion, the components are multiplied by |q|^2.
     """
     v, s = q[:, :3], q[:, 3:]
     inner = np.sum(v * vector, axis=1, keepdims=True)
@@ -121,14 +121,15 @@ def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 class SlewDynamics:
-    """The motion of one satellite at n times, in units of `scale` s and of `unit` A m^2.
+    """The equations of motion of a satellite at n times, in units of `scale` s and of `unit` A m^2.
 
-    With z = (m + residual, b, e, w, q), where b and e are quadratic in q, all terms of x' except a constant
-    are quadratic in z: 1/2 z . H z. One matrix product therefore gives the derivatives at all times at once.
+    The state derivative x' is a constant plus the quadratic form 1/2 z . H z of z = (m + residual, b, e, w,
+    q), where b and e are quadratic in q. One matrix product therefore gives the derivatives at all times at
+    once.
     """
 
     def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
-        """Store the environment at the n times, with e scaled by the strength of the gravity gradient."""
+        """Store the environment at n times, with e scaled by the root of the gravity gradient."""
         self._residual = craft.residual / unit
         down, strength = around.gradient()
         vectors = np.stack(
@@ -147,11 +148,11 @@ class SlewDynamics:
             self._parts[:, part, columns] = np.eye(part.stop - part.start)
 
     def field(self, q: FloatArray) -> FloatArray:
-        """Return the field b (n, 3) at attitudes (n, 4), in the units of the motion and body axes."""
+        """Return the scaled magnetic field b (n, 3), body axes, at attitudes (n, 4)."""
         return np.asarray(0.5 * np.einsum("nijk,nj,nk->ni", self._forms[:, :3], q, q))
 
     def flow(self, x: FloatArray, m: FloatArray) -> FloatArray:
-        """Return x' (n, 7) at states (n, 7) and dipoles (n, 3)."""
+        """Return the time derivatives x' (n, 7) of states (n, 7) for dipoles (n, 3)."""
         z, _ = self._quantities(x, m)
         result = 0.5 * np.einsum("nij,nj->ni", self._steepness(z), z) + self._constant
         q = x[:, None, :4, None]
@@ -159,14 +160,14 @@ class SlewDynamics:
         return np.asarray(result)
 
     def slopes(self, x: FloatArray, m: FloatArray) -> FloatArray:
-        """Return the derivatives (n, 7, 10) of x' by the state and the dipole."""
+        """Return the derivatives (n, 7, 10) of the state derivatives x' by states and dipoles."""
         z, turned = self._quantities(x, m)
         result = self._steepness(z) @ self._by_unknowns(turned)
         result[:, 4:, :4] += (self._pushes @ x[:, None, :4, None])[:, :, :, 0]
         return np.asarray(result)
 
     def curvature(self, x: FloatArray, m: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the second derivative (n, 10, 10) of y . x' by state and dipole, for `y` (n, 7)."""
+        """Return the second derivatives (n, 10, 10) of y . x' by state and dipole, for weights `y` (n, 7)."""
         z, turned = self._quantities(x, m)
         bend = (y @ self._quadratic.reshape(7, -1)).reshape(-1, _Z, _Z)
         parts = self._by_unknowns(turned)
@@ -177,7 +178,7 @@ class SlewDynamics:
         return np.asarray(result)
 
     def _quantities(self, x: FloatArray, m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the vector z (n, 16), and the derivatives (n, 6, 4) of b and e by the attitude."""
+        """Return the vectors z (n, 16) of the class docstring, and derivatives (n, 6, 4) of b and e by q."""
         z, q = np.empty((len(x), _Z)), x[:, :4]
         turned = (self._forms.reshape(-1, 24, 4) @ q[:, :, None]).reshape(-1, 6, 4)
         z[:, _M], z[:, _W], z[:, _Q] = m + self._residual, x[:, 4:], q
@@ -185,11 +186,11 @@ class SlewDynamics:
         return z, turned
 
     def _steepness(self, z: FloatArray) -> FloatArray:
-        """Return the derivative (n, 7, 16) of x' by z."""
+        """Return the derivatives (n, 7, 16) of the state derivatives x' by the vectors z (n, 16)."""
         return np.asarray((z @ self._quadratic.reshape(-1, _Z).T).reshape(-1, 7, _Z))
 
     def _by_unknowns(self, turned: FloatArray) -> FloatArray:
-        """Return the derivative (n, 16, 10) of z by state and dipole.
+        """Return the derivatives (n, 16, 10) of the vectors z by states and dipoles.
 
         The next call overwrites the returned array.
         """
@@ -203,7 +204,7 @@ _ATTITUDE, _RATE, _DIPOLE = slice(0, 4), slice(4, 7), slice(7, 10)
 
 
 def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
-    """Return the second derivatives (n, 3, 4, 4) by the attitude of the accelerations by air and sunlight."""
+    """Return the second derivatives (n, 3, 4, 4) of air and sunlight accelerations by the attitude."""
     count = len(around.field)
     result = np.zeros((count, 3, 4, 4))
     if around.pressures is not None:
@@ -215,7 +216,7 @@ def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:
-    """Return the symmetric H (7, 16, 16): x' is 1/2 z . H z plus the constant torque's acceleration."""
+    """Return the symmetric matrices H (7, 16, 16) of the quadratic form 1/2 z . H z in x'."""
     result = np.zeros((7, _Z, _Z))
     crossed = -cross_matrices(_EYE3)  # crossed[i] . (a, c) is component i of a x c
     result[:3, _Q, _W][:, :3] = 0.5 * crossed
@@ -229,7 +230,7 @@ def _quadratic(inertia: FloatArray) -> FloatArray:
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a x b (n, 3); several times as fast as `np.cross`."""
+    """Return the cross products a x b (n, 3), several times as fast as `np.cross`."""
     return np.stack(
         [
             a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
@@ -244,7 +245,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 class HermiteCubic:
     """A curve through `values` (n, k) with `slopes` (n, k) at increasing `times` (n,), n > 1.
 
-    For times outside its range, the first or the last cubic is extrapolated.
+    At times outside the given range, the first or the last cubic is extrapolated.
     """
 
     times: FloatArray
@@ -252,19 +253,19 @@ class HermiteCubic:
     slopes: FloatArray
 
     def __call__(self, times: FloatArray) -> FloatArray:
-        """Return the values (m, k) at `times` (m,)."""
+        """Return the interpolated values (m, k) at `times` (m,)."""
         s, span, start, step, out, into = self._parts(times)
         bend = (1.0 - s) * (span * out - step) + s * (step - span * into)
         return np.asarray(start + s * step + s * (1.0 - s) * bend)
 
     def derivative(self, times: FloatArray) -> FloatArray:
-        """Return the slopes (m, k) at `times` (m,)."""
+        """Return the slopes (m, k) of the curve at `times` (m,)."""
         s, span, _, step, out, into = self._parts(times)
         mean = 6.0 * s * (1.0 - s) * step / span
         return np.asarray(mean + (1.0 - s) * (1.0 - 3.0 * s) * out + s * (3.0 * s - 2.0) * into)
 
     def _parts(self, times: FloatArray) -> tuple[FloatArray, ...]:
-        """Return each time's fraction of its span, and the span's length, start value, step and slopes."""
+        """Return the fraction of each time in its span, and the length, values and slopes of the span."""
         at = np.asarray(times, dtype=float)
         before = np.clip(np.searchsorted(self.times, at, side="right") - 1, 0, len(self.times) - 2)
         span = (self.times[before + 1] - self.times[before])[:, None]
@@ -276,7 +277,7 @@ class HermiteCubic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewPath:
-    """The path of a slew from time 0 to its last time; between the times it is the cubic of the collocation.
+    """The path of a slew, given at times from zero on, with the cubic of the collocation between these times.
 
     Attributes:
         times: (n,) s.
@@ -300,7 +301,7 @@ class SlewPath:
     def references(self, times: FloatArray) -> AttitudeReferences:
         """Return the commanded motion at times (m,) s.
 
-        Outside the path the attitude is that of the nearer end, and the body is at rest.
+        Before the start and after the end of the path, the body rests at the attitude of the nearer end.
         """
         inside = np.clip(times, 0.0, self.horizon)
         turning = HermiteCubic(self.times, self.rate, self.acceleration)
@@ -319,7 +320,7 @@ class SlewPath:
         )
 
     def dipoles(self, times: FloatArray) -> FloatArray:
-        """Return the dipoles (m, 3) A m^2 at times (m,) s; zero outside the path."""
+        """Return the dipole moments (m, 3), A m^2, at times (m,), s, or zero before and after the path."""
         found = [np.interp(times, self.times, part, left=0.0, right=0.0) for part in self.dipole.T]
         return np.stack(found, axis=1)
 
@@ -330,7 +331,8 @@ class Cone:
 
     Attributes:
         name: for messages.
-        direction: function from times (n,), s after the start, to unit vectors (n, 3), ICRS.
+        direction: function from times (n,), s after the start of the slew, to unit vectors (n, 3) along the
+            axis of the cone, ICRS.
     """
 
     name: str
@@ -345,10 +347,10 @@ class Cone:
 
 
 class ConeConstraints:
-    """Exclusion cones at n times as inequalities g >= 0.
+    """Exclusion cones at n times, as inequalities g >= 0 for the attitude.
 
     The value of g is the cosine of the cone's half angle minus the cosine of the angle between body axis and
-    direction. It is a quadratic form of the attitude.
+    direction. Each inequality is a quadratic form of the attitude quaternion.
     """
 
     def __init__(self, cones: tuple[Cone, ...], margin: FloatArray, times: FloatArray) -> None:
@@ -366,27 +368,27 @@ class ConeConstraints:
         """Second derivative (cones, n, 4, 4) of the cone constraints by the attitude."""
 
     def values(self, q: FloatArray) -> FloatArray:
-        """Return g (cones, n) at attitudes (n, 4), or g (m, cones, n) of m paths (m, 1, n, 4)."""
+        """Return the values g (cones, n) at attitudes (n, 4), or g (m, cones, n) for m paths (m, 1, n, 4)."""
         return np.asarray(self._limits + 0.5 * np.sum(self.slopes(q) * q, axis=-1))
 
     def slopes(self, q: FloatArray) -> FloatArray:
-        """Return the derivatives (cones, n, 4) of g by the attitude."""
+        """Return the derivatives (cones, n, 4) of the inequalities g by the attitude."""
         return np.asarray((self.curvatures @ q[..., None])[..., 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeEnd:
-    """An end at a full attitude: quaternion (4,) ICRS into body, and rate (3,) rad/s in ICRS axes."""
+    """End of a slew at a given attitude (4,), ICRS into body, with a body rate (3,), rad/s, ICRS axes."""
 
     quaternion: FloatArray
     rate: FloatArray
 
     def is_met(self, q: FloatArray) -> bool:
-        """Return True, because an attitude with zero error is the target."""
+        """Return True, because an attitude with zero error is always the target attitude."""
         return True
 
     def misses(self) -> tuple[FloatArray, FloatArray]:
-        """Return linear part (3, 4) and quadratic part (3, 4, 4) of the attitude error as a function of q.
+        """Return linear part (3, 4) and quadratic part (3, 4, 4) of the attitude error by the quaternion q.
 
         The error is the vector part of the product of q and the inverse of the target.
         """
@@ -397,9 +399,9 @@ class AttitudeEnd:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoresightEnd:
-    """An end at which body `axis` (3,) points to `direction` (3,), ICRS, with a free roll.
+    """End of a slew at which body `axis` (3,) points to `direction` (3,), ICRS, with a free roll.
 
-    `rate` (3,) rad/s, ICRS axes, is the full body rate.
+    The body rate at the end, with all three components, is `rate` (3,), rad/s, ICRS axes.
     """
 
     axis: FloatArray
@@ -411,21 +413,21 @@ class BoresightEnd:
         return float(self.axis @ shown(q[None], self.direction[None])[0]) > 0.0
 
     def misses(self) -> tuple[FloatArray, FloatArray]:
-        """Return linear part (2, 4) and quadratic part (2, 4, 4) of the error's sines as a function of q."""
+        """Return linear part (2, 4) and quadratic part (2, 4, 4) of the sines of the pointing error."""
         across = tangent_basis(self.axis)
         return np.zeros((2, 4)), shown_curvature(across, np.broadcast_to(self.direction, (2, 3)))
 
 
 End = AttitudeEnd | BoresightEnd
 EndLaw = Callable[[float], End]
-"""Function from the duration of a slew, s, to its end."""
+"""Function from the duration of a slew, s, to the end conditions of the slew."""
 
 
 class EndConditions:
-    """The equations for the end of a slew: the attitude error and the rate error of a state (7,)."""
+    """The attitude error and the rate error of a state (7,) relative to the end of a slew."""
 
     def __init__(self, end: End, scale: float) -> None:
-        """Set up the equations of `end` for times in units of `scale` s."""
+        """Set up the error equations for `end`, with times in units of `scale` s."""
         linear, forms = end.misses()
         self.count = len(linear) + 3
         self._linear = np.zeros((self.count, 7))
@@ -434,17 +436,17 @@ class EndConditions:
         self._forms = np.concatenate([forms, turning])
 
     def miss(self, x: FloatArray) -> FloatArray:
-        """Return the errors (n,) of a state (7,)."""
+        """Return the attitude and rate errors (n,) of a state (7,)."""
         return np.asarray(self._linear @ x + 0.5 * (self._forms @ x[:4]) @ x[:4])
 
     def slope(self, x: FloatArray) -> FloatArray:
-        """Return the derivative (n, 7) of `miss`."""
+        """Return the derivatives (n, 7) of the errors by the state."""
         result = self._linear.copy()
         result[:, :4] += self._forms @ x[:4]
         return result
 
     def curvature(self, pull: FloatArray) -> FloatArray:
-        """Return the second derivative (4, 4) of pull . miss by the quaternion."""
+        """Return the second derivatives (4, 4), by q, of the sum of the errors weighted with `pull`."""
         return np.asarray(np.tensordot(pull, self._forms, 1))
 
 
@@ -453,7 +455,8 @@ def along(
 ) -> EnvironmentAt:
     """Return the environment of a slew that starts at `begin` s of the ephemeris.
 
-    With `areas` and `path`, air and sunlight act on the `areas` (3,) that a body on `path` exposes to them.
+    If `areas` (3,) and `path` are given, the environment includes the pressures of air and sunlight on the
+    areas that a body on this path exposes.
     """
 
     def around(times: FloatArray) -> SlewEnvironment:
@@ -496,28 +499,31 @@ def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float)
 
 
 NODES = 24
-"""Default number of collocation intervals. The heat differs by less than 0.1 % from that with 48 intervals,
-and the shortest time by less than 0.6 %."""
+"""Default number of collocation intervals. Compared with 48 intervals, the heat of a slew differs by less
+than 0.1 % and the shortest duration by less than 0.6 %."""
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
 _DEEP, _STILL = math.radians(5.0), 1e-4
-"""Depth (rad) inside a cone above which an end is rejected, and rate (rad/s) of an inertially fixed end."""
+"""Depth (rad) of the end attitude inside an exclusion cone above which the task is rejected, and rate (rad/s)
+below which an end attitude counts as inertially fixed."""
 MINIMUM_TIME = math.inf
-"""Value of the time cost for which only the duration is minimised."""
+"""Value of the time cost with which only the duration is minimised."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewTask:
-    """The task of the slew planner.
+    """The task of the slew planner: satellite, environment, start, end and limits of a slew.
 
     Attributes:
-        craft, along: the model; `along` counts times from the start of the slew.
+        craft: model of the satellite.
+        along: function that returns the environment at times (n,), s after the start of the slew.
         quaternion, rate: attitude (4,) from ICRS into body axes and body rate (3,), rad/s, at the start.
-        end: the end of a slew as a function of its duration.
-        horizon, longest: requested and longest duration, s; the slew is stretched if no path over `horizon`
-            is found.
-        time_cost: cost of time, W; None keeps the horizon, MINIMUM_TIME minimises it.
-        cones: exclusion cones kept during the whole slew.
+        end: end conditions as a function of the slew's duration.
+        horizon, longest: requested and longest permitted duration, s. The slew is stretched if no path of the
+            requested duration is found.
+        time_cost: weight of the duration in the cost, W. None keeps the duration, and MINIMUM_TIME minimises
+            the duration only.
+        cones: exclusion cones that are avoided during the whole slew.
         nodes: number of collocation intervals.
     """
 
@@ -534,7 +540,7 @@ class SlewTask:
 
 
 def check(task: SlewTask) -> None:
-    """Raise PlanningError if no path can fulfil the task."""
+    """Raise PlanningError for invalid values, and for a start or an end inside an exclusion cone."""
     craft = task.craft
     arrays = (
         craft.inertia,
@@ -572,7 +578,7 @@ def check(task: SlewTask) -> None:
                 f"the start lies {inside:.1f} deg inside the exclusion cone of the {cone.name}"
             )
         # The cones move by some degrees during a slew.
-        # An end deep inside a cone is inside it for every horizon.
+        # An end attitude deep inside a cone is therefore inside for every duration of the slew.
         if isinstance(end, AttitudeEnd) and float(np.abs(end.rate).max()) < _STILL:
             clearance = cone.clearance(end.quaternion[None], np.array([task.horizon]))
             if float(clearance[0]) >= -_DEEP:
@@ -581,9 +587,9 @@ def check(task: SlewTask) -> None:
 
 
 def blocking_cone(task: SlewTask, horizon: float) -> Cone | None:
-    """Return an exclusion cone that contains the end of a slew over `horizon` s; None if there is none.
+    """Return an exclusion cone that contains the end attitude of a slew of `horizon` s, or None.
 
-    Only ends at a full attitude are checked.
+    The result is also None if only the direction of a boresight is given at the end.
     """
     end = task.end(horizon)
     if not isinstance(end, AttitudeEnd):
