@@ -1,12 +1,13 @@
 """The orbit of an object from directions alone, fitted to all sightings from a satellite in a known orbit.
 
-At the middle of the arc, the six unknowns are the direction, the relative velocity divided by the distance,
-and the logarithm of the distance. Sightings of one pass determine all unknowns except the distance well. Only
-the curvature of the path by gravity distinguishes the distances of an object in free fall near the observer.
-The distance is therefore scanned (as over the admissible region of Milani et al., Celestial Mechanics 90,
-2004). For each distance the other five unknowns are fitted by Gauss-Newton, and the best fit is refined in
-all six. The arc is long enough for an orbit if the 95 % confidence interval of the distance, found from
-chi-square, is short. Gauss's method finds the same distance, but with the noise of only three sightings.
+The six unknowns at the middle of the arc are two angles of the direction, the relative velocity divided by
+the distance, and the logarithm of the distance. Sightings of one pass determine all unknowns except the
+distance well. The distance of an object in free fall near the observer can be determined only from the
+curvature of the path that gravity causes. The distance is therefore scanned (as over the admissible region of
+Milani et al., Celestial Mechanics 90, 2004). For each distance the other five unknowns are fitted by
+Gauss-Newton, and the best fit is refined in all six. The arc is long enough for an orbit if the 95 %
+confidence interval of the distance, found from chi-square, is short. Gauss's method finds the same distance,
+but uses only three sightings and is therefore noisier.
 
 The forces are the gravity of a spherical Earth and J2. The directions of an object are compared with
 catalogue directions of stars, so light time and aberration shift the object by its velocity relative to the
@@ -82,7 +83,7 @@ def trajectories(start: FloatArray, times: FloatArray) -> FloatArray:
 def _derivative(state: FloatArray) -> FloatArray:
     """Return the time derivatives (k, 6) of states (k, 6), which are velocities and accelerations."""
     position = state[:, :3]
-    # The lower bound of the radius limits the acceleration of hypotheses deep inside the Earth.
+    # A lower bound of the radius limits the acceleration of hypothetical objects inside the Earth.
     square = np.maximum(np.sum(position**2, axis=1, keepdims=True), (0.5 * EARTH_RADIUS) ** 2)
     flat = 1.5 * J2 * EARTH_RADIUS**2 / square
     tilt = 5.0 * position[:, 2:] ** 2 / square
@@ -92,7 +93,7 @@ def _derivative(state: FloatArray) -> FloatArray:
 
 MINIMUM_SIGHTINGS = 6
 RATIO = 1.5
-"""Largest ratio of the longest to the shortest possible distance for which an orbit is returned."""
+"""Largest ratio of the ends of the distance's confidence interval for which an orbit is returned."""
 GROUND_CLEARANCE = 80e3
 """Smallest perigee height (m) of an orbit that is clear of the Earth."""
 _NEAREST, _FARTHEST, _GRID = 1e3, 6e7, 90
@@ -106,8 +107,8 @@ _LONGEST_STEPS = np.array([0.05, 0.05, 0.02, 0.02, 0.02])
 """Longest Gauss-Newton steps of the six unknowns, which keep poor hypotheses from diverging."""
 _ROUNDS, _FINAL_ROUNDS = 6, 20
 _MISFIT = 1e-6
-"""Smallest accepted probability of the chi-square of a fit. Below it, the object is not in free fall, or the
-sightings have larger errors than stated."""
+"""Smallest accepted probability of the chi-square of a fit. A smaller probability means that the object is
+not in free fall or that the sightings have larger errors than stated."""
 
 
 class ArcError(FlightError):
@@ -141,11 +142,12 @@ class FirstOrbit:
     Attributes:
         time: s.
         state: position and velocity (6,) of the object relative to the Earth's centre, ICRS, m and m/s.
-        covariance: covariance (6, 6) of the state, without the error of the observer's orbit.
+        covariance: covariance (6, 6) of the state due to errors of the directions; errors of the observer's
+            orbit are not included.
         distance: distance of the object from the observer at the time of the state, m.
         interval: ends of the 95 % confidence interval of the distance, m.
-        lasts: whether the orbit is bound to the Earth and does not hit it. If the orbit is not, other orbits
-            in the distance interval are.
+        lasts: whether the orbit is bound to the Earth and does not hit the Earth. If this is false, at least
+            one other orbit in the distance interval is bound and does not hit the Earth.
         chi_square: chi-square of the sightings, with `degrees` degrees of freedom.
         degrees: number of degrees of freedom of the chi-square.
     """
@@ -210,8 +212,8 @@ def _within(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the interval of distances in which chi-square is within `_DEGREES_95` of its minimum.
 
-    The first returned pair holds the outermost scanned distances inside the interval, the second pair the
-    interpolated ends.
+    The first result is the pair of the outermost scanned distances inside the interval, and the second result
+    is the pair of the interpolated ends of the interval.
     """
     excess = chi_square - chi_square.min() - _DEGREES_95
     first, last = (int(position) for position in np.flatnonzero(excess < 0.0)[[0, -1]])
@@ -228,7 +230,8 @@ def _within(
 def _too_short(arc: float, interval: tuple[float, float], lasting: FloatArray) -> str:
     """Return the message for an arc (s) that is too short.
 
-    `lasting` holds the logarithms of those distances whose orbits are bound and clear of the Earth.
+    The argument `lasting` contains the logarithms of the distances whose orbits are bound to the Earth and do
+    not hit the Earth.
     """
     low, high = (1e-3 * math.exp(end) for end in interval)
     text = f"the arc of {arc:.0f} s is too short: the distance is {low:.3g} to {high:.3g} km (95 %)"
@@ -269,7 +272,7 @@ class _ArcFit:
         way = way - distance * (states[..., 3:] + seen.earth) / SPEED_OF_LIGHT
         way /= np.linalg.norm(way, axis=2, keepdims=True)
         off = np.einsum("nij,nkj->kni", self._across, way)
-        # Without a lower bound of the cosine, the offset would be small for directions behind the observer.
+        # Without a lower bound of the cosine, directions behind the observer would have small offsets.
         facing = np.einsum("nj,nkj->kn", seen.directions, way)
         off = off / np.maximum(facing, 1e-3)[:, :, None]
         return np.asarray((off / seen.sigma[:, None]).reshape(len(unknowns), -1))
@@ -279,7 +282,7 @@ class _ArcFit:
         return np.asarray(np.sum(self.residuals(unknowns) ** 2, axis=1))
 
     def admissible(self, unknowns: FloatArray) -> BoolArray:
-        """Return whether each hypothesis (k,) is an orbit that is bound to the Earth and does not hit it."""
+        """Return whether each hypothetical orbit (k,) is bound to the Earth and does not hit the Earth."""
         states = self.states(unknowns)
         position, motion = states[:, :3], states[:, 3:]
         radius = np.linalg.norm(position, axis=1)
@@ -295,7 +298,7 @@ class _ArcFit:
         unknowns = np.zeros((len(logarithms), 6))
         unknowns[:, 5] = logarithms
         times = self._seen.times - self.time
-        # The initial guess is the mean motion of the observed direction.
+        # The initial guess of the velocity is the mean motion of the observed direction.
         weights = (times - times.mean()) / np.sum((times - times.mean()) ** 2)
         unknowns[:, 2:4] = (weights @ self._seen.directions) @ self._basis.T
         for _ in range(_ROUNDS):

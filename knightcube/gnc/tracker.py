@@ -1,20 +1,20 @@
 """Tracks of several objects over camera frames, and a filter of the line of sight to each object.
 
-The filter uses directions alone. The filter state is the relative position y (a unit vector) and the relative
-velocity z, both divided by the present range. Without forces z is constant and y moves on a straight line.
-The motion is therefore linear at any angular rate, and only the measurement is nonlinear. After each step the
-state is divided by the length of y, so that y is a unit vector again. This is the vector form of the modified
-polar coordinates of Aidala and Hammel (1983, IEEE Transactions on Automatic Control 28). The component of z
-across the line of sight is the angular rate v. The component of z along the line of sight is s = (range rate)
-/ range. The angular acceleration is -2 s v.
+The filter uses measured directions only, without ranges. The filter state consists of the relative position y
+(a unit vector) and the relative velocity z, both divided by the present range. Without forces z is constant
+and y moves on a straight line. The motion is therefore linear at any angular rate, and only the measurement
+is nonlinear. After each step the state is divided by the length of y, so that y is a unit vector again. This
+is the vector form of the modified polar coordinates of Aidala and Hammel (1983, IEEE Transactions on
+Automatic Control 28). The component of z across the line of sight is the angular rate v. The component of z
+along the line of sight is s = (range rate) / range. The angular acceleration is -2 s v.
 
 Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
 gradient gives their relative acceleration, to first order in the distance divided by the orbit radius.
 
 The process noise models tidal accelerations as white noise of density `wander`, or `residual_wander` if the
 gravity gradient is known. More process noise along the line of sight lets the filter follow motions that are
-not straight lines. An object on a great circle at a constant rate is an example, for which s changes by
-rate^2 per second. The additional density is (`bend` rate^2)^2 / rate.
+not straight lines. For example, s changes by rate^2 per second for an object that moves along a great circle
+at a constant rate. The additional density is (`bend` rate^2)^2 / rate.
 
 Sightings are assigned to tracks in order of their chi-square, each to at most one track. This is the greedy
 nearest neighbour method (Blackman and Popoli 1999, Design and Analysis of Modern Tracking Systems, section
@@ -65,12 +65,14 @@ class MotionModel:
 
     Attributes:
         rate: standard deviation of each component of the angular rate before the second sighting, rad/s.
-        closing: standard deviation of (range rate) / range before the second sighting, 1/s.
-        wander: density of the tidal acceleration divided by the range, 1/s^3. In low orbit this scaled
+        closing: standard deviation of the ratio (range rate) / range before the second sighting, 1/s.
+        wander: noise density of the tidal acceleration divided by the range, 1/s^3. In low orbit this scaled
             acceleration reaches 1.5 n^2 = 1.8e-6 1/s^2. With the default density, the errors of direction and
             rate agree with the covariance in passes at 0.05 to 0.6 deg/s and up to 5,000 km.
-        residual_wander: density of the scaled residual acceleration if the gravity gradient is known, 1/s^3.
-        bend: unmodelled change of (range rate) / range per second by curved motion, as a fraction of rate^2.
+        residual_wander: noise density of the residual acceleration divided by the range if the gravity
+            gradient is known, 1/s^3.
+        bend: standard deviation of the unmodelled change per second of (range rate) / range on curved paths,
+            divided by the squared angular rate.
     """
 
     rate: float = 0.01
@@ -110,7 +112,7 @@ class LineOfSightState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectionInnovation:
-    """The residual (2,) rad of a measured direction from the prediction, its covariance and chi-square."""
+    """Residual (2,), rad, of a measured from a predicted direction, with covariance and chi-square."""
 
     residual: FloatArray
     covariance: FloatArray
@@ -175,7 +177,7 @@ def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArr
 
 
 def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> LineOfSightState:
-    """Return the state corrected by a direction (3,) with covariance (3, 3) rad^2 at the same time."""
+    """Return the line of sight updated with a direction (3,) of covariance (3, 3), rad^2."""
     seen = compare(state, direction, covariance)
     gain = np.linalg.solve(seen.covariance, seen.observation @ state.covariance).T
     change = gain @ seen.residual
@@ -190,7 +192,7 @@ def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArra
 def _at_unit_range(
     time_ns: int, position: FloatArray, velocity: FloatArray, covariance: FloatArray
 ) -> LineOfSightState:
-    """Return the state divided by its range, which is the length of `position`."""
+    """Return the line of sight for a state that is divided by the range, the length of `position`."""
     size = float(np.linalg.norm(position))
     direction, scaled = position / size, velocity / size
     jacobian = np.zeros((6, 6))
@@ -330,7 +332,7 @@ class ObjectTracker:
             replace(track, line=predict(track.line, frame.time_ns, motion, tide), frames=track.frames + 1)
             for track in self._tracks
         ]
-        # From here on, the covariance of the directions includes the attitude error.
+        # From here on, the covariances of the sighted directions include the attitude error.
         crosses = cross_matrices(frame.directions)
         spread = np.asarray(
             frame.covariance + crosses @ frame.attitude @ crosses.transpose(0, 2, 1), dtype=float
@@ -407,7 +409,7 @@ class ObjectTracker:
     def _is_object(self, track: Track) -> bool:
         if track.history.bit_count() < self._settings.needed:
             return False
-        # The first two sightings determine position and rate, and the later sightings test both.
+        # The first two sightings determine position and rate, and later sightings test position and rate.
         tested = 2 * (track.sightings - 1)
         if track.chi_square > bound(self._settings.missed, tested):
             return False

@@ -1,12 +1,12 @@
-"""PID and adaptive controllers of the testbed's rotation angle, for comparison (Sease 2013, ch. 5).
+"""PID and adaptive controllers of the testbed's rotation angle, for comparison (Sease 2013, chapter 5).
 
-The PID controller (0.15 W on the testbed) has free gains, or gains that place all three poles of a double
-integrator at -w: 3 w on the rate, 3 w^2 on the angle and w^3 on the integral of the angle. The reference
-angle enters the proportional part with a weight b (set-point weighting, Astrom and Hagglund 1995, section
-3.4). With b = 0 a step of the target causes neither a step of the current nor overshoot. The integration
-stops while the current is saturated and the error would increase the saturation (conditional integration).
-The only plant parameter that the PID controller uses is the ratio of inertia to torque constant, which scales
-the gains.
+The PID controller (0.15 W on the testbed) has free gains, or gains that place all three closed-loop poles of
+a double integrator at -w. These gains are 3 w on the rate, 3 w^2 on the angle and w^3 on the integral of the
+angle. The reference angle enters the proportional part with a weight b (set-point weighting, Astrom and
+Hagglund 1995, section 3.4). With b = 0, a step of the target causes no step of the current and no overshoot.
+The integration stops while the current is saturated and the error would increase the saturation (conditional
+integration). The only plant parameter that the PID controller uses is the ratio of inertia to torque
+constant, which scales the gains.
 
 The adaptive controller (0.66 W on the testbed) follows Slotine and Li 1991, section 8.5. With the composite
 error s = e' + l e and the reference acceleration a_r = theta_m'' + l e', the current I is defined by
@@ -158,7 +158,7 @@ class AdaptiveController:
     """
 
     def __init__(self, plant: SingleAxisPlant, period: float, settings: AdaptiveSettings) -> None:
-        """Begin with the plant's inertia, stiffness and damping as parameters.
+        """Begin with the inertia, stiffness and damping of the plant model as parameters.
 
         Args:
             plant: testbed parameters.

@@ -1,4 +1,4 @@
-"""Nadir by the methods of Meller et al., chapter 3, for comparison with `knightcube.vision.horizon`.
+"""Nadir determination as in Meller et al., chapter 3, for comparison with `knightcube.vision.horizon`.
 
 Edge detection (Meller et al., section 3.1): A scan line is divided by the average of its high intensities and
 rounded to 0 or 1. Short fluctuations along the scan line are filtered out. The first change from 0 to 1 is
@@ -55,7 +55,7 @@ def high_average(lines: Image) -> FloatArray:
 
 
 def binarised(lines: Image, high: FloatArray) -> BoolArray:
-    """Return scan lines (n, m) divided by their high averages (n,) and rounded to 0 or 1.
+    """Return scan lines (n, m), each divided by the average of the high intensities and rounded to 0 or 1.
 
     The operation is step 1 in section 3.1 of Meller et al.
     """
@@ -92,9 +92,10 @@ class HorizonCircle:
 def fit_circle(points: FloatArray) -> HorizonCircle:
     """Return the least-squares circle through points (n, 2), by equations (2) to (5) of Meller et al.
 
-    Each row of the linear system contains a point and the next point, cyclically. Three points lie exactly on
-    the circle. For more points the radius of the circle is the RMS distance of the points from the centre.
-    Raises NoCircleError for fewer than three points and for collinear points.
+    Each row of the linear system contains a point and the next point; the last row contains the last and the
+    first point. Three points lie exactly on the circle. For more points the radius of the circle is the RMS
+    distance of the points from the centre. Raises NoCircleError for fewer than three points and for collinear
+    points.
     """
     points = np.asarray(points, dtype=float)
     if len(points) < 3:
@@ -127,7 +128,7 @@ class ScannedHorizon:
         points: (n, 2) edge positions in the image, px.
         circle: circle in the image of an ideal pinhole camera with the same focal length
             (`CameraModel.ideal`), px.
-        middle: (3,) unit vector in camera axes to the edge closest to the optical axis.
+        middle: (3,) unit vector, in camera axes, to the horizon edge closest to the optical axis.
     """
 
     points: FloatArray
@@ -191,7 +192,7 @@ class GraphicMethodError(FlightError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelCamera:
-    """Camera whose boresight is perpendicular to the body's z axis and whose y axis is parallel to that axis.
+    """Camera whose boresight is perpendicular and whose y axis is parallel to the z axis of the body.
 
     Attributes:
         right: (2,) body x and y components of the camera's x axis, which is a unit vector.

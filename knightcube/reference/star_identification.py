@@ -4,20 +4,20 @@ Each method proposes candidates, which assign guide stars to some observed stars
 attitude. With this attitude the brightest observed stars are transformed to the sky, and the stars close to
 guide stars are counted. The candidates with the highest counts are verified with all observed stars by
 `knightcube.vision.startracker.verification`, which rejects false candidates. If the image scale is uncertain,
-the field is searched at several scales (`ScaledField`).
+the identification is tried at several scales (`ScaledField`).
 
 The methods are:
 
 - Angle matching: The triangles of the brightest observed stars are processed in order of brightness
-  (Michalski, section 3.2.1, and Gottlieb in Wertz 1978, section 7.7). Two pairs of guide stars with the
-  angles of two sides are joined if they share a star. The joined pairs are a candidate if the third angle
-  matches as well.
+  (Michalski, section 3.2.1, and Gottlieb in Wertz 1978, section 7.7). Two pairs of guide stars whose angles
+  match two sides of a triangle are joined if the pairs share a star. The joined pairs are a candidate if the
+  third angle matches as well.
 
 - Triangles by area and polar moment: The area of an observed triangle and its propagated standard deviation
   define a range of areas in the table of guide star triangles (Michalski, sections 3.2.2 and 3.2.3, and Cole
   & Crassidis 2004 and 2006). The triangles in this range whose polar moment and side lengths match are
-  candidates. If several triangles match, the sources pivot to a neighbouring triangle, while this
-  implementation tests all of them.
+  candidates. If several triangles match, the published methods pivot to a neighbouring triangle, while this
+  implementation tests all matching triangles.
 
 - Pyramid: The triangles are ordered so that no observed star occurs in many consecutive triangles, which
   limits the effect of a false star (Michalski, section 3.2.4, and Mortari, Samaan, Bruccoleri & Junkins,
@@ -305,7 +305,7 @@ def _support(
     middle = 0.5 * (pair[:, 0] + pair[:, 1])
     lever = np.linalg.norm(seen[None] - middle[:, None], axis=-1)
     sigma = float(view.sigma.max())
-    # The error of a star's position includes the attitude error of the pair times the distance from the pair.
+    # The attitude error of the pair adds a position error proportional to the distance from the pair.
     gate = settings.tolerance * sigma * np.sqrt(1.5 + 2.0 * (lever / base[:, None]) ** 2)
     gate = np.minimum(gate + view.slack * lever, 0.25 * math.atan(min(sky.half_width)))
     distance, _ = sky.tree.query(seen @ matrices, distance_upper_bound=float(gate.max()))
@@ -406,7 +406,7 @@ def _pyramids(
         alike &= within(sky, found[of, corner], fourth, low[owner], high[owner])
     triangles, fourth, owner = found[of[alike]], fourth[alike], owner[alike]
     observed = np.column_stack([np.tile(corners, (len(owner), 1)), rest[owner]])
-    # One pyramid per triangle is enough, because the verification uses all other stars.
+    # One fourth star per triangle is enough, because the verification uses all other stars.
     _, once = np.unique(triangles, axis=0, return_index=True)
     return Candidates(observed[once], np.column_stack([triangles, fourth])[once])
 
@@ -695,7 +695,7 @@ def _rate(direction: FloatArray, velocity: FloatArray, sigma: FloatArray) -> tup
 
 
 def _agrees(direction: FloatArray, motion: StarMotion, rate: FloatArray, covariance: FloatArray) -> BoolArray:
-    """Return for each point (n,) whether its motion agrees with `rate` within the errors of both."""
+    """Return for each point (n,) whether the motion of the point agrees with `rate` within the errors."""
     residual = motion.velocity - np.cross(direction, rate)
     residual -= np.sum(residual * direction, axis=-1, keepdims=True) * direction
     # The error of the rate adds at most this variance perpendicular to the line of sight.

@@ -5,11 +5,11 @@ between the stars. The angle of a pair is stored as float32, with a rounding err
 rad. Pairs are sorted by angle and searched with a k-vector, which finds the keys of a range without a binary
 search (Mortari & Neta, K-vector range searching techniques, 2000). A straight line approximates the sorted
 keys. The k-vector contains the number of keys below each of the evenly spaced values of the line. The inverse
-of the line gives the cell of a value, so that two look-ups delimit a range. Ranges are half-open (low <= key
-< high). Unlike equation 61 of Michalski, which returns some additional keys, this implementation compares the
-keys in the two boundary cells and is exact. Equation 54 of Michalski is corrected to 2 delta-epsilon, as in
-the original paper, so that the line ends above the largest key. The fixed margin 2.22e-16 in equation 56 of
-Michalski is replaced by a margin relative to the size of the keys.
+of the line gives the cell of a value, so that two look-ups give the beginning and end of a range. Ranges are
+half-open (low <= key < high). Unlike equation 61 of Michalski, which returns some additional keys, this
+implementation compares the keys in the two boundary cells and is exact. Equation 54 of Michalski is corrected
+to 2 delta-epsilon, as in the original paper, so that the line ends above the largest key. The margin 2.22e-16
+in equation 56 of Michalski is replaced by a margin proportional to the size of the keys.
 
 Triangle tables: Triangles of the brighter guide stars are described by area and polar moment. Planar
 triangles have chords as sides (Michalski, eq. 35-48, and Cole & Crassidis, Fast star-pattern recognition
@@ -54,8 +54,9 @@ class KVector:
 
     Attributes:
         key: (n,) keys in ascending order.
-        count: (cells + 1,) number of keys below each value of the line.
-        slope, origin: parameters of the line, whose value at index j is origin + slope j (Michalski, eq. 53).
+        count: (cells + 1,) number of keys below each evenly spaced value of the straight line.
+        slope, origin: parameters of the straight line, whose value at index j is origin + slope j (Michalski,
+            eq. 53).
     """
 
     key: npt.NDArray[Any]
@@ -123,7 +124,7 @@ def build_k_vector(key: npt.NDArray[Any], cells: int | None = None) -> KVector:
 
 
 def members(start: IntArray, stop: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the concatenated indices (k,) of m ranges, and the number (k,) of the range of each index."""
+    """Return the concatenated indices (k,) of m ranges, and for each index (k,) the position of its range."""
     length = stop - start
     owner = np.repeat(np.arange(len(start)), length)
     begin = np.cumsum(length) - length
@@ -518,7 +519,7 @@ def cells_of(place: FloatArray, along: FloatArray, radius: float) -> IntArray:
     """Return the grid cells (k,) of positions in tangent planes.
 
     Args:
-        place: (k, 2) positions on the tangent planes.
+        place: (k, 2) positions of stars on the tangent planes.
         along: (k, 2) positions of the aligning stars, which define the +x axis of the grid.
         radius: radius of the patterns, rad.
     """

@@ -19,18 +19,20 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.errors import FlightError
 
 WEAKEST = 0.15
-"""Relative strength below which a torque direction is discarded. A weak direction would need all the current,
-and scaling would then reduce the torque in the other directions."""
+"""Torque per unit current, relative to the strongest direction, below which a torque direction is discarded.
+A weak direction would need all the current, and scaling would then reduce the torque in the other
+directions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Allocation:
-    """Currents of the coils and their torque.
+    """Allocated currents of the coils, and the torque of these currents.
 
     Attributes:
         currents: coil currents (3,), zero for coils that are not available, A.
         torque: torque (3,) of the allocated currents, N m.
-        share: component of the torque along the requested torque, as a fraction of it, from 0 to 1.
+        share: component of the torque along the requested torque, as a fraction of the requested torque, 0 to
+            1.
     """
 
     currents: FloatArray
@@ -57,7 +59,7 @@ def allocate(
         raise FlightError(f"allocation: torque {wanted} or field {field} is not finite")
     turns = np.ones(3) if free is None else np.asarray(free, dtype=np.float64)
     usable = np.ones(3) if available is None else np.asarray(available, dtype=np.float64)
-    # Column a of `effect` is the torque of one ampere in coil a about the free axes.
+    # Column a of the matrix `effect` is the torque about the free axes of one ampere in coil a.
     effect = turns[:, None] * np.cross(np.eye(3), field).T * (dipole_per_ampere * usable)
     wanted = wanted * turns
     currents = np.linalg.pinv(effect, rcond=WEAKEST) @ wanted * usable

@@ -1,15 +1,15 @@
-"""Detumbling by the magnetometer alone: B-dot, with the field measured while the coils are off.
+"""B-dot detumbling with the magnetometer alone, which measures the field while the coils are off.
 
 The field of the coils disturbs the magnetometer, so time is divided into windows. In each window the coils
 are first off to let the field settle, then the field is measured and averaged, and then the coils are driven.
-The rate is computed from the mean fields of two consecutive windows. In body axes a constant field changes by
-B' = -w x B, which gives the rate across the field, w_p = B' x B / B^2. The dipole moment m = (k / B^2) w_p x
-B reduces the rate, because its torque m x B is -k w_p for any direction of the field (B-dot control: Wertz
-1978, section 18.3, and Avanzini and Giulietti 2012, J. Guid. Control Dyn. 35(4)). The gain k is chosen so
-that in one window the torque k w_p removes the fraction `share` of the momentum J w_p, where J is the
-smallest moment of inertia. While the coils are driven, the field is propagated with the last rate, so that a
-fast body is not accelerated. The rate is unambiguous if the body rotates by less than half a revolution per
-window.
+The rate is computed from the mean fields of two consecutive windows. A field that is constant in inertial
+axes changes in body axes by B' = -w x B, which gives the component of the rate across the field, w_p = B' x B
+/ B^2. The dipole moment m = (k / B^2) w_p x B reduces the rate, because its torque m x B is -k w_p for any
+direction of the field (B-dot control: Wertz 1978, section 18.3, and Avanzini and Giulietti 2012, Journal of
+Guidance, Control, and Dynamics 35(4)). The gain k is chosen so that in one window the torque k w_p removes
+the fraction `share` of the momentum J w_p, where J is the smallest moment of inertia. While the coils are
+driven, the measured field is rotated with the last rate, so that the torque does not accelerate a fast body.
+The rate is unambiguous if the body rotates by less than half a revolution per window.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from knightcube.gnc.estimation.field_rate import rate_across
 MAXIMUM_SHARE = 0.5
 _SECOND = 1e-9
 _REACHED_NS = 50_000_000
-"""Largest delay (ns) of a command to the coils, equal to two control cycles."""
+"""Largest delay (ns) until a command acts on the coils, equal to two control cycles."""
 _NO_CURRENT: FloatArray = np.zeros(3)
 
 
@@ -52,8 +52,8 @@ class WindowSchedule:
     def calm(self, begin_ns: int, length_ns: int) -> int:
         """Return the first time from `begin_ns` on at which the coils do not switch for `length_ns`.
 
-        Windows are counted from time zero. If neither the pause nor the driven phase is long enough, the
-        result is `begin_ns`.
+        Windows follow each other without gaps from time zero. If neither the pause nor the driven phase is
+        long enough, the result is `begin_ns`.
         """
         phase_ns, pause_ns = begin_ns % self.period_ns, self.settle_ns + self.measure_ns
         later_ns = self.period_ns + pause_ns
@@ -106,7 +106,7 @@ def share_in_rotating_field(field_rate: float, schedule: WindowSchedule) -> floa
 def braking_current(
     braking: DetumblerSettings, rate: FloatArray, field: FloatArray, act_time: float
 ) -> FloatArray:
-    """Return currents (3,) A that reduce `rate` (3,) rad/s across `field` (3,) T, acting for `act_time` s.
+    """Return the currents (3,), A, that reduce a rate (3,), rad/s, across a field (3,), T, in `act_time` s.
 
     If a coil would exceed its current limit, all three currents are scaled by one factor to preserve the
     direction.
@@ -148,12 +148,15 @@ class Detumbler:
         return time_ns >= self._begun_ns and inside
 
     def sample(self, time_ns: int, field: FloatArray) -> None:
-        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled."""
+        """Accept a field (3,), T, measured at `time_ns`.
+
+        The field is ignored unless the coils were off and settled.
+        """
         if not self.listens(time_ns):
             return
         window = (time_ns - self._begun_ns) // self._schedule.period_ns
         if window <= self._closed:
-            return  # the window of this late sample is already closed
+            return  # the sample is late, and the mean field of its window is already computed
         if window != self._window:
             self._samples.clear()
             self._window = window
@@ -169,11 +172,11 @@ class Detumbler:
         window = (now_ns - self._begun_ns) // schedule.period_ns
         field = self.field(now_ns)
         if self._rate is None or field is None or window != self._closed:
-            return _NO_CURRENT  # without a field of this window, an older field is too old
+            return _NO_CURRENT  # the field of an earlier window is too old
         return braking_current(self._braking, self._rate, field, schedule.act_ns * _SECOND)
 
     def field(self, now_ns: int) -> FloatArray | None:
-        """Return the field (3,) T in body axes, propagated to `now_ns`, or None before a rate is known."""
+        """Return the field (3,), T, in body axes at `now_ns`, or None before a rate is known."""
         if self._rate is None or self._field is None:
             return None
         since = (now_ns - self._field[0]) * _SECOND
@@ -196,5 +199,5 @@ class Detumbler:
         self._rate = None
         if self._before is not None:
             span_ns = time_ns - self._before[0]
-            if span_ns < 2 * self._schedule.period_ns:  # after a missed window the rate stays unknown
+            if span_ns < 2 * self._schedule.period_ns:  # a window without samples gives no rate
                 self._rate = rate_across(self._before[1], field, span_ns * _SECOND)

@@ -1,8 +1,8 @@
 """Detumbling of a free satellite with its magnetometer, and with gyro and attitude if available.
 
 The field of the coils disturbs the magnetometer. The coils are therefore switched off periodically, first to
-let the field settle, then to measure it. From the samples of these pauses, the filter
-`knightcube.gnc.estimation.field_rate` estimates the full body rate and the inertial rotation of the field. A
+let the field settle, then to measure it. The filter `knightcube.gnc.estimation.field_rate` uses the samples
+in these pauses to estimate all components of the body rate and the rotation of the field in inertial axes. A
 gyro sample gives the rate along the field at once. The momentum plan uses a predicted field. If the attitude
 is known, it is predicted along the orbit. Otherwise the measured field is assumed to rotate on at its present
 rate. In contrast to B-dot control, a spin along the field is also removed, as soon as the field has rotated.
@@ -14,7 +14,8 @@ a restarted sensor may give only unusable fields.
 The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
 momentum obeys h' = m x B, in which inertia and attitude do not appear. By Pontryagin's principle, the dipole
 moment of minimum time has the maximum strength L and the direction of -B x y, where the costate y is a
-constant vector. A time T suffices to reduce the momentum to at most r if and only if every y satisfies
+constant vector. The momentum can be reduced to at most r within the time T if and only if every vector y
+satisfies
 
     h . y <= L integral of |B x y| over T + r |y|,
 
@@ -26,8 +27,8 @@ the field, which is removed later. The plan leaves a residual momentum r, becaus
 along a slowly rotating field would take most of the time.
 
 The minimum-time plan first accelerates a body that spins along the field, about an axis across the field. The
-settings `gentle` and `spin_up` therefore give an upper bound of the rate. At the bound, no dipole moment is
-commanded that increases the rate. If the bound equals the initial rate, detumbling takes longer, because a
+settings `gentle` and `spin_up` therefore give an upper bound of the rate. At this bound, the commanded dipole
+moment does not increase the rate. If the bound equals the initial rate, detumbling takes longer, because a
 spin along the field is then stopped only after the field has rotated by a right angle.
 """
 
@@ -47,14 +48,14 @@ from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSetti
 
 ITERATIONS = 12
 LIMIT_GAIN = 1.4
-"""Mean dipole moment of three coils in a rotating body, relative to the limit of one coil. With all coils
-saturated, this ratio would be 1.5."""
+"""Assumed mean dipole moment of three coils in a rotating body, relative to the limit of one coil. With all
+coils saturated, the ratio would be 1.5."""
 STEEP = 12.0
-"""Gain of the dipole: a coil reaches its limit where |B x y| exceeds its mean divided by this number. The
-minimum-time plan would always saturate all coils, but noise of B would then reverse the coils wherever B x y
-is small."""
+"""Gain of the dipole moment: a coil reaches the dipole limit where |B x y| exceeds the mean of |B x y|
+divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would then reverse
+the coils wherever B x y is small."""
 FLAT = 0.02
-"""Lower bound of |B x y|, relative to its largest value, that keeps the weights finite."""
+"""Lower bound of |B x y|, relative to the largest |B x y|, that keeps the weights of the iteration finite."""
 FINENESS = 60
 """Resolution of the search for the minimum time, as the number of steps per minimum time."""
 
@@ -66,7 +67,7 @@ class MomentumPlan:
     Attributes:
         costate: scaled costate y (3,), inertial axes, A m^2/T; zero for a body at rest. The commanded dipole
             moment is -B x costate, clipped at the limit of each coil.
-        horizon: time from now until the body is at rest, s.
+        horizon: time until the body is at rest, s.
     """
 
     costate: FloatArray
@@ -79,8 +80,9 @@ def momentum_plan(
     """Return the plan that reduces `momentum` (3,) N m s to `rest` N m s in minimum time.
 
     `field` (n, 3) T is the predicted field at `times` (n,) s from now on, in the inertial axes of the
-    momentum, and `limit` is the limit of each coil in A m^2. If the predicted times are too short, the plan
-    removes as much momentum as possible within them. Raises UsageError for fewer than three times.
+    momentum, and `limit` is the limit of each coil in A m^2. If the prediction ends too early, the plan
+    removes as much momentum as possible until the end of the prediction. Raises UsageError for fewer than
+    three times.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
@@ -105,9 +107,10 @@ def momentum_plan(
 
 
 def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
-    """Return the dipole moment (3,) A m^2 of a plan in a field (3,) T, body axes, clipped at `limit`.
+    """Return the dipole moment (3,), A m^2, that a plan commands in a field (3,), T, body axes.
 
-    Each coil is clipped separately, because each coil contributes to the removal of momentum on its own.
+    Each component is clipped separately at `limit`, because each coil removes momentum independently of the
+    other coils.
     """
     return np.clip(-cross_product(field, costate), -limit, limit)
 
@@ -117,8 +120,8 @@ def without_speed_up(
 ) -> FloatArray:
     """Return the dipole moment (3,) without the part whose torque increases the rate.
 
-    `rate` (3,) is the body rate (rad/s) and `inverse` (3, 3) the inverse inertia tensor in body axes. The
-    result has no larger component than the given dipole moment.
+    `rate` (3,) is the body rate (rad/s) and `inverse` (3, 3) the inverse inertia tensor in body axes. No
+    component of the result is larger than the same component of the given dipole moment.
     """
     # `grows` is the derivative of d(|rate|^2 / 2)/dt with respect to the dipole moment.
     grows = cross_product(field, inverse @ rate)
@@ -131,7 +134,7 @@ def without_speed_up(
 
 
 def rotating_field(field: FloatArray, change: FloatArray, times: FloatArray) -> FloatArray:
-    """Return the predicted field (n, 3) T at `times` (n,) s from now on, rotating at the present rate.
+    """Return the predicted field (n, 3), T, after `times` (n,), s, if the field rotates at its present rate.
 
     `field` (3,) T and its time derivative `change` (3,) T/s are in inertial axes. The field strength is
     assumed to be constant.
@@ -181,7 +184,7 @@ class _FieldPreview:
     rest: float
 
     def across(self, y: FloatArray, count: int) -> FloatArray:
-        """Return |B x y| at the first `count` instants, but at least a small positive value."""
+        """Return |B x y| at the first `count` instants, bounded below by a small positive value."""
         found = np.cross(self.field[:count], y)
         across = np.sqrt(np.einsum("ni,ni->n", found, found))
         strength = math.sqrt(float(self.field[0] @ self.field[0]))
@@ -193,7 +196,7 @@ class _FieldPreview:
         return np.asarray(np.tensordot(weight, self.effect[:count], 1) + self.rest * np.eye(3))
 
     def worst(self, momentum: FloatArray, count: int, guess: FloatArray) -> FloatArray:
-        """Return the unit vector y (3,) along which the first `count` instants remove the least momentum."""
+        """Return the unit vector y (3,) along which `count` instants can remove the least momentum."""
         y = guess
         for _ in range(ITERATIONS):
             found = np.linalg.solve(self.matrix(y, count), momentum)
@@ -211,13 +214,14 @@ OLDEST_NS = 100_000_000
 """Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
 INSTANTS = 150
 DENSER = 1.5
-"""Exponent of the times of the field prediction, which are denser at the start. For a prediction over 1,500
-s, the first time step is 1 s and the last 15 s."""
+"""Exponent of the power law by which the times of the field prediction are denser at the start. For a
+prediction over 1,500 s, the first time step is 1 s and the last 15 s."""
 LEFT = 0.7
 """Residual momentum of a plan, as a fraction of the momentum at which a body counts as detumbled."""
 FEW, SOON = 4.0, 5.0
-"""Factor and time (s) of the last phase. A momentum below FEW times the residual momentum of a plan is
-removed within SOON seconds if its component along the field is small."""
+"""Ratio of the momentum to the residual momentum of a plan, and duration (s), that define the last phase of
+detumbling. A momentum below FEW times the residual momentum of a plan is removed within SOON seconds if its
+component along the field is small."""
 KNOWN = 2e-3
 """Standard deviation (rad/s) of the least certain rate component below which the upper bound of the rate is
 set."""
@@ -291,7 +295,7 @@ class FieldDetumbler:
         self._planned_rotation = _NO_DIPOLE
         self._agreed = 0
         self._bounded = False
-        self._driven_ns = now_ns  # another flight mode may have driven the coils before
+        self._driven_ns = now_ns  # another flight mode may have driven the coils before this pause
         self._accepted_ns = now_ns
         self._fastest = math.inf
         self._filter.restart()
@@ -354,7 +358,7 @@ class FieldDetumbler:
 
     @property
     def trusted(self) -> bool:
-        """Whether enough samples agreed with the filter, and the rate is known well enough."""
+        """Whether enough samples agreed with the filter and the estimated rate is accurate enough."""
         return self._bounded
 
     @property

@@ -1,4 +1,4 @@
-"""Control about one axis: a linear-quadratic tracker, and an excitation for identifying the plant.
+"""Control about one axis with a linear-quadratic tracker, and excitation manoeuvres that identify the plant.
 
 The tracker applies feedback linearisation to the attitude error and then a linear-quadratic regulator (Sease
 2013, eqs. (5.16) to (5.32)). The error is e = sin(theta_p - theta) (Sease, eq. (5.21)), where theta_p is the
@@ -8,26 +8,28 @@ corrected) are
     e'  = cos(d) (theta_p' - w)
     e'' = cos(d) (theta_p'' - w') - sin(d) (theta_p' - w)^2,     d = theta_p - theta.
 
-The regulator demands e'' = v = -K (e', e), with K from the Riccati equation. This is solved for the angular
-acceleration w', from which the plant model gives the current.
+The regulator demands e'' = v = -K (e', e), with K from the Riccati equation. The expression for e'' is solved
+for the angular acceleration w', from which the plant model gives the current.
 
-The tracker has two additions to the thesis, which the option `as_in_thesis` switches off. First, the
-estimated disturbance is fed forward, so that a constant torque causes no offset. The estimator integrates the
-acceleration that the model did not predict. Integrator windup cannot occur, because the estimator uses the
-current after limiting. Second, an error is reduced only as fast as the coil can decelerate the body, where a
-linear law would overshoot. Small errors are reduced at the rate s e with s = K_e / K_e', and errors above A /
-s^2 at the rate sqrt(2 A |e| - (A / s)^2), where A is the available deceleration. This is the proximate
-time-optimal servo (Workman 1987), here also with a continuous slope.
+The tracker extends the controller of the thesis by two features, which the option `as_in_thesis` switches
+off. First, the estimated disturbance is fed forward, so that a constant torque causes no offset. The
+estimator integrates the acceleration that the model did not predict. Integrator windup cannot occur, because
+the disturbance estimator uses the limited current. Second, the rate at which an error is reduced is limited,
+so that the coil can decelerate the body in time and the angle does not overshoot. Small errors are reduced at
+the rate s e with s = K_e / K_e', and errors above A / s^2 at the rate sqrt(2 A |e| - (A / s)^2), where A is
+the available deceleration. This law is the proximate time-optimal servomechanism (Workman 1987), here with a
+continuous slope.
 
 The error e = sin(d) is monotonic in d only up to 90 degrees. Beyond `largest_error` the angle d is therefore
 clamped. The demanded acceleration then stays bounded and does not decrease for larger angles.
 
-The excitation does not follow a path. First the tracker brings the body to rest. Long and short pulses then
-rotate the body out and back, from which torque constant and delay are identified. Further pulses displace the
-body and release it with the coils off, from which stiffness and damping are identified. All pulses are
-repeated with the opposite sign. Between manoeuvres the tracker brings the body to rest again. It also takes
-over whenever the body could not be stopped within the allowed angle. If the tracker cannot bring the body to
-rest, the current stays zero.
+The excitation manoeuvres do not follow a path. Before the first manoeuvre, the tracker brings the body to
+rest. Long and short current pulses then rotate the body out and back, and the response identifies torque
+constant and delay. Further pulses displace the body, which then oscillates with the coils off, and the
+oscillation identifies stiffness and damping. All pulses are repeated with the opposite sign. Between
+manoeuvres the tracker brings the body to rest again. The tracker also takes over whenever the body could
+otherwise not be stopped within the allowed angle. If the tracker cannot bring the body to rest, the current
+stays zero.
 """
 
 from __future__ import annotations
@@ -43,15 +45,15 @@ from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant, 
 
 @dataclass(frozen=True, slots=True)
 class CurrentCommand:
-    """A controller's command to the coil.
+    """Coil current that a controller commands in one cycle.
 
     Attributes:
         current: commanded current within the limit, A.
         demanded: demanded current before limiting, A; zero if the coil has no control authority.
         saturated: whether the current was limited.
         authority: whether |cos(theta)| was large enough for a useful torque; otherwise the current is zero.
-        error: angle of the path minus angle of the body, rad, in [-pi, pi], before clamping.
-        held: whether the error exceeded `largest_error` and was clamped.
+        error: angle of the path minus angle of the body, before clamping, from -pi to pi, rad.
+        held: whether the angle error exceeded `largest_error` and was clamped.
     """
 
     current: float
@@ -74,7 +76,7 @@ class CurrentCommand:
 
 
 class AngleController(Protocol):
-    """A controller that computes a coil current from commanded and estimated motion in each cycle."""
+    """Controller interface: computes a coil current from commanded and estimated motion in each cycle."""
 
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
@@ -126,11 +128,10 @@ class LqTracker:
     ) -> None:
         """Create a tracker with the weights Q = state_weight I and R = input_weight.
 
-        The gains follow from the Riccati equation (Sease, eqs. (5.28) to (5.32)).
-
-        `largest_error` (rad) is below pi/2. Below `minimum_authority`, |cos(theta)| is too small for control.
-        `as_in_thesis` switches off the disturbance feedforward and the limited deceleration. Raises
-        UsageError if a value is outside its range.
+        The gains follow from the Riccati equation (Sease, eqs. (5.28) to (5.32)). The error bound
+        `largest_error` (rad) must be below pi/2. The current is zero while |cos(theta)| is below
+        `minimum_authority`. `as_in_thesis` switches off the disturbance feedforward and the limited
+        deceleration. Raises UsageError if a value is outside its range.
         """
         for name, value in (("Q", state_weight), ("R", input_weight)):
             if not (math.isfinite(value) and value > 0.0):
@@ -164,7 +165,7 @@ class LqTracker:
             v = -(self.rate_gain * cosine * lag + self.error_gain * sine)
             acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine
         else:
-            # Below, `braking` is the deceleration (rad/s^2) available between the present angle and the path.
+            # The coil can provide the deceleration `braking` (rad/s^2) all the way to the angle of the path.
             authority = max(min(math.cos(angle), math.cos(wanted.angle)), 0.0)
             taken = abs(disturbance - self._plant.stiffness * angle / self._plant.inertia)
             braking = max(
@@ -177,7 +178,7 @@ class LqTracker:
         return CurrentCommand.within(self._plant.current_limit, demanded, error, held)
 
     def _approach(self, error: float, braking: float) -> float:
-        """Return the signed rate (1/s) at which `error` is reduced, given the available deceleration."""
+        """Return the rate (1/s) at which `error` is reduced with an available deceleration `braking`."""
         slope = self.error_gain / self.rate_gain
         reach = braking / slope
         if abs(error) * slope <= reach:
@@ -204,14 +205,14 @@ _REST_ANGLE = 0.03
 _REST_RATE = 4.0e-3
 _REST_TIME = 1.0
 _TIMEOUT = 60.0
-_REACH = 0.45  # fraction of the angle bound; allows 1.4 times the modelled response
+_REACH = 0.45  # modelled amplitude as a fraction of the angle bound, to allow 1.4 times the modelled response
 _WEAK = 0.7  # fraction of the modelled torque that is assumed to be available for braking
 _SHORT_PULSE = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """A current pulse with a fraction (-1 to 1) of the excitation's current, for `duration` seconds."""
+    """A current pulse of `duration` s, with the fraction `share` (-1 to 1) of the excitation current."""
 
     share: float
     duration: float
@@ -289,7 +290,7 @@ class ExcitationController:
             return CurrentCommand.without_authority(error)
         if self._phase is _Phase.MOVING:
             pulse = self._pulse()
-            # With enough room, the body can still be stopped within the angle bound or moves inwards.
+            # The body has enough room if it can still be stopped within the angle bound or moves inwards.
             outward = rate if angle >= 0.0 else -rate
             braking = _WEAK * self._strength * math.cos(min(abs(angle), self._bound))
             has_room = abs(angle) + 0.5 * max(outward, 0.0) ** 2 / braking < self._bound
@@ -313,7 +314,7 @@ class ExcitationController:
         self._resting = 0.0
 
     def _pulse(self) -> Pulse | None:
-        """Return the current pulse; None if the manoeuvre has ended."""
+        """Return the present pulse of the manoeuvre, or None if the manoeuvre has ended."""
         begin = 0.0
         for pulse in self._manoeuvres[self._next % len(self._manoeuvres)]:
             begin += pulse.duration
@@ -328,9 +329,9 @@ class ExcitationController:
 
 
 def manoeuvres(strength: float, reach: float, swing: float) -> tuple[Manoeuvre, ...]:
-    """Return manoeuvres with pulses of `strength` rad/s^2 that rotate the body by up to `reach` rad.
+    """Return manoeuvres whose pulses of `strength` rad/s^2 rotate the body by up to `reach` rad.
 
-    A pulse of T seconds and its opposite rotate a body that was at rest by strength T^2.
+    A pulse of T seconds followed by an opposite pulse rotates a resting body by strength * T^2.
     """
     out = math.sqrt(reach / strength)
     made = []

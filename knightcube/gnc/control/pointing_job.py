@@ -1,14 +1,15 @@
-"""The planning job of a satellite, which computes a table of the pointing law for a target.
+"""The planning job that computes a table of the pointing law for a pointing target.
 
 Field and torques are predicted along the orbit for a revolution and a quarter, because the gains at the end
 of the table depend on the following revolution. The table covers a third of a revolution. A passing object is
-near for minutes only, so its tables are short, have short steps, and are computed again after each sighting.
+near for minutes only, so tables for an object are short, have short steps, and are recomputed after each
+sighting.
 
-Far from the commanded attitude, the body can approach it by a slew of minimum heat. The module `slew_plan`
-plans the slew with the torques that the filter estimates. The planned dipole moments of the slew are used as
-feedforward. The gains come from linear-quadratic tracking along the slew and the following attitude law, and
-errors at the end of the slew have the highest cost. The table also contains the change of the dipole moment
-per change of the estimated torques.
+From a distant attitude, the body can approach the commanded attitude by a slew of minimum heat. The module
+`slew_plan` plans the slew with the disturbance torques that the attitude filter estimates. The planned dipole
+moments of the slew are used as feedforward. The gains come from linear-quadratic tracking along the slew and
+the following attitude law, and errors at the end of the slew have the highest cost. The table also contains
+the change of the dipole moment per change of the estimated torques.
 """
 
 from __future__ import annotations
@@ -52,19 +53,21 @@ from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_task
 RESERVE = 0.8
 """Fraction of the coils' limit that a planned slew may use; the remainder is for the correction of errors."""
 STIFFER = 5.0
-"""Factor by which the dipole moment of unit cost is larger during a slew than otherwise."""
+"""Factor by which the dipole moment with a cost of one is larger during a slew than otherwise."""
 LONGEST = 1_500.0
-"""Longest slew, s. A slew must be shorter than a table, which also includes some time after the slew."""
+"""Longest duration of a slew, s. A slew must be shorter than a table, which also includes some time after the
+slew."""
 FINE = 5
 """Number of steps of a slew table per step of a pointing table, because a slewing body rotates faster."""
 TAIL = 300.0
-"""Duration (s) after the end of a slew over which its feedback gains are still computed."""
+"""Duration (s) after the end of a slew for which the slew table still contains feedback gains."""
 END = 2_000.0
 """Weight (s) of errors at the end of a slew: an end error costs as much as the same error during this time.
 The weight is high because the torques are poorly known before the slew, and their effects should be corrected
 by the end of the slew."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
-"""Extra factor on the horizon of a slew that rotates too fast, largest total factor, and number of trials."""
+"""Additional factor by which a slew that rotates too fast is lengthened, largest total factor, and largest
+number of trials."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +96,7 @@ class SlewStart:
     Attributes:
         quaternion, rate: attitude (4,) and body rate (3,), rad/s, at the first of `times`.
         times: equally spaced times (m,) of table and preview, s.
-        kept: number of steps of the pointing table.
+        kept: number of steps in the pointing table.
         inertia: (3, 3) kg m^2.
         limit: mean dipole limit of a coil, A m^2.
         sizes: estimated sizes (9,) of the disturbance torques, N m.
@@ -116,7 +119,7 @@ def slew(
     ahead: Ephemeris,
     fastest: float,
 ) -> SlewPath | None:
-    """Return the slew into a target's law that stays slower than `fastest` rad/s; None if there is none.
+    """Return a slew into the attitude law of a target that is slower than `fastest` rad/s, or None.
 
     The slew avoids the exclusion cones, unless the body is already inside a cone or no such slew is found.
     """
@@ -144,7 +147,7 @@ def slew(
 
 
 def _slow_enough(task: SlewTask, fastest: float, near: SlewPath | None = None) -> SlewPath | None:
-    """Return the path of a task, lengthened if the body would rotate too fast, or None without a path.
+    """Return the path of a task, lengthened if the body would rotate too fast, or None if no path is found.
 
     The search is warm-started from `near`, the path of a similar task.
     """
@@ -175,8 +178,8 @@ def slew_table(
 ) -> PointingTable:
     """Return the table of a slew and the following law, in steps of a fifth of the step of `begin.times`.
 
-    `residual` (3,) A m^2 is the residual dipole moment with which the path was planned. Of `expected`, only
-    the environment at the times of `begin` is used.
+    `residual` (3,) A m^2 is the residual dipole moment with which the path was planned. Only the environment
+    of `expected` is used, at the times of `begin`.
     """
     step, first = float(begin.times[1] - begin.times[0]) / FINE, float(begin.times[0])
     law = law_of(target, axes, path.quaternion[-1], ahead, first + path.horizon)
@@ -195,7 +198,7 @@ def slew_table(
     times = np.asarray(first + step * np.arange(FINE * begin.kept + 1), dtype=float)
     wanted = references(law, ahead, times)
     flown = path.references(times[:count] - first)
-    # The pointing law subtracts the residual dipole moment again.
+    # The residual dipole moment is added here because the pointing law subtracts the estimate in flight.
     dipole = path.dipoles(times[:count] + 0.5 * step - first) + residual
     stop = count + round(TAIL / step)
     tracked = _joined(flown, wanted.until(stop + 1))
@@ -213,7 +216,7 @@ def slew_table(
 
 
 def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeReferences:
-    """Return a path interpolated at `times` (n,) s; the first `count` instants are placeholders."""
+    """Return a path interpolated at `times` (n,), s, with arbitrary values at the first `count` instants."""
     rest = [path.at(float(time)) for time in times[count:]]
     whole = [*[rest[0]] * count, *rest]
     return AttitudeReferences(
@@ -225,7 +228,7 @@ def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeR
 
 
 def _joined(first: AttitudeReferences, then: AttitudeReferences) -> AttitudeReferences:
-    """Return the motion `then` with its first instants replaced by those of `first`."""
+    """Return the motion `then` with the first instants replaced by the instants of `first`."""
     count = len(first.times)
     return AttitudeReferences(
         then.times,
@@ -271,7 +274,7 @@ class TableSpan:
 
 
 STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
-"""Durations of tables for lasting goals, and for a passing object."""
+"""Durations and steps of tables for lasting goals, and for a passing object."""
 LEAD = 2.0
 """Time (s) from the estimated state to the start of the table, in which the table is computed."""
 FAR = math.radians(15.0)
@@ -294,7 +297,7 @@ class ObjectDirection:
 
     @property
     def span(self) -> TableSpan:
-        """Durations of the object's prediction and tables."""
+        """Durations of the prediction and of the tables for this object."""
         return PASSING if self.velocity.any() else STEADY
 
 

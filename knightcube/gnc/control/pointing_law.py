@@ -25,14 +25,15 @@ from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
 
 LARGEST_ROTATION = math.radians(20.0)
-"""Largest rotation error (rad) used by the law; larger errors are reduced, because the law is linear."""
+"""Largest rotation error (rad) used by the law; larger errors are reduced to this error, because the law is
+linear."""
 LARGEST_RATE = math.radians(1.0)
-"""Largest rate error (rad/s) used by the law; larger errors are reduced to it."""
+"""Largest rate error (rad/s) used by the law; larger rate errors are reduced to this error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingCommand:
-    """A command of the pointing law.
+    """Dipole moment that the pointing law commands, with the attitude and rate errors.
 
     Attributes:
         dipole: dipole moment (3,) within the coils' limit, A m^2.
@@ -87,7 +88,7 @@ class PointingLaw:
         # Both rates are expressed in body axes, which differ from the reference axes by the rotation error.
         missed = rate - attitude_matrix(from_rotation_vector(rotation)) @ wanted.rate
         cut_rotation, cut_rate = _cut(rotation, LARGEST_ROTATION), _cut(missed, LARGEST_RATE)
-        # The gains expect the difference of the rates' components, each rate in its own axes.
+        # The gains are for the body rate in body axes minus the reference rate in reference axes.
         error = np.concatenate([cut_rotation, cut_rate - np.cross(cut_rotation, wanted.rate)])
         k, table = self._table.path.position(time)[0], self._table
         beyond = sizes - table.sizes
@@ -124,7 +125,8 @@ class PathRecovery:
     Attributes:
         since: start time of the damping, s, or None while the body follows the path.
         ready: whether a new path may be planned.
-        leaving: whether a new path should be planned while the body still follows the old path.
+        leaving: whether a new path should be planned while the body still follows the old path, because the
+            deviation is large.
     """
 
     def __init__(self) -> None:

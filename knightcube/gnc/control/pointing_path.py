@@ -1,4 +1,4 @@
-"""The optimal motion of a body from its attitude to its attitude law, by linear-quadratic sweeps.
+"""The optimal motion of a body from the present attitude to an attitude law, by linear-quadratic sweeps.
 
 The errors x of the body relative to a reference motion are a small rotation and a rate error, both in the
 axes of the reference motion. With the predicted field b(t) in these axes, the errors obey
@@ -7,17 +7,18 @@ axes of the reference motion. With the predicted field b(t) in these axes, the e
 
 where G is the stiffness of the gravity gradient and f the torque that the reference motion requires in
 addition to the modelled torques. Riccati's equation is integrated backwards for the cost-to-go x^T S x / 2 +
-s^T x (Psiaki 2001, J. Guid. Control Dyn. 24(2); the affine part s, a preview, is added here). The dipole
-moment m = -(K x + k) is constant during a step. The affine part of the error model has one column per source,
-and so has k, which is linear in the affine part. The sweep also supports other controls than the dipole
-moment.
+s^T x (Psiaki 2001, Journal of Guidance, Control, and Dynamics 24(2)). The affine part s, which anticipates
+future torques, is added here. The dipole moment m = -(K x + k) is constant during a step. The affine part of
+the error model has one column for each source of errors. The vector k is linear in the affine part and has
+the same columns. A sweep also supports controls other than the dipole moment.
 
 The path minimises the squared rotation error relative to the law plus the squared dipole moment, in the
 predicted field and torques. The path obeys the full equations of motion and the limit of the coils. The path
 is found by iterative linear-quadratic sweeps (Li & Todorov 2004, ICINCO, and Tassa, Erez & Todorov 2012,
-IROS). Each iteration linearises the equations about the last motion and simulates the result. Because coils
-cause no torque along the field, the first iterations from a large error would give tumbling motions. The
-first sweeps therefore allow a torque along the field, at a cost that is increased until this torque vanishes.
+IROS). Each iteration linearises the equations of motion about the last motion and simulates the corrected
+motion. Because coils cause no torque along the field, the first iterations from a large error would give
+tumbling motions. The first sweeps therefore allow a torque along the field, at a cost that is increased until
+this torque vanishes.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class LinearErrorModel:
 
     Attributes:
         transition: (n, 6, 6).
-        by_control: change of the errors (n, 6, controls) per control, such as per A m^2 of each coil.
+        by_control: change of the errors (n, 6, controls) per unit of each control, such as A m^2 for a coil.
         by_torque: change of the errors (n, 6, 3) per N m of torque in each axis.
         missing: torque f (n, 3) that the reference motion requires in addition to the modelled torques, N m.
         field: magnetic field (n, 3) in the axes of the reference motion, T.
@@ -67,7 +68,7 @@ class LinearErrorModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepCost:
-    """The cost of n steps: x^T state x / 2 + state_slope^T x + control u^2 / 2 + control_slope^T u.
+    """The step costs x^T state x / 2 + state_slope^T x + control u^2 / 2 + control_slope^T u of n steps.
 
     Attributes:
         state: (n, 6, 6).
@@ -83,7 +84,7 @@ class SweepCost:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CostToGo:
-    """The cost-to-go, with the quadratic part `square` (6, 6) and the linear part `slope` (6, columns)."""
+    """The cost-to-go with a quadratic part `square` (6, 6) and a linear part `slope` (6, columns)."""
 
     square: FloatArray
     slope: FloatArray
@@ -99,10 +100,10 @@ def linearised(
 ) -> LinearErrorModel:
     """Return the linear model of the errors relative to a reference motion.
 
-    `field` (n, 3) T and `position` (n, 3) m are in ICRS axes. The dipole moment `dipole` (n, 3) A m^2 is
-    fixed in body axes, so its torque depends on the rotation error. Each element of `pressed` is a torque by
-    air or sunlight, as a vector (3,) in body axes (N m) and a direction (n, 3) in ICRS axes whose cross
-    product is the torque.
+    `field` (n, 3) T and `position` (n, 3) m are in ICRS axes. The dipole moment `dipole` (n, 3), A m^2, is
+    fixed in body axes, so the torque of this dipole depends on the rotation error. Each element of `pressed`
+    is a torque by air or sunlight, as a vector (3,) in body axes (N m) and a direction (n, 3) in ICRS axes
+    whose cross product is the torque.
     """
     rate, inverse = references.rate, np.linalg.inv(inertia)
     slopes, shown, up = acceleration_slopes(
@@ -127,10 +128,10 @@ def acceleration_slopes(
     dipole: FloatArray | None = None,
     pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the derivatives (n, 3, 6) of the angular accelerations by rotation and rate.
+    """Return the derivatives (n, 3, 6) of angular accelerations by rotation and rate.
 
-    Also return field and position (n, 3) in body axes. The motion has attitudes (n, 4) and rates (n, 3)
-    rad/s; the other arguments are those of `linearised`.
+    The second and third result are the field and the position (n, 3) in body axes. The motion has attitudes
+    (n, 4) and rates (n, 3) rad/s; the other arguments are those of `linearised`.
     """
     turned, inverse = attitude_matrix(quaternion), np.linalg.inv(inertia)
     shown, up = (np.einsum("nij,nj->ni", turned, vectors) for vectors in (field, position))
@@ -149,10 +150,10 @@ def acceleration_slopes(
 def sweep(
     linear: LinearErrorModel, affine: FloatArray, cost: SweepCost, end: CostToGo
 ) -> tuple[FloatArray, FloatArray, CostToGo]:
-    """Return the gains K (n, controls, 6) and k (n, controls, columns), and the cost-to-go at the start.
+    """Return the feedback gains K (n, controls, 6), the affine parts k, and the cost-to-go at the start.
 
-    `affine` (n, 6, columns) is the affine part of the error model. `end` is the cost-to-go after the last
-    step. Takes 0.1 ms per step.
+    The affine part k has the shape (n, controls, columns). The affine part of the error model is `affine` (n,
+    6, columns), and `end` is the cost-to-go after the last step. The computation takes 0.1 ms per step.
     """
     (count, controls), columns = cost.control.shape, affine.shape[2]
     gain, steady = np.empty((count, controls, 6)), np.empty((count, controls, columns))
@@ -196,23 +197,24 @@ def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
 
 
 RISES = (4.0, 2.0, 10.0)
-"""Ratios between successive costs of a torque along the field. Different ratios lead to different optima and
-are tried in turn until a path settles."""
+"""Ratios between successive costs of a torque along the field. The ratios are tried in turn until a path
+settles, because different ratios lead to different optima."""
 DEAR, PROHIBITIVE = 1e4, 1e6
 """Costs of a torque along the field, relative to the cost of the same torque across the field. The increase
 of the cost ends at DEAR, and the last sweeps use the cost PROHIBITIVE."""
 SETTLED = math.radians(20.0)
-"""Largest angle (rad) between body and law in the second half of a path that counts as settled."""
+"""Angle (rad) between the attitude of the body and the attitude law that a settled path does not exceed in
+the second half."""
 SWEEPS = 8
 """Largest number of sweeps at one cost of a torque along the field. The best motion is used even if the
 sweeps have not converged."""
 SAVED = (0.05, 2e-3)
 """Relative improvement below which the sweeps at one cost of a torque along the field end. The second value
-is used at the last cost."""
+is used at the last (largest) cost of this torque."""
 NEAR = math.radians(10.0)
-"""Largest angle (rad) from the law up to which the first sweeps do not need a torque along the field."""
+"""Angle (rad) from the attitude law up to which the first sweeps do not need a torque along the field."""
 EXCESS = 3e-5
-"""Excess of the rate (rad/s) over its limit that has a cost of one."""
+"""Excess of the body rate (rad/s) over the rate limit that has a cost of one."""
 SHARES = (1.0, 0.4, 0.15)
 """Fractions of the change proposed by a sweep that are tried in turn."""
 RUN_AWAY = 100.0
@@ -270,7 +272,7 @@ class PathConditions:
 
     @property
     def step(self) -> float:
-        """The time between instants, s."""
+        """The time between two instants of the path, s."""
         return float(self.wanted.times[1] - self.wanted.times[0])
 
     def acceleration(
@@ -315,8 +317,9 @@ class PathCriterion:
     Attributes:
         state: weights (6, 6) of rotation and rate errors relative to the law.
         dipole: weight of the squared dipole moment of each axis.
-        end: cost-to-go of following the law after the path. Its first column is for the law and the expected
-            torques, and each further column is for the size of one disturbance torque.
+        end: cost-to-go of following the attitude law after the path. The first column of the linear part is
+            for the law and the expected torques, and each further column is for the size of one disturbance
+            torque.
         shape: disturbance torques of unit size (n + 1, 3, sizes), in the axes of the law.
         fastest: rate above which the cost increases steeply (see `EXCESS`), rad/s.
     """
@@ -330,7 +333,7 @@ class PathCriterion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedMotion:
-    """A motion with attitudes (n + 1, 4), rates (n + 1, 3) rad/s and controls (n, 4) held over the steps.
+    """A motion with attitudes (n + 1, 4), rates (n + 1, 3), rad/s, and controls (n, 4) constant in a step.
 
     A control consists of a dipole moment (A m^2, body axes) and a torque along the field (N m).
     """
@@ -347,7 +350,7 @@ class PlannedMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionGains:
-    """Gains K (n, 4, 6) about a motion, and the affine part k (n, 4, columns).
+    """Feedback gains K (n, 4, 6) about a motion, and affine parts k (n, 4, columns) of the control.
 
     The first column of k is the change of the controls that improves the motion. Each further column of k
     compensates one disturbance torque.
@@ -387,9 +390,9 @@ def best_path(
 def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) -> PlannedMotion:
     """Return the motion with which the sweeps start.
 
-    The motion is propagated with the given gains, or without control if the gains make it diverge. The torque
-    along the field is not limited, so far from the motion `rest` the gains may rotate the body by several
-    revolutions in a step.
+    The motion is propagated with the given gains, or without control if the motion diverges with the gains.
+    The torque along the field is not limited, so far from the motion `rest` the gains may rotate the body by
+    several revolutions in a step.
     """
     nothing = MotionGains(np.zeros_like(gains.gain), np.zeros_like(gains.steady))
     for tried in (gains, nothing):
@@ -402,7 +405,7 @@ def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) ->
 def _improved(
     expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, multiple: float
 ) -> PlannedMotion:
-    """Return the best motion near a feasible motion, for a cost `multiple` of torques along the field."""
+    """Return the best motion near a feasible motion, for the cost `multiple` of a torque along the field."""
     cost = _cost(expected, motion, criterion, multiple)
     enough = SAVED[multiple == PROHIBITIVE]
     for _ in range(SWEEPS):
@@ -452,7 +455,7 @@ def _swept(
 ) -> MotionGains:
     """Return the feedback gains about a motion.
 
-    A `given` motion need not be a result of its own controls.
+    If the motion is `given`, the attitudes and rates need not result from the controls of the motion.
     """
     count, state, end = len(motion.control), criterion.state, criterion.end
     first = motion.references(expected.wanted.times).until(count)
@@ -493,7 +496,7 @@ def _swept(
 def _cost(
     expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, multiple: float
 ) -> float:
-    """Return the cost of a motion, including the cost-to-go at its end."""
+    """Return the cost of a motion, including the cost-to-go at the end of the motion."""
     deviation, end = errors(expected.wanted, motion), criterion.end
     strength = np.linalg.norm(expected.field[:-1], axis=1)
     squares = np.einsum("ni,ij,nj->", deviation[:-1], criterion.state, deviation[:-1])
@@ -505,7 +508,7 @@ def _cost(
 
 
 def _haste(rate: FloatArray, fastest: float, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return gradient (n, 3) and Hessian (n, 3, 3) of the cost of rates (n, 3) above `fastest`, rad/s."""
+    """Return gradient (n, 3) and Hessian (n, 3, 3) of the cost of exceeding the rate `fastest`, rad/s."""
     speed = np.maximum(np.linalg.norm(rate, axis=1), 1e-9)
     along = rate / speed[:, None]
     excess, weight = np.maximum(speed - fastest, 0.0), step / EXCESS**2
@@ -516,20 +519,20 @@ def _haste(rate: FloatArray, fastest: float, step: float) -> tuple[FloatArray, F
 
 
 def errors(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
-    """Return the rotation and rate errors (n + 1, 6) of a motion relative to the law."""
+    """Return the rotation and rate errors (n + 1, 6) of a motion relative to the attitude law."""
     turn = to_rotation_vector(multiply(motion.quaternion, conjugate(wanted.quaternion)))
     return np.concatenate([turn, motion.rate - wanted.rate], axis=1)
 
 
 def _counted(wanted: AttitudeReferences, motion: PlannedMotion, criterion: PathCriterion) -> FloatArray:
-    """Return the rotation error (n + 1,) rad relative to the law, with reduced errors about cheap axes."""
+    """Return the weighted rotation errors (n + 1,), rad, relative to the attitude law."""
     turn, weights = errors(wanted, motion)[:, :3], criterion.state[:3, :3]
     squares = np.einsum("ni,ij,nj->n", turn, weights, turn)
     return np.asarray(np.sqrt(squares / np.linalg.eigvalsh(weights)[-1]))
 
 
 def error_jacobians(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
-    """Return the derivatives (n + 1, 6, 6) of the errors relative to the law by small changes of the motion.
+    """Return the derivatives (n + 1, 6, 6) of the attitude and rate errors by small changes of the motion.
 
     The rotation block is the inverse left Jacobian of the rotation group, for scalar-last quaternions from
     inertial into body axes.

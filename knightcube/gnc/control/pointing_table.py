@@ -1,18 +1,18 @@
-"""The table of the pointing law: the best motion over the next revolution, and feedback gains along it.
+"""The table of the pointing law, with the best motion over the next revolution and feedback gains.
 
 The motion is found by multiple shooting with linear-quadratic steps. Each step is shortened until it improves
 a merit function, the cost plus the weighted defects (Nocedal & Wright 2006, Numerical Optimization, algorithm
 18.3). In contrast to the sweeps of `pointing_path`, intermediate motions need not be feasible. The defect of
 a step is the difference between its propagated end and the next instant, and the following iterations remove
-all defects (Bock & Plitt 1984, IFAC 9th World Congress). Errors therefore do not grow along a revolution.
-Growing errors would be a problem, because coils cause no torque about the field and the body may rotate far
-about its pointing axis. An iteration takes 0.07 ms per instant. The motion is propagated by the midpoint
-rule, and the derivatives are those of the discrete rule. With derivatives of the continuous motion, the
-iteration would stall for bodies that rotate by degrees per time step.
+all defects (Bock & Plitt 1984, IFAC 9th World Congress). Multiple shooting prevents errors from growing along
+a revolution. Errors could otherwise grow, because coils cause no torque about the field and the body may
+rotate far about the pointing axis. An iteration takes 0.07 ms per instant. The motion is propagated by the
+midpoint rule, and derivatives are computed of this discrete rule. With derivatives of the continuous motion,
+the iteration would stall for bodies that rotate by degrees per time step.
 
-If multiple shooting fails, or its motion exceeds the limit of the coils, the table contains the best path of
-`pointing_path`. At the end of this path, the cost of an error follows from a sweep along the law over one
-more revolution.
+If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
+the module `pointing_path` instead. The cost of an error at the end of this path follows from a sweep along
+the attitude law over one more revolution.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _EYE: FloatArray = np.eye(3)
 
 
 def midpoint_step(expected: PathConditions, motion: PlannedMotion) -> tuple[FloatArray, FloatArray]:
-    """Return the attitudes (n, 4) and rates (n, 3) rad/s to which each step propagates its instant."""
+    """Return the attitudes (n, 4) and rates (n, 3), rad/s, at the end of each propagated step."""
     step, count = expected.step, len(motion.control)
     half, middle = _halfway(expected, motion)
     there = multiply(from_rotation_vector(step * middle), motion.quaternion[:count])
@@ -128,28 +128,28 @@ def _rotation_jacobian(vector: FloatArray) -> FloatArray:
 STEPS = 40
 """Maximum number of iterations of multiple shooting."""
 FARTHEST = math.radians(30.0)
-"""Largest rotation (rad) of any attitude by an iteration; a larger change is scaled down."""
+"""Largest rotation (rad) of an attitude by one iteration; a larger change is scaled down to this rotation."""
 HALVES = 6
 """Largest number of times that the change of an iteration is halved."""
 DEARER = 1.2
-"""Weight of the defects in the merit function, relative to the largest cost sensitivity to a defect."""
+"""Weight of the defects in the merit function, relative to the largest derivative of the cost by a defect."""
 DONE = math.radians(0.05)
 """Rotation (rad) by an iteration below which multiple shooting ends. Multiple shooting also ends if an
 iteration improves the merit by less than the fraction SAVED."""
 SAVED = 1e-4
 ENOUGH = 0.01
-"""Largest weighted defects of an acceptable motion, as a fraction of the motion's cost plus one."""
+"""Largest sum of weighted defects of an acceptable motion, relative to one plus the cost of the motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ShootingStep:
-    """A full Newton-like step of multiple shooting.
+    """A full step of multiple shooting (a linear-quadratic Newton step).
 
     Attributes:
         change: change (n + 1, 6) of rotation and rate.
         control: change (n, 3) of the dipole moment, A m^2.
-        gains: feedback gains about the motion.
-        linear: linear error model about the motion.
+        gains: feedback gains about the motion at which the step starts.
+        linear: linear error model about the motion at which the step starts.
         rotated: largest rotation of any attitude by the step, rad.
         sensitivity: largest derivative (6,) of the cost with respect to a defect at any instant.
     """
@@ -198,7 +198,7 @@ def best_course(
 
 @dataclass(eq=False)
 class _Merit:
-    """The merit function of a motion.
+    """The merit function by which motions are compared: the cost plus the weighted defects.
 
     `state` (6, 6) and `dipole` weight the errors and the dipole moment of a step. `dear` (6,) weights the
     defects.
@@ -218,7 +218,7 @@ class _Merit:
 
 
 def _direction(criterion: _Merit, motion: PlannedMotion) -> _ShootingStep:
-    """Return the full linear-quadratic step from a motion."""
+    """Return the full linear-quadratic Newton step from a motion, before any shortening."""
     expected, state, dipole = criterion.expected, criterion.state, criterion.dipole
     count, wanted, sizes = len(motion.control), expected.wanted, expected.sizes
     shown = attitude_matrix(motion.quaternion[:count])
@@ -282,8 +282,8 @@ def _moved(motion: PlannedMotion, change: FloatArray, control: FloatArray) -> Pl
 
 
 LEAST_PART = 1.0 / 3.0
-"""Minimum fraction of a table that is used without the rest. If the usable part is shorter, the previous
-table is kept."""
+"""Minimum fraction of a table that is used if the remainder of the table is unusable. If the usable part is
+shorter, the previous table is kept."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -337,7 +337,7 @@ class PointingTable:
         return float(np.linalg.norm(self.path.rate, axis=1).max())
 
     def below(self, fastest: float) -> PointingTable | None:
-        """Return the part before the rate reaches `fastest`, rad/s.
+        """Return the part of the table before the body rate reaches `fastest`, rad/s.
 
         Returns None if this part is shorter than the fraction `LEAST_PART` of the table.
 
@@ -432,7 +432,7 @@ def _beyond(
 ) -> CostToGo:
     """Return the cost-to-go of following the law from the instant with index `begin` on.
 
-    Column 0 of the linear part is for the law and the expected torques.
+    The first column of the linear part is for the law and the expected torques.
     """
     air, light = ahead.pressures.air[begin:], ahead.pressures.light[begin:]
     pressed = [(ahead.sizes[AIR], air), (ahead.sizes[LIGHT], light)]

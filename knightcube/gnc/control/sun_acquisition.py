@@ -3,13 +3,14 @@
 The direction of the Sun s and the field B are measured in body axes, and propagated between measurements by
 the gyro. The law demands the torque J (w^2 e - 2 z w rate), where e is the rotation from the body axis to the
 Sun. The coils can produce only the component of this torque across the field (Lovera & Astolfi 2004,
-Automatica 40(8)). A torque about the direction of the Sun is therefore added to cancel the component along
-the field. This torque disturbs the pointing of the body axis least. Unless the field is normal to the Sun,
-both axes across the Sun are controlled at once, while the body may roll about the Sun. The faster the roll,
-the less torque about the Sun is used. The direction of the Sun is propagated through an eclipse
-(`PropagatedSun`). Without a known direction, the body is only damped. The residual dipole moment, which
-causes the largest torque on a light body, is estimated and cancelled (`ResidualDipole`). The coils are off
-while the field is measured. They are driven only after the fields of two consecutive pauses agree.
+Automatica 40(8)). A torque about the direction of the Sun is therefore added, such that the sum has no
+component along the field. A torque about the Sun disturbs the pointing of the body axis least. Unless the
+field is normal to the Sun, both axes across the Sun are controlled at once, while the body may roll about the
+Sun. The faster the roll, the less torque about the Sun is used. The direction of the Sun is propagated
+through an eclipse (`PropagatedSun`). Without a known direction, the body is only damped. The residual dipole
+moment, which causes the largest torque on a light body, is estimated and cancelled (`ResidualDipole`). The
+coils are off while the field is measured. The coils are driven only after the fields measured in two
+consecutive pauses agree.
 """
 
 from __future__ import annotations
@@ -33,9 +34,10 @@ it."""
 LARGEST_BIAS = 3e-3
 """Largest estimated gyro bias per axis, rad/s."""
 LONGEST_DELAY = 0.5
-"""Longest age (s) of the last gyro reading at which propagated and measured direction are compared."""
+"""Longest age (s) of the last gyro reading with which the propagated and the measured direction are
+compared."""
 LONGEST_GAP = 3.0
-"""Longest gyro gap (s) over which the direction can be propagated."""
+"""Longest gap (s) between gyro readings over which the direction can be propagated."""
 _SECOND = 1e-9
 
 
@@ -45,7 +47,7 @@ class PropagatedSun:
     Between measurements the direction is propagated with the gyro rate. The drift from the measured
     directions gives the gyro bias, except for the bias component about the Sun, which does not move the
     direction. The direction can therefore be propagated through an eclipse. The estimator is a complementary
-    filter of one direction (Mahony, Hamel & Pflimlin 2008, IEEE Trans. Autom. Control 53(5)).
+    filter of one direction (Mahony, Hamel & Pflimlin 2008, IEEE Transactions on Automatic Control 53(5)).
     """
 
     def __init__(self) -> None:
@@ -126,17 +128,17 @@ AGREES = 0.2
 ROLL = 150.0
 """Cost of torques about other axes relative to the cost of a torque about the Sun."""
 FASTEST, FASTEST_ACROSS = 0.0165, 0.010
-"""Total rate and rate across the Sun (rad/s) above which the body is only damped. Both are lower than the
-rates above which the flight software detumbles."""
+"""Total rate, and rate across the direction of the Sun (rad/s), above which the body is only damped. Both
+limits are below the rates at which the flight software starts detumbling."""
 FASTEST_ROLL = 0.0105
 """Roll rate (rad/s) about the Sun above which a torque about the Sun is no longer preferred."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
-"""Bandwidth w (rad/s) and damping ratio z of the law. At one radian from the Sun the law uses at most the
-fraction `SHARE` of the coils' torque."""
+"""Bandwidth w (rad/s) and damping ratio z of the Sun pointing law. At one radian from the Sun the law uses at
+most the fraction `SHARE` of the coils' torque."""
 RESIDUAL = 0.05
 """Largest estimated residual dipole moment, as a fraction of the coils' limit."""
 _FIELD = 3e-5
-"""Typical field strength in a low orbit, T."""
+"""Typical strength of the Earth's magnetic field in a low orbit, T."""
 _NO_DIPOLE: FloatArray = np.zeros(3)
 
 
@@ -156,7 +158,7 @@ class SunAcquisitionSettings:
 
     @property
     def speed(self) -> float:
-        """Bandwidth w of the law for this body, rad/s."""
+        """Bandwidth w of the Sun pointing law for this body, rad/s."""
         return min(BANDWIDTH, math.sqrt(SHARE * self.limit * _FIELD / float(self.inertia.max())))
 
 

@@ -7,9 +7,9 @@ diameters of a small circle around a pixel. At a corner the intensity changes al
 cornerness is therefore the minimum, over all directions, of the sum of the squared intensity changes from the
 centre to both ends of a diameter. Between two neighbouring diameters the intensity is interpolated linearly
 with a parameter t from 0 to 1. With the squared changes r and r' along the two diameters, the squared change
-is A t^2 + 2 B t + C with C = r and A = r' - r - 2B. The coefficient B combines the two ends of the same
-diameter. Sease, eq. 3.12, is corrected in this respect, because the printed B1 mixes the ends of different
-diameters.
+is A t^2 + 2 B t + C with C = r and A = r' - r - 2B. The coefficient B combines the intensity changes to the
+two ends of the same diameter. Sease, eq. 3.12, is corrected in this respect, because the printed B1 mixes the
+ends of different diameters.
 """
 
 from __future__ import annotations

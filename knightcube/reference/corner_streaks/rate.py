@@ -3,11 +3,11 @@
 The order of the two ends of a streak is initially unknown. All stars rotate about a common axis a, so that
 a.(v2 - v1) = 0 for the end directions v1 and v2 of each streak. The axis, except for its sign, is the
 direction that is most nearly perpendicular to all chords v2 - v1. The sign of a.(v1 x v2) then determines the
-order of the ends (Sease, eq. 3.17-3.19, corrected). Unlike a computation with the projected centre of
-rotation, the computation with vectors has no singularity. OLAE computes the rotation, and a median-based
-scale of the residuals rejects outliers. The "Combined Indicator" of Sease uses the standard deviation
-instead, which outliers increase. A single frame cannot distinguish omega from -omega, so that a prior rate
-must decide.
+order of the ends (Sease, eq. 3.17-3.19, corrected). The computation with unit vectors has no singularity,
+unlike a computation with the projected centre of rotation. OLAE computes the rotation, and a median-based
+scale of the residuals rejects outliers. The "Combined Indicator" of Sease uses the standard deviation of the
+residuals instead, which outliers increase. A single frame cannot distinguish omega from -omega, so that a
+prior rate must decide.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def estimate_rate(
 def _rate(
     streaks: Streaks, pinhole: Pinhole, exposure: float, settings: StreakSettings, seen: StreakResult
 ) -> StreakResult:
-    """Return the result `seen` completed by the rate, except for its sign, or by the reason of failure."""
+    """Return the streak result `seen` with the rate up to its sign, or with the reason of failure."""
     seen = replace(
         seen,
         endpoints=streaks.endpoints,

@@ -29,8 +29,8 @@ class StreakSettings(EndpointSettings):
         endpoint_bias_sigma: uncertainty of `endpoint_bias`, which is an error common to all streaks, px.
         axis_tolerance: tolerated error of an endpoint in the search for the rotation axis, px.
         outlier_sigmas: number of robust standard deviations above which a streak is rejected.
-        worst_residual: largest accepted RMS residual of the endpoints, px; stars have at most 0.6 px, and
-            fragments that agree by chance 1 to 4 px (campaign `streaks`).
+        worst_residual: largest accepted RMS residual of the endpoints, px. True streaks have residuals of at
+            most 0.6 px, and fragments that agree by chance have 1 to 4 px (campaign `streaks`).
         sign_sigmas: minimum ratio of the prior rate along the rotation axis to its standard deviation for
             which the prior decides the sense of rotation.
     """

@@ -159,12 +159,12 @@ def _brightest_first(found: StreakResult, camera: CameraModel) -> tuple[FloatArr
 def _scatter(both: TwoAttitudes, count: int) -> float:
     """Return the ratio of the observed variance of the residuals to the assumed variance.
 
-    Each of the two attitudes has two residual components per star and three parameters. The ratio is
+    The fit of each attitude has two residual components per star and three parameters. The ratio is
     multiplied by nu/(nu - 2), with nu degrees of freedom, to allow for its own uncertainty (Student's t
     distribution).
 
     Args:
-        both: attitudes at the start and end.
+        both: attitudes at the start and end of the exposure.
         count: number of stars.
     """
     freedom = 4 * count - 6

@@ -10,8 +10,8 @@ the torques c x A(q) v by air and sunlight, which depend on the attitude. The to
 component along the field, so not every path is feasible. All derivatives are analytic, because A(q) v is a
 quadratic form of q whose second derivatives are twice Davenport's matrix.
 
-Paths are cubic Hermite curves (de Boor 1978, ch. IV), evaluated here because scipy.interpolate would take 20
-MiB of memory in each process that flies or plans a slew.
+Paths are cubic Hermite curves (de Boor 1978, chapter IV), evaluated here because scipy.interpolate would take
+20 MiB of memory in each process that flies or plans a slew.
 
 The end of a slew is an attitude, which gives three equations, or the direction of a boresight with a free
 roll, which gives two. The body rate at the end gives three more equations. All these equations are quadratic
@@ -110,7 +110,10 @@ def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the second derivative (n, 4, 4) of pull. A(q) v by q, which is twice Davenport's matrix."""
+    """Return the second derivatives (n, 4, 4) by q of the products of `pull` (n, 3) and A(q) v.
+
+    They are twice Davenport's matrices.
+    """
     curvature = np.empty((len(pull), 4, 4))
     outer = pull[:, :, None] * vector[:, None, :]
     inner = np.sum(pull * vector, axis=1)
@@ -123,7 +126,7 @@ def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
 class SlewDynamics:
     """The equations of motion of a satellite at n times, in units of `scale` s and of `unit` A m^2.
 
-    The state derivative x' is a constant plus the quadratic form 1/2 z . H z of z = (m + residual, b, e, w,
+    The state derivative x' is a constant plus the quadratic form z^T H z / 2 of z = (m + residual, b, e, w,
     q), where b and e are quadratic in q. One matrix product therefore gives the derivatives at all times at
     once.
     """
@@ -167,7 +170,7 @@ class SlewDynamics:
         return np.asarray(result)
 
     def curvature(self, x: FloatArray, m: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the second derivatives (n, 10, 10) of y . x' by state and dipole, for weights `y` (n, 7)."""
+        """Return the second derivatives (n, 10, 10), by state and dipole, of x' weighted with `y` (n, 7)."""
         z, turned = self._quantities(x, m)
         bend = (y @ self._quadratic.reshape(7, -1)).reshape(-1, _Z, _Z)
         parts = self._by_unknowns(turned)
@@ -216,7 +219,7 @@ def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:
-    """Return the symmetric matrices H (7, 16, 16) of the quadratic form 1/2 z . H z in x'."""
+    """Return the symmetric matrices H (7, 16, 16) of the quadratic form z^T H z / 2 in x'."""
     result = np.zeros((7, _Z, _Z))
     crossed = -cross_matrices(_EYE3)  # crossed[i] . (a, c) is component i of a x c
     result[:3, _Q, _W][:, :3] = 0.5 * crossed

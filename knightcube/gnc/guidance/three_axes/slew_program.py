@@ -13,11 +13,11 @@ neighbouring elements, so the Newton matrix is banded and is factored by LAPACK.
 it is used, because the control process imports this module without solving programs.
 
 The vector of inequalities g >= 0 contains the lower and upper limits of the dipoles (2, k + 1, 3), followed
-by the exclusion cones (cones, 2 k), for k intervals. The interior point method is that of Wachter and
-Biegler, Math. Program. 106 (2006), with the curvature test of Chiang and Zavala (Math. Program. 2016) instead
-of a count of eigenvalues, and with second-order corrections. Without limits, the method is Newton's method.
-Far from a feasible point, the curvature of the equations is omitted (Gauss-Newton), because it would lead to
-bad steps.
+by the exclusion cones (cones, 2 k), for k intervals. The interior point method is that of Wachter and Biegler
+(Mathematical Programming 106, 2006) with second-order corrections. The curvature test of Chiang and Zavala
+(Mathematical Programming, 2016) replaces the count of eigenvalues. Without inequalities, the interior point
+method reduces to Newton's method. Far from a feasible point, the second derivatives of the equations are
+omitted (Gauss-Newton), because there they lead to bad steps.
 """
 
 from __future__ import annotations
