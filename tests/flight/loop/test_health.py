@@ -11,12 +11,14 @@ from typing import Any, cast
 
 import pytest
 
+from flight.link import events
 from flight.loop import facts
 from flight.loop.facts import EventLog
 from flight.loop.health import (
     Board,
     ClockWatch,
     GroupsAndWorkers,
+    Housekeeping,
     PerformanceObserver,
     ResourceMonitor,
     ResourceSample,
@@ -336,3 +338,22 @@ def test_the_statistics_of_groups_and_jobs_are_in_seconds() -> None:
         ),
         ("job_timing", {"name": "vision", "execution": 0.25, "outcome": "done"}),
     ]  # fmt: skip
+
+
+def test_lost_records_are_reported_with_their_number_since_the_last_call() -> None:
+    said: list[tuple[Any, str]] = []
+    recorder = SimpleNamespace(lost=0, lost_text="")
+    log = SimpleNamespace(report=lambda kind, _, text: said.append((kind, text)), count=0)
+    services = cast(Any, SimpleNamespace(recorder=recorder, events=log, facts=None))
+    housekeeping = cast(Any, Housekeeping)(*(None,) * 5, lambda: "", services)
+    housekeeping.report_lost(0)
+    assert said == []
+    recorder.lost, recorder.lost_text = 3, "too long"
+    housekeeping.report_lost(1)
+    recorder.lost = 4
+    housekeeping.report_lost(2)
+    housekeeping.report_lost(3)
+    assert [kind for kind, _ in said] == [events.RECORD_LOST] * 2
+    assert said[0][1].startswith("3 ")
+    assert "too long" in said[0][1]
+    assert said[1][1].startswith("1 ")

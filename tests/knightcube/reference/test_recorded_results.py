@@ -31,6 +31,7 @@ from knightcube.reference.star_identification import (
     shared_rate,
 )
 from knightcube.reference.star_tables import KnownSky
+from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex, TriangleIndex, choose_guide_stars
 from sim_hal.earth_camera import render
 from tests.sim_hal.earth_camera.scenes import limb_scene
@@ -177,3 +178,13 @@ def test_circles_and_propagated_nadirs_are_as_recorded() -> None:
     nadir = propagated_nadir(np.array([0.0, 0.6, 0.8]), before, after)
     depth = [horizon_plane_depth(altitude) for altitude in (300e3, 900e3)]
     check(__file__, "circle", [circle, circle.distances(points), nadir, depth])
+
+
+def test_the_default_method_identifies_by_the_index_of_the_sky() -> None:
+    rng = np.random.default_rng(9)
+    stars = default_index().stars
+    one = draw(ListKind(14.0, noise_px=0.1, known_deg=0.0, faintest=6.0), stars, rng)
+    found = METHODS[DEFAULT_METHOD].identify(one.field(), KnownSky(default_index(), one.field().half_width))
+    claimed = found.star >= 0
+    assert np.count_nonzero(claimed) > 5
+    np.testing.assert_array_equal(found.star[claimed], one.star[claimed])

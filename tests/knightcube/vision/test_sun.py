@@ -20,7 +20,7 @@ from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.horizon.initial_guess import shortest_turn
 from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, SolarStringModel, coarse_sun
-from knightcube.vision.sun import LINEAR, SunSettings, SunStatus, find_sun, sun_of_cameras
+from knightcube.vision.sun import LINEAR, SunSettings, SunStatus, find_sun, sample, sun_of_cameras
 from sim_hal.assembly import wide_model
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.sim_hal.earth_camera.scenes import LOW, pointing, random_sun_scene
@@ -290,3 +290,17 @@ def test_all_cameras_are_read_with_uncertain_strings_and_none_in_eclipse(
     assert not night.each
     assert night.direction is None
     assert night.reason == "no light: eclipse"
+
+
+def test_a_strip_is_sampled_bilinearly_up_to_its_border() -> None:
+    rows, columns = np.indices((5, 7))
+    strip = (100.0 + 10.0 * columns + 3.0 * rows + 0.5 * rows * columns).astype(np.float64)
+    x = np.array([0.0, 2.25, 5.5, 5.999, 6.0, 3.0])
+    y = np.array([0.0, 1.5, 3.75, 3.999, 4.0, 2.0])
+    found = sample(strip, 20, np.stack([x, y + 20.0], axis=1))
+    np.testing.assert_allclose(found, 100.0 + 10.0 * x + 3.0 * y + 0.5 * x * y)
+    outside = np.array([[-0.01, 21.0], [6.01, 21.0], [2.0, 19.99], [2.0, 24.01]])
+    assert np.isnan(sample(strip, 20, outside)).all()
+    line = sample(strip[:1, :1], 0, np.array([[0.0, 0.0], [0.5, 0.0]]))
+    assert line[0] == 100.0
+    assert np.isnan(line[1])
