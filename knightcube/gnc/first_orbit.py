@@ -1,17 +1,17 @@
 """The orbit of an object from directions alone, fitted to all sightings from a satellite in a known orbit.
 
 The six unknowns at the middle of the arc are two angles of the direction, the relative velocity divided by
-the distance, and the logarithm of the distance. Sightings of one pass determine all unknowns except the
-distance well. The distance of an object in free fall near the observer can be determined only from the
-curvature of the path that gravity causes. The distance is therefore scanned (as over the admissible region of
-Milani et al., Celestial Mechanics 90, 2004). For each distance the other five unknowns are fitted by
-Gauss-Newton, and the best fit is refined in all six. The arc is long enough for an orbit if the 95 %
-confidence interval of the distance, found from chi-square, is short. Gauss's method finds the same distance,
-but uses only three sightings and is therefore noisier.
+the distance, and the logarithm of the distance. The sightings of one pass determine the distance poorly and
+the other unknowns well. The distance of an object in free fall near the observer can be determined only from
+the curvature of the path that gravity causes. The distance is therefore scanned (as over the admissible
+region of Milani et al., Celestial Mechanics 90, 2004). For each distance the other five unknowns are fitted
+by the Gauss-Newton method, and all six unknowns of the best fit are then refined. The arc is long enough for
+an orbit if the 95 % confidence interval of the distance, found from chi-square, is short. Gauss's method
+finds the same distance, but uses only three sightings and is therefore noisier.
 
 The forces are the gravity of a spherical Earth and J2. The directions of an object are compared with
-catalogue directions of stars, so light time and aberration shift the object by its velocity relative to the
-Sun.
+catalogue directions of stars, so light time and aberration shift the apparent direction according to the
+object's velocity relative to the Sun.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ class _ArcFit:
         )
 
     def residuals(self, unknowns: FloatArray) -> FloatArray:
-        """Return the residuals (k, 2 n) of n sightings, divided by their standard deviations."""
+        """Return the residuals (k, 2 n) of n sightings, divided by the standard deviations."""
         seen, middle = self._seen, self._middle
         start = self.states(unknowns)
         states = propagate_about(start, seen.times, middle)
@@ -308,7 +308,7 @@ class _ArcFit:
         return unknowns
 
     def refine(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the best unknowns (6,) near a guess, and their covariance (6, 6)."""
+        """Return the best-fit unknowns (6,) near a guess, and the covariance (6, 6) of the unknowns."""
         covariance = np.eye(6)
         for _ in range(_FINAL_ROUNDS):
             residual, jacobian = self._linear(unknowns[None])
@@ -326,7 +326,7 @@ class _ArcFit:
         return np.asarray(((ahead - behind) / (2.0 * _STEPS[:, None])).T)
 
     def _linear(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals (k, m) and their derivatives (k, m, 6) with respect to the unknowns."""
+        """Return the residuals (k, m), and the derivatives (k, m, 6) of the residuals by the unknowns."""
         shifts = np.concatenate([np.zeros((1, 6)), np.diag(_STEPS), -np.diag(_STEPS)])
         many = (unknowns[None] + shifts[:, None]).reshape(-1, 6)
         found = self.residuals(many).reshape(13, len(unknowns), -1)

@@ -9,18 +9,19 @@ Automatic Control 28). The component of z across the line of sight is the angula
 along the line of sight is s = (range rate) / range. The angular acceleration is -2 s v.
 
 Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
-gradient gives their relative acceleration, to first order in the distance divided by the orbit radius.
+gradient gives the relative acceleration of object and observer, to first order in the distance divided by the
+orbit radius.
 
 The process noise models tidal accelerations as white noise of density `wander`, or `residual_wander` if the
 gravity gradient is known. More process noise along the line of sight lets the filter follow motions that are
 not straight lines. For example, s changes by rate^2 per second for an object that moves along a great circle
 at a constant rate. The additional density is (`bend` rate^2)^2 / rate.
 
-Sightings are assigned to tracks in order of their chi-square, each to at most one track. This is the greedy
-nearest neighbour method (Blackman and Popoli 1999, Design and Analysis of Modern Tracking Systems, section
-6.4). Unassigned sightings start tentative tracks. A track is confirmed after m sightings in n frames if its
-rate differs from that of a star. During these n frames, two unconfirmed tracks may share a sighting. A
-confirmed track coasts while its object is not visible.
+Sightings are assigned to tracks in order of increasing chi-square, each sighting to at most one track. This
+is the greedy nearest neighbour method (Blackman and Popoli 1999, Design and Analysis of Modern Tracking
+Systems, section 6.4). Unassigned sightings start tentative tracks. A track is confirmed after m sightings in
+n frames if its angular rate differs from the rate of a star. During these n frames, two unconfirmed tracks
+may share a sighting. A confirmed track is propagated without measurements while the object is not visible.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class MotionModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineOfSightState:
-    """The direction to an object and its motion at one time.
+    """Direction and relative velocity of an object at one time.
 
     Attributes:
         time_ns: time of the state.
@@ -123,7 +124,7 @@ class DirectionInnovation:
 def begin(
     time_ns: int, direction: FloatArray, covariance: FloatArray, motion: MotionModel
 ) -> LineOfSightState:
-    """Return the line of sight after one sighting with covariance (3, 3) rad^2, whose rate is unknown."""
+    """Return the line of sight, with unknown rate, after one sighting of covariance (3, 3), rad^2."""
     along = np.outer(direction, direction)
     across = np.eye(3) - along
     start = np.zeros((6, 6))
@@ -219,8 +220,8 @@ def _noise(state: LineOfSightState, step: float, motion: MotionModel, known: boo
 
 _UNSEEN = np.full(3, np.nan)
 _ALIKE = 2.0
-"""Largest brightness difference of a sighting from a tentative track, in standard deviations. A confirmed
-track has no such limit, because its position is known well and an object may flash."""
+"""Largest brightness difference of a sighting from a tentative track, in standard deviations. The brightness
+of a confirmed track is not limited, because the position is known well and an object may flash."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,8 +233,8 @@ class TrackSettings:
         needed: number of sightings, within `within` frames, that confirm a track.
         within: number of frames in which `needed` sightings confirm a track.
         missed: probability that the gate rejects a true sighting of the object.
-        moving: minimum difference of the rate from that of the stars, in standard deviations, to confirm a
-            track.
+        moving: minimum difference between the angular rate and the rate of the stars, in standard deviations,
+            to confirm a track.
         minimum_rate: angular rate below which an object cannot be distinguished from an uncatalogued star,
             rad/s.
         coast: time that a confirmed track lasts without a sighting, s.
@@ -269,8 +270,8 @@ class Track:
         history: one bit per frame, set if the frame has a sighting; the newest frame is the lowest bit.
         measured: direction (3,) of the sighting in the newest frame; NaN without a sighting.
         measured_sigma: standard deviation of `measured` along each axis, including the attitude error, rad.
-        chi_square: chi-square of the sightings relative to their predictions, with two degrees of freedom per
-            sighting after the first.
+        chi_square: chi-square of the sightings relative to the predictions, with two degrees of freedom per
+            sighting after the first sighting.
     """
 
     number: int
@@ -307,7 +308,7 @@ class ObjectTracker:
 
     @property
     def objects(self) -> tuple[Track, ...]:
-        """The confirmed tracks in order of their age, the oldest first."""
+        """The confirmed tracks, the oldest track first."""
         return tuple(sorted((t for t in self._tracks if t.confirmed), key=lambda track: track.number))
 
     def predicted(self, number: int, time_ns: int) -> LineOfSightState | None:
@@ -448,7 +449,7 @@ def _brightness(track: Track, magnitude: float, count: int) -> tuple[float, floa
         return magnitude, math.nan
     before = 0.0 if math.isnan(track.magnitude_sigma) else track.magnitude_sigma
     change = magnitude - track.magnitude
-    # The variance of the mean of n magnitudes is their sum of squared deviations divided by n (n - 1).
+    # The variance of the mean of n magnitudes is the sum of squared deviations divided by n (n - 1).
     scatter = before**2 * (count - 1) * max(count - 2, 0) + change**2 * (count - 1) / count
     return track.magnitude + change / count, math.sqrt(scatter / (count * (count - 1)))
 

@@ -250,7 +250,7 @@ def search(
 def _best(
     view: ScaledField, sky: KnownSky, candidates: Candidates, taken: int, settings: ClassicalSettings
 ) -> StarMatch | None:
-    """Return the first verified candidate of the first `taken` ones, in order of decreasing support."""
+    """Return the first verified candidate among the `taken` candidates with the highest support."""
     if not taken:
         return None
     observed, star = candidates.observed[:taken], candidates.star[:taken]
@@ -354,7 +354,7 @@ def shared(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def within(sky: KnownSky, one: IntArray, other: IntArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return for each pair of guide stars (k,) whether its angle lies between `low` and `high` (rad)."""
+    """Return for each pair of guide stars (k,) whether the angle lies between `low` and `high` (rad)."""
     direction = sky.stars.direction
     cosine = np.einsum("kx,kx->k", direction[one], direction[other])
     minimum, maximum = np.cos(np.minimum(high, np.pi)), np.cos(np.maximum(low, 0.0))
@@ -378,7 +378,7 @@ def propose_pyramids(view: ScaledField, sky: KnownSky, settings: ClassicalSettin
 def cycled_triangles(stars: int) -> Iterator[tuple[int, int, int]]:
     """Yield the triangles of `stars` stars in the order of the pyramid method (Mortari et al. 2004).
 
-    The triangles are ordered by the differences between the indices of their stars.
+    The triangles are ordered by the differences between the indices of the three stars.
     """
     for step in range(1, stars - 1):
         for further in range(1, stars - step):
@@ -389,7 +389,7 @@ def cycled_triangles(stars: int) -> Iterator[tuple[int, int, int]]:
 def _pyramids(
     view: ScaledField, sky: KnownSky, corners: tuple[int, int, int], found: IntArray, tolerance: float
 ) -> Candidates:
-    """Return the matched triangles `found` (k, 3) that a fourth star confirms, with this star."""
+    """Return those matched triangles `found` (k, 3) that a fourth star confirms, extended by this star."""
     rest = np.setdiff1d(np.arange(view.stars), corners)
     pivot = np.full(len(rest), corners[0])
     _, low, high = view.angles(pivot, rest, tolerance)
@@ -449,7 +449,7 @@ def _triangle_matches(
     tolerance: float,
 ) -> Candidates:
     """Return the guide star triangles in a table that match observed triangles (t, 3)."""
-    # The area of a triangle is proportional to the scale squared, the polar moment to its fourth power.
+    # The area of a triangle is proportional to scale^2, and the polar moment to scale^4.
     reach = tolerance * found.sigma_area + 2.0 * view.slack * found.area
     # The limits are widened by the rounding of the table's values to float32.
     reach = reach + 1e-7 * found.area

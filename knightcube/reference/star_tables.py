@@ -6,10 +6,10 @@ rad. Pairs are sorted by angle and searched with a k-vector, which finds the key
 search (Mortari & Neta, K-vector range searching techniques, 2000). A straight line approximates the sorted
 keys. The k-vector contains the number of keys below each of the evenly spaced values of the line. The inverse
 of the line gives the cell of a value, so that two look-ups give the beginning and end of a range. Ranges are
-half-open (low <= key < high). Unlike equation 61 of Michalski, which returns some additional keys, this
-implementation compares the keys in the two boundary cells and is exact. Equation 54 of Michalski is corrected
-to 2 delta-epsilon, as in the original paper, so that the line ends above the largest key. The margin 2.22e-16
-in equation 56 of Michalski is replaced by a margin proportional to the size of the keys.
+half-open (low <= key < high). Equation 61 of Michalski returns some additional keys. This implementation is
+exact, because it also compares the keys in the two boundary cells. Equation 54 of Michalski is corrected to 2
+delta-epsilon, as in the original paper, so that the line ends above the largest key. The margin 2.22e-16 in
+equation 56 of Michalski is replaced by a margin proportional to the size of the keys.
 
 Triangle tables: Triangles of the brighter guide stars are described by area and polar moment. Planar
 triangles have chords as sides (Michalski, eq. 35-48, and Cole & Crassidis, Fast star-pattern recognition
@@ -22,9 +22,9 @@ theta is the angle from the mean direction of the corners. Each table contains a
 into one frame, sorted by area with a k-vector. The corners of a triangle are ordered by the length of the
 opposite side, so that matching triangles also have matching corners.
 
-Grid table (Padgett & Kreutz-Delgado 1997): The grid pattern of a star is the set of cells occupied by its
-neighbours. The star is the origin of a tangent plane, and the nearest neighbour outside a buffer radius
-defines the +x axis. Each other star within the pattern radius occupies one cell.
+Grid table (Padgett & Kreutz-Delgado 1997): The grid pattern of a star is the set of cells that the
+neighbouring stars occupy. The star is the origin of a tangent plane, and the nearest neighbour outside a
+buffer radius defines the +x axis. Each other star within the pattern radius occupies one cell.
 
 Each table is built at its first use, so that only the tables of the methods in use need memory.
 """
@@ -124,7 +124,7 @@ def build_k_vector(key: npt.NDArray[Any], cells: int | None = None) -> KVector:
 
 
 def members(start: IntArray, stop: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the concatenated indices (k,) of m ranges, and for each index (k,) the position of its range."""
+    """Return the concatenated indices (k,) of m ranges, and the range (k,) to which each index belongs."""
     length = stop - start
     owner = np.repeat(np.arange(len(start)), length)
     begin = np.cumsum(length) - length
@@ -466,7 +466,7 @@ class GridTable:
     star: npt.NDArray[np.int32]
 
     def votes(self, cells: IntArray) -> IntArray:
-        """Return for each guide star (n,) how many of the given cells (k,) its grid pattern occupies."""
+        """Return the numbers (n,) of given cells (k,) that the patterns of the guide stars occupy."""
         place, _ = members(self.begin[cells], self.begin[cells + 1])
         return np.bincount(self.star[place], minlength=len(self.aligning))
 
@@ -476,7 +476,7 @@ def build_grid(direction: FloatArray, tree: cKDTree, radius: float) -> GridTable
 
     Args:
         direction: (n, 3) unit vectors to the guide stars.
-        tree: search tree of these directions.
+        tree: search tree of the guide star directions.
         radius: radius of the patterns, rad.
     """
     pairs = tree.query_pairs(2.0 * np.sin(0.5 * radius), output_type="ndarray").astype(np.int64)

@@ -156,7 +156,7 @@ class Detumbler:
             return
         window = (time_ns - self._begun_ns) // self._schedule.period_ns
         if window <= self._closed:
-            return  # the sample is late, and the mean field of its window is already computed
+            return  # the mean field of the window of this late sample is already computed
         if window != self._window:
             self._samples.clear()
             self._window = window
@@ -188,7 +188,7 @@ class Detumbler:
         return self._rate
 
     def _close_window(self) -> None:
-        """Average the samples of a window, and compute the rate from this mean field and the previous one."""
+        """Average the samples of a window, and compute the rate from this and the previous mean field."""
         if not self._samples:
             return
         time_ns = round(sum(time for time, _ in self._samples) / len(self._samples))

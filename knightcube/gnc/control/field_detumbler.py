@@ -1,15 +1,16 @@
-"""Detumbling of a free satellite with its magnetometer, and with gyro and attitude if available.
+"""Detumbling of a free satellite with the magnetometer, and with gyro and attitude if available.
 
-The field of the coils disturbs the magnetometer. The coils are therefore switched off periodically, first to
-let the field settle, then to measure it. The filter `knightcube.gnc.estimation.field_rate` uses the samples
-in these pauses to estimate all components of the body rate and the rotation of the field in inertial axes. A
-gyro sample gives the rate along the field at once. The momentum plan uses a predicted field. If the attitude
-is known, it is predicted along the orbit. Otherwise the measured field is assumed to rotate on at its present
-rate. In contrast to B-dot control, a spin along the field is also removed, as soon as the field has rotated.
-The coils stay off until `TRUSTED` consecutive samples agree with the prediction of the filter and the
-standard deviation of the rate across the field is below `BOUNDED`. Until then, samples outside the pauses are
-used as well. The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because
-a restarted sensor may give only unusable fields.
+The field of the coils disturbs the magnetometer. The coils are therefore switched off periodically, first
+until the field of the coils has decayed, then to measure the field. The filter
+`knightcube.gnc.estimation.field_rate` uses the samples in these pauses to estimate all components of the body
+rate and the rotation of the field in inertial axes. A gyro sample gives the rate along the field at once. The
+momentum plan uses a predicted field. If the attitude is known, the field is predicted along the orbit.
+Otherwise the measured field is assumed to continue to rotate at the present rate. In contrast to B-dot
+control, a spin along the field is also removed, as soon as the field has rotated. The coils stay off until
+`TRUSTED` consecutive samples agree with the prediction of the filter and the standard deviation of the rate
+across the field is below `BOUNDED`. Until then, samples outside the pauses are used as well. The coils are
+switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a restarted sensor may give
+only unusable fields.
 
 The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
 momentum obeys h' = m x B, in which inertia and attitude do not appear. By Pontryagin's principle, the dipole
@@ -19,12 +20,13 @@ satisfies
 
     h . y <= L integral of |B x y| over T + r |y|,
 
-The minimum time is the smallest T at which even the worst y satisfies this inequality, and the plan is this
-y. For the worst y, A(y) y is parallel to h, where A is the integral of L (B^2 I - B B^T) / |B x y| plus r /
-|y|. The worst y is found by iterating this condition (iteratively reweighted least squares). Momentum along
-the field can be removed only after the field has rotated. The minimum-time plan may first add momentum across
-the field, which is removed later. The plan leaves a residual momentum r, because removing the last momentum
-along a slowly rotating field would take most of the time.
+The minimum time is the smallest T for which every y satisfies this inequality, and the plan is the worst y,
+for which the inequality holds with equality. For the worst y, A(y) y is parallel to h, where A is the
+integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. The worst y is found by iteratively reweighted least
+squares: A is computed with the last y, and then the next y from A. Momentum along the field can be removed
+only after the field has rotated. The minimum-time plan may first add momentum across the field, which is
+removed later. The plan leaves a residual momentum r, because removing the last momentum along a slowly
+rotating field would take most of the time.
 
 The minimum-time plan first accelerates a body that spins along the field, about an axis across the field. The
 settings `gentle` and `spin_up` therefore give an upper bound of the rate. At this bound, the commanded dipole
@@ -220,8 +222,8 @@ LEFT = 0.7
 """Residual momentum of a plan, as a fraction of the momentum at which a body counts as detumbled."""
 FEW, SOON = 4.0, 5.0
 """Ratio of the momentum to the residual momentum of a plan, and duration (s), that define the last phase of
-detumbling. A momentum below FEW times the residual momentum of a plan is removed within SOON seconds if its
-component along the field is small."""
+detumbling. A momentum below FEW times the residual momentum of a plan is removed within SOON seconds if the
+momentum along the field is small."""
 KNOWN = 2e-3
 """Standard deviation (rad/s) of the least certain rate component below which the upper bound of the rate is
 set."""
@@ -340,7 +342,7 @@ class FieldDetumbler:
     def dipole(self, now_ns: int) -> FloatArray:
         """Return the present dipole (3,) A m^2, zero while the field is measured or the rate is unknown."""
         schedule = self._schedule
-        if self._filter.started:  # before the filter has started, only samples advance it
+        if self._filter.started:  # a filter that has not started is advanced by samples only
             self._advance(max(now_ns, self._time_ns))
         if self.trusted and now_ns - self._accepted_ns > SILENT_PERIODS * schedule.period_ns:
             self._distrust()
@@ -351,7 +353,7 @@ class FieldDetumbler:
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the dipole moment (3,) A m^2 that acts instead of the commanded one until the next command."""
+        """Set the dipole moment (3,), A m^2, that acts until the next command, if not the commanded one."""
         if self._dipole.any() or dipole.any():
             self._driven_ns = self._commanded_ns
         self._dipole = dipole

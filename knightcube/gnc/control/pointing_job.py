@@ -62,9 +62,9 @@ FINE = 5
 TAIL = 300.0
 """Duration (s) after the end of a slew for which the slew table still contains feedback gains."""
 END = 2_000.0
-"""Weight (s) of errors at the end of a slew: an end error costs as much as the same error during this time.
-The weight is high because the torques are poorly known before the slew, and their effects should be corrected
-by the end of the slew."""
+"""Weight (s) of errors at the end of a slew: an error at the end costs as much as the same error that lasts
+for this time. The weight is high because disturbance torques are poorly known before the slew, and the errors
+that they cause should be corrected by the end of the slew."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
 """Additional factor by which a slew that rotates too fast is lengthened, largest total factor, and largest
 number of trials."""
@@ -176,7 +176,9 @@ def slew_table(
     expected: PointingPreview,
     weights: PointingWeights,
 ) -> PointingTable:
-    """Return the table of a slew and the following law, in steps of a fifth of the step of `begin.times`.
+    """Return the pointing table for a slew and the following attitude law.
+
+    A step of this table is a fifth of a step of `begin.times`.
 
     `residual` (3,) A m^2 is the residual dipole moment with which the path was planned. Only the environment
     of `expected` is used, at the times of `begin`.
@@ -341,8 +343,8 @@ def prepare() -> None:
 def run(job: PointingJob) -> PointingTable:
     """Return the table, whose times are in seconds after the job's origin.
 
-    The computation takes about one second, or two with a slew. Raises FlightError if the magnetic field is
-    unknown, and UsageError if the law does not define an attitude.
+    The computation takes about one second, or two seconds with a slew. Raises FlightError if the magnetic
+    field is unknown, and UsageError if the law does not define an attitude.
     """
     span = job.span
     ahead = predict(job.orbit, span.preview + 4.0 * STEADY.step)

@@ -1,9 +1,9 @@
 """The pointing law, which computes a dipole moment from a table of gains, and the recovery from large errors.
 
 The law is linear in small rotations. With a large error, the law would saturate the coils and could make a
-light body rotate faster than before. A new path is therefore planned for a body that leaves its path. A body
-far from its path is first damped until its rate is low. The damping torque is the component of -2 w J rate
-normal to the field, which removes energy in any attitude.
+light body rotate faster than before. A new path is therefore planned if the body leaves the planned path. Far
+from the planned path, the body is first damped until its rate is low. The damping torque is the component of
+-2 w J rate normal to the field, which removes energy in any attitude.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class PointingLaw:
         k, table = self._table.path.position(time)[0], self._table
         beyond = sizes - table.sizes
         pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond
-        # The component of the dipole moment along the field is removed, because it causes no torque.
+        # The dipole moment along the field is removed, because a dipole along the field causes no torque.
         dipole = field * (float(field @ pull) / float(field @ field)) - pull - residual_dipole
         # All coils are scaled by one factor, which preserves the direction of the torque.
         largest = float(np.abs(dipole).max())

@@ -1,13 +1,14 @@
 """The optimal motion of a body from the present attitude to an attitude law, by linear-quadratic sweeps.
 
 The errors x of the body relative to a reference motion are a small rotation and a rate error, both in the
-axes of the reference motion. With the predicted field b(t) in these axes, the errors obey
+axes of the reference motion. With the predicted field b(t) in the axes of the reference motion, the errors
+obey the linear equations
 
     turn' = rate - w_r x turn,    J rate' = ([J w_r x] - [w_r x] J) rate + G turn + m x b - f,
 
-where G is the stiffness of the gravity gradient and f the torque that the reference motion requires in
-addition to the modelled torques. Riccati's equation is integrated backwards for the cost-to-go x^T S x / 2 +
-s^T x (Psiaki 2001, Journal of Guidance, Control, and Dynamics 24(2)). The affine part s, which anticipates
+The matrix G is the stiffness of the gravity gradient, and f is the torque that the reference motion requires
+in addition to the modelled torques. Riccati's equation is integrated backwards for the cost-to-go x^T S x / 2
++ s^T x (Psiaki 2001, Journal of Guidance, Control, and Dynamics 24(2)). The affine part s, which anticipates
 future torques, is added here. The dipole moment m = -(K x + k) is constant during a step. The affine part of
 the error model has one column for each source of errors. The vector k is linear in the affine part and has
 the same columns. A sweep also supports controls other than the dipole moment.
@@ -131,7 +132,7 @@ def acceleration_slopes(
     """Return the derivatives (n, 3, 6) of angular accelerations by rotation and rate.
 
     The second and third result are the field and the position (n, 3) in body axes. The motion has attitudes
-    (n, 4) and rates (n, 3) rad/s; the other arguments are those of `linearised`.
+    (n, 4) and rates (n, 3) rad/s; the other arguments have the same meaning as in `linearised`.
     """
     turned, inverse = attitude_matrix(quaternion), np.linalg.inv(inertia)
     shown, up = (np.einsum("nij,nj->ni", turned, vectors) for vectors in (field, position))
@@ -188,7 +189,10 @@ def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Return exp(F dt) (n, 6, 6) and the rate columns (n, 6, 3) of its integral, to third order in dt."""
+    """Return the transition matrices exp(F dt) (n, 6, 6) and the rate columns (n, 6, 3) of their integrals.
+
+    Both are computed to third order in dt.
+    """
     first = flow * dt
     second = first @ first
     transition = _EYE6 + first + 0.5 * second + first @ second / 6.0
@@ -230,7 +234,7 @@ class PathConditions:
         field, position: magnetic field (T) and position (m), each (n + 1, 3), ICRS.
         pressures: pressures of air and sunlight, which determine the sizes of the torques.
         sizes: estimated sizes (9,) of the disturbance torques, N m.
-        inertia, inverse: inertia tensor (3, 3) in body axes, kg m^2, and its inverse.
+        inertia, inverse: inertia tensor (3, 3) in body axes, kg m^2, and the inverse of this tensor.
         limit: dipole limit of each coil, A m^2.
     """
 
@@ -343,7 +347,7 @@ class PlannedMotion:
     control: FloatArray
 
     def references(self, times: FloatArray) -> AttitudeReferences:
-        """Return the motion as a reference motion, given its times (n + 1,) s."""
+        """Return the motion as a reference motion at times (n + 1,), s."""
         rises = np.diff(self.rate, axis=0) / (times[1] - times[0])
         return AttitudeReferences(times, self.quaternion, self.rate, np.concatenate([rises, rises[-1:]]))
 

@@ -1,14 +1,15 @@
 """The table of the pointing law, with the best motion over the next revolution and feedback gains.
 
-The motion is found by multiple shooting with linear-quadratic steps. Each step is shortened until it improves
-a merit function, the cost plus the weighted defects (Nocedal & Wright 2006, Numerical Optimization, algorithm
-18.3). In contrast to the sweeps of `pointing_path`, intermediate motions need not be feasible. The defect of
-a step is the difference between its propagated end and the next instant, and the following iterations remove
-all defects (Bock & Plitt 1984, IFAC 9th World Congress). Multiple shooting prevents errors from growing along
-a revolution. Errors could otherwise grow, because coils cause no torque about the field and the body may
-rotate far about the pointing axis. An iteration takes 0.07 ms per instant. The motion is propagated by the
-midpoint rule, and derivatives are computed of this discrete rule. With derivatives of the continuous motion,
-the iteration would stall for bodies that rotate by degrees per time step.
+The motion is found by multiple shooting with linear-quadratic steps. Each step is shortened until the step
+improves a merit function, the cost plus the weighted defects (Nocedal & Wright 2006, Numerical Optimization,
+algorithm 18.3). In contrast to the sweeps of `pointing_path`, intermediate motions need not be feasible. The
+defect of a time step is the difference between the propagated state at the end of the step and the state at
+the next instant. The iterations remove all defects (Bock & Plitt 1984, IFAC 9th World Congress). Multiple
+shooting prevents errors from growing along a revolution. Errors could otherwise grow, because coils cause no
+torque about the field and the body may rotate far about the pointing axis. An iteration takes 0.07 ms per
+instant. The motion is propagated by the midpoint rule, and derivatives are computed of this discrete rule.
+With derivatives of the continuous motion, the iteration would stall for bodies that rotate by degrees per
+time step.
 
 If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
 the module `pointing_path` instead. The cost of an error at the end of this path follows from a sweep along
@@ -112,7 +113,7 @@ def _pushes(inverse: FloatArray, shown: FloatArray) -> FloatArray:
 
 
 def _rotation_jacobian(vector: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 3, 3) of rotations by their rotation vectors (n, 3).
+    """Return the derivatives (n, 3, 3) of rotations by the rotation vectors (n, 3).
 
     The derivatives are left Jacobians of the rotation group, for scalar-last quaternions from inertial into
     body axes.
@@ -210,7 +211,7 @@ class _Merit:
     dear: FloatArray = field(default_factory=lambda: np.zeros(6))
 
     def merit(self, motion: PlannedMotion) -> tuple[float, float]:
-        """Return the cost of a motion and the sum of its weighted defects."""
+        """Return the cost of a motion and the sum of the weighted defects."""
         deviation = errors(self.expected.wanted, motion)
         squares = float(np.einsum("ni,ij,nj->", deviation, self.state, deviation))
         squares += self.dipole * float(np.sum(motion.control**2))
@@ -296,8 +297,8 @@ class PointingWeights:
         dipole: dipole moment of each axis with unit cost, A m^2.
         fastest: rate above which the cost increases steeply while the body approaches the law (see
             `pointing_path.EXCESS`), rad/s.
-        roll: rotation error with unit cost about the unit vector `axis` (3,), rad, if it weighs less than
-            other rotations.
+        roll: rotation error with unit cost about the unit vector `axis` (3,), rad, if rotations about this
+            axis weigh less than other rotations.
     """
 
     turn: float
@@ -320,7 +321,8 @@ class PointingTable:
         torque_part: change of the dipole moment per change of each disturbance size (n, 3, sizes), A m^2/(N
             m).
         sizes: sizes of the disturbance torques with which the path was planned, N m.
-        slew: slew at the start of the path, or None; its times count from the start of the path.
+        slew: slew path at the start of the table, with times from the start of the path, or None without a
+            slew.
     """
 
     path: AttitudeReferences
@@ -341,7 +343,7 @@ class PointingTable:
 
         Returns None if this part is shorter than the fraction `LEAST_PART` of the table.
 
-        A table with a slew is never shortened; it is returned whole or not at all.
+        A table with a slew is never shortened, so the result is the whole table or None.
         """
         over = np.flatnonzero(np.linalg.norm(self.path.rate, axis=1) >= fastest)
         if not len(over):

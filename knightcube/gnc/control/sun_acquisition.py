@@ -5,12 +5,12 @@ the gyro. The law demands the torque J (w^2 e - 2 z w rate), where e is the rota
 Sun. The coils can produce only the component of this torque across the field (Lovera & Astolfi 2004,
 Automatica 40(8)). A torque about the direction of the Sun is therefore added, such that the sum has no
 component along the field. A torque about the Sun disturbs the pointing of the body axis least. Unless the
-field is normal to the Sun, both axes across the Sun are controlled at once, while the body may roll about the
-Sun. The faster the roll, the less torque about the Sun is used. The direction of the Sun is propagated
-through an eclipse (`PropagatedSun`). Without a known direction, the body is only damped. The residual dipole
-moment, which causes the largest torque on a light body, is estimated and cancelled (`ResidualDipole`). The
-coils are off while the field is measured. The coils are driven only after the fields measured in two
-consecutive pauses agree.
+field is normal to the direction of the Sun, both axes across this direction are controlled simultaneously,
+while the body may roll about the direction. The torque about the direction of the Sun is reduced for a body
+that rolls fast. The direction of the Sun is propagated through an eclipse (`PropagatedSun`). Without a known
+direction, the body is only damped. The residual dipole moment, which causes the largest torque on a light
+body, is estimated and cancelled (`ResidualDipole`). The coils are off while the field is measured. The coils
+are driven only after the fields measured in two consecutive pauses agree.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ MEMORY = 2400.0
 SMOOTHED, DRIFT = 10.0, 6.5e-4
 """Averaging time (s) of measured directions, and gain (rad/s^2) from a direction error to the gyro bias."""
 JUMP = 0.5
-"""Sine of the smallest angle from the propagated to a measured direction at which the measurement replaces
-it."""
+"""Sine of the smallest angle between the propagated and a measured direction at which the measurement
+replaces the propagated direction."""
 LARGEST_BIAS = 3e-3
 """Largest estimated gyro bias per axis, rad/s."""
 LONGEST_DELAY = 0.5
@@ -92,8 +92,8 @@ class ResidualDipole:
 
     A Luenberger observer predicts the rate from the dipole moments of coils and body and follows the measured
     rate. The difference is attributed to a residual dipole moment across the field. The component along the
-    field becomes observable when the field rotates in body axes. Torques of gravity and air across the field
-    are also attributed to the dipole moment, and are cancelled with it.
+    field becomes observable when the field rotates in body axes. Gravity-gradient and air torques across the
+    field are also attributed to the residual dipole moment, and are therefore cancelled as well.
     """
 
     def __init__(self, inertia: FloatArray, bound: float) -> None:
@@ -133,8 +133,8 @@ limits are below the rates at which the flight software starts detumbling."""
 FASTEST_ROLL = 0.0105
 """Roll rate (rad/s) about the Sun above which a torque about the Sun is no longer preferred."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
-"""Bandwidth w (rad/s) and damping ratio z of the Sun pointing law. At one radian from the Sun the law uses at
-most the fraction `SHARE` of the coils' torque."""
+"""Bandwidth w (rad/s) and damping ratio z of the Sun pointing law. At one radian from the Sun, the law
+demands at most the fraction `SHARE` of the torque that the coils can produce."""
 RESIDUAL = 0.05
 """Largest estimated residual dipole moment, as a fraction of the coils' limit."""
 _FIELD = 3e-5
@@ -163,7 +163,7 @@ class SunAcquisitionSettings:
 
 
 class SunAcquisition:
-    """The Sun acquisition with its estimates of Sun, field and residual dipole moment.
+    """The Sun acquisition law, with estimates of the Sun direction, field and residual dipole moment.
 
     It accepts the readings of the inertial unit and the directions of the Sun in order of time, and returns
     the dipole moment of each cycle.
@@ -199,7 +199,7 @@ class SunAcquisition:
         self._sun.measure(time_ns, sun)
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the dipole moment (3,) A m^2 that acts instead of the commanded one until the next command."""
+        """Set the dipole moment (3,), A m^2, that acts until the next command, if not the commanded one."""
         self._acts = dipole
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
@@ -244,13 +244,13 @@ class SunAcquisition:
         if square > FASTEST**2 or square - roll**2 > FASTEST_ACROSS**2:
             return torque
         torque = torque + speed**2 * seeking.inertia * _rotation_to_sun(seeking.axis, sun)
-        # A torque about the Sun cancels the component along the field, because it disturbs the axis least.
+        # A torque about the Sun cancels the torque along the field, because it disturbs the pointing least.
         cheap = 1.0 + (ROLL - 1.0) * math.exp(-((roll / FASTEST_ROLL) ** 2))
         spread = field + (cheap - 1.0) * float(sun @ field) * sun
         return torque - spread * (float(field @ torque) / float(field @ spread))
 
     def _close(self, rotated: FloatArray) -> None:
-        """End a pause, and estimate the field as the median of its samples, which is robust to outliers."""
+        """End a pause, and estimate the field as the median of the samples, which is robust to outliers."""
         found = np.median([rotated @ sample for sample in self._samples], axis=0)
         self._samples = []
         strength = math.sqrt(float(found @ found))

@@ -45,7 +45,7 @@ def minimum_eigenvalue(tensor: StructureTensor) -> FloatArray:
     half_trace = 0.5 * (tensor.xx + tensor.yy)
     larger = half_trace + np.hypot(0.5 * (tensor.xx - tensor.yy), tensor.xy)
     determinant = tensor.xx * tensor.yy - tensor.xy**2
-    # Dividing the determinant by the larger eigenvalue avoids cancellation if the smaller one is near zero.
+    # The smaller eigenvalue is the determinant divided by the larger one, which avoids cancellation.
     return np.asarray(np.maximum(determinant, 0.0) / np.where(larger > 0.0, larger, 1.0))
 
 

@@ -270,7 +270,7 @@ def _reject_and_solve(
 
 
 def _components(vectors: FloatArray, solution: OlaeSolution) -> tuple[FloatArray, FloatArray]:
-    """Return the OLAE residuals (n,) of streaks along their motion, and (n,) across their motion, rad."""
+    """Return the OLAE residuals, rad, along the motion of each streak (n,) and across the motion (n,)."""
     starts, ends = vectors[:, 0], vectors[:, 1]
     residual = np.cross(starts + ends, solution.rodrigues) - (ends - starts)
     along, across = _motion_axes(starts + ends, solution.rodrigues)
@@ -286,7 +286,7 @@ def _motion_axes(sums: FloatArray, rodrigues: FloatArray) -> tuple[FloatArray, F
 
 
 def _arc_outward(endpoints: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return the outward directions (n, 2, 2) in the image at both ends of each streak, along its arc."""
+    """Return the image directions (n, 2, 2) along the arc that point outward at the ends of each streak."""
     v = pinhole.unit_vectors(endpoints)
     velocity = -np.cross(rotation, v)
     image = velocity[..., :2] * v[..., 2:] - v[..., :2] * velocity[..., 2:]
@@ -303,9 +303,9 @@ def _covariance(
     """Return the covariance (3, 3) of the rotation vector, rad^2.
 
     The variances along and across the streaks are estimated separately from the residuals. Each variance is
-    multiplied by nu/(nu - 2), with nu degrees of freedom, to allow for its uncertainty (Student's t
-    distribution). The bias of the detector does not affect the residuals, so that the uncertainty
-    `endpoint_bias_sigma` of the bias is added.
+    multiplied by nu/(nu - 2), with nu degrees of freedom, to allow for the uncertainty of the variance
+    (Student's t distribution). The bias of the detector does not affect the residuals, so that the
+    uncertainty `endpoint_bias_sigma` of the bias is added.
     """
     weights = 1.0 / errors**2
     cross = cross_matrices(solution.sums)

@@ -31,7 +31,7 @@ class StreakSettings(EndpointSettings):
         outlier_sigmas: number of robust standard deviations above which a streak is rejected.
         worst_residual: largest accepted RMS residual of the endpoints, px. True streaks have residuals of at
             most 0.6 px, and fragments that agree by chance have 1 to 4 px (campaign `streaks`).
-        sign_sigmas: minimum ratio of the prior rate along the rotation axis to its standard deviation for
+        sign_sigmas: minimum prior rate along the rotation axis, in standard deviations of the prior rate, for
             which the prior decides the sense of rotation.
     """
 
@@ -57,7 +57,7 @@ _OF_DETECTOR: dict[DetectorName, dict[str, Any]] = {
     # The biases for point spreads of 0.7 and 1.5 px are 1.23 and 1.68 px with Trajkovic-4.
     # The biases for point spreads of 0.7 and 1.5 px are 0.93 and 1.24 px with Trajkovic-8.
     "harris": {},
-    # The minimum eigenvalue grows with brightness squared, Harris's response with its fourth power.
+    # The minimum eigenvalue is proportional to brightness^2, and Harris's response to brightness^4.
     "minimum-eigenvalue": {"peak_relative": 0.2, "intensity_half_width": 4, "endpoint_bias": 0.45},
     # With four neighbours, all pixels of a diagonal streak are detected as corners.
     # Smoothing and a high threshold suppress false corners, but also half of the streak ends.

@@ -82,7 +82,7 @@ def attitudes_of_ends(
     end = SOLVERS["esoq2"](vectors[:, 1], reference, errors)
     turn = multiply(end.quaternion, conjugate(start.quaternion))
     rotation = to_rotation_vector(turn)
-    # The start error is rotated into the camera axes at the end, to which the rotation vector refers.
+    # The error of the start attitude is rotated into the end axes, to which the rotation vector refers.
     propagated = attitude_matrix(turn)
     jacobian = _turn_to_vector(rotation)
     covariance = jacobian @ (end.covariance + propagated @ start.covariance @ propagated.T) @ jacobian.T
@@ -140,7 +140,7 @@ def _turn_to_vector(rotation: FloatArray) -> FloatArray:
     """Return the derivatives (3, 3) of the rotation vector with respect to an additional small rotation."""
     angle = float(np.linalg.norm(rotation))
     cross = cross_matrices(rotation[None])[0]
-    # The coefficient has the limit 1/12 for an angle of zero, at which both of its terms diverge.
+    # For an angle of zero both terms of the coefficient diverge, but the coefficient has the limit 1/12.
     second = 1.0 / 12.0 if angle < 1e-3 else 1.0 / angle**2 - 1.0 / (2.0 * angle * np.tan(0.5 * angle))
     return np.asarray(np.eye(3) + 0.5 * cross + second * cross @ cross)
 

@@ -1,7 +1,8 @@
 """Guidance about one axis: checks plans, follows the last accepted path and then holds the end attitude.
 
-A plan is rejected, with its reason, when it is late, not finite, beyond the limits, out of order, for another
-target, or does not start at the estimated state. A rejected plan does not change the commanded motion.
+A plan is rejected if it is late, not finite, beyond the limits, out of order, for another target, or does not
+start at the estimated state. The rejection states the reason. A rejected plan does not change the commanded
+motion.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ class PathGuidance:
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
         """Set the target attitude and its rate in rad/s; the present path is followed until a new plan comes.
 
-        Raises UsageError when a value is not finite or q2 is beyond its limit.
+        Raises UsageError if a value is not finite or q2 is beyond the limit of q2.
         """
         if not abs(target_q2) <= self._rules.q2_limit:  # NaN compares false
             raise UsageError(f"target q2 is {target_q2}: it must lie within +-{self._rules.q2_limit}")

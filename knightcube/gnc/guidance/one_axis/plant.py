@@ -8,17 +8,17 @@ the planned path. Functions with singular names (`current`) take floats and use 
 40 Hz loop; functions with plural names (`currents`) take arrays of one shape.
 
 The coils are driven by pulse-width modulation with a period of 20 ms (Sease thesis, chapter 5). The time
-constant L/R of a coil, 0.1 ms, is short compared with the period, so a coil carries V/R while the H-bridge
-drives it, and otherwise no current. For a mean current I the supply delivers the power V |I| with V = R Imax,
-which heats the coil. The cost R I^2 of Sease, eq. (5.1), is the heat of a steady current, which equals V |I|
-times the duty cycle.
+constant L/R of a coil, 0.1 ms, is short compared with the period, so the coil current is V/R while the
+H-bridge drives the coil, and otherwise zero. For a mean current I the supply delivers the power V |I| with V
+= R Imax, which heats the coil. The cost R I^2 of Sease, eq. (5.1), is the heat of a steady current, which
+equals V |I| times the duty cycle.
 
-The pseudospectral discretisation is that of Sease, eq. (5.8). The n nodes are -1, 1 and the roots of P'(x),
-where P is the Legendre polynomial of degree n - 1. Quadrature on the nodes is exact up to degree 2n - 3, and
-the differentiation matrix up to degree n - 1. A path is a single polynomial q2(t) of time. Angle, rate and
-acceleration follow exactly from q2 (Sease, eqs. (5.9) and (5.13), corrected), so the planner's limits also
-hold between the nodes. After its end, a path holds the last attitude, or continues at the end rate up to the
-angle where the coil loses its torque.
+The motion is discretised by the pseudospectral method of Sease, eq. (5.8). The n nodes are -1, 1 and the
+roots of P'(x), where P is the Legendre polynomial of degree n - 1. Quadrature on the nodes is exact up to
+degree 2n - 3, and the differentiation matrix up to degree n - 1. A path is a single polynomial q2(t) of time.
+Angle, rate and acceleration follow exactly from q2 (Sease, eqs. (5.9) and (5.13), corrected), so the
+planner's limits also hold between the nodes. After the end of a path, the commanded motion is the last
+attitude, or continues at the end rate up to the angle at which the coil loses its torque.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from knightcube.errors import UsageError
 
 
 def supply_power(current: FloatArray, voltage: float) -> FloatArray:
-    """Return V |I|, the power that each coil takes from its supply, W.
+    """Return the power V |I|, W, that coils take from the supply.
 
     Args:
         current: mean coil currents over a PWM period, of any shape, A.
@@ -192,7 +192,7 @@ def current_and_slopes(
 
 _ROUNDED = 0.1
 """Smoothing parameter e of |I| in the cost, relative to Imax. The cost uses sqrt(I^2 + e^2) - e instead of
-|I|, because its slope is continuous."""
+|I|, because the slope of |I| is discontinuous."""
 
 
 class PathCost(StrEnum):
@@ -208,7 +208,7 @@ class PathCost(StrEnum):
         return supply_power(current, plant.resistance * plant.current_limit)
 
     def smooth(self, plant: SingleAxisPlant, current: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the smoothed power (W) and its derivative (W/A) for currents (m,) in A."""
+        """Return the smoothed power (W) for currents (m,), A, and the derivative by the current (W/A)."""
         if self is PathCost.HEAT:
             pull = plant.resistance * current
             return pull * current, 2.0 * pull
@@ -263,7 +263,7 @@ def lgl_rule(count: int) -> LglRule:
     barycentric = 1.0 / values
     gap = nodes[:, None] - nodes + np.eye(count)
     differentiation = barycentric / barycentric[:, None] / gap
-    # Each diagonal element is minus the sum of its row, so the derivative of a constant is zero.
+    # The elements of each row add up to zero, so that the derivative of a constant is zero.
     np.fill_diagonal(differentiation, 0.0)
     np.fill_diagonal(differentiation, -differentiation.sum(axis=1))
     for array in (nodes, weights, differentiation, barycentric):

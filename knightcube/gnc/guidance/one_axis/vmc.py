@@ -1,15 +1,15 @@
 """The planner of minimum-energy paths about one axis by virtual motion camouflage.
 
-The method is that of Sease 2013, eqs. (5.8) to (5.15), corrected. NLopt optimises the free path control
-parameters under |I| <= Imax and |q2| <= a bound at every time. If no path over the requested horizon
-(duration) keeps the limits, the horizon is stretched to the shortest feasible horizon, and the plan has the
-status STRETCHED. With a time cost, the horizon is optimised as well. Energy is the integral of R I^2 in J,
-without the factor 1/2 of Sease, eq. (5.1).
+The planner uses the method of Sease 2013, eqs. (5.8) to (5.15), with corrections. NLopt optimises the free
+path control parameters under |I| <= Imax and |q2| <= a bound at every time. If no path over the requested
+horizon (duration) keeps the limits, the horizon is stretched to the shortest feasible horizon, and the plan
+has the status STRETCHED. With a time cost, the horizon is optimised as well. Energy is the integral of R I^2
+in J, without the factor 1/2 of Sease, eq. (5.1).
 
 All three searches for a horizon minimise energy plus a time cost between a shortest and a longest horizon. If
-the time cost is far above the coil's power and the shortest horizon is the requested one, the solution is the
-requested horizon if a path over it keeps the limits, and otherwise the shortest feasible horizon. In this way
-no infeasible program has to be solved.
+the time cost is far above the power of the coil and the requested horizon is the lower bound, the solution
+has the requested horizon if this horizon is feasible, and otherwise the shortest feasible horizon. No
+infeasible nonlinear program therefore has to be solved.
 
 The planner is deterministic, so that the same arguments give the same plan in any process.
 """
@@ -52,9 +52,9 @@ ProgramAt = Callable[[float], PathProgram]
 this horizon."""
 
 SHORTEST_COST = 7.0
-"""Time cost, in units of R Imax^2, with which the shortest horizon is found. An infinite cost would give the
-bang-bang path, whose energy is up to 1 % above the optimum at its horizon. With SHORTEST_COST, the horizon is
-about 0.3 % longer than the shortest horizon, and the energy is within 0.25 % of the optimum."""
+"""Time cost, in units of R Imax^2, with which the shortest horizon is found. An infinite time cost would give
+the bang-bang path, whose energy is up to 1 % above the optimum for the same horizon. With SHORTEST_COST, the
+horizon is about 0.3 % longer than the shortest horizon, and the energy is within 0.25 % of the optimum."""
 
 _SHORTEST_STRETCH = 1.015
 """Largest factor by which the time cost SHORTEST_COST may stretch a horizon although the requested horizon is
@@ -93,9 +93,9 @@ class HorizonSearch:
     def within(self, asked: float, longest: float) -> tuple[PathProgram, Trial | None]:
         """Return the minimum-energy path over `asked` s, or over the shortest feasible time up to `longest`.
 
-        Current scales with 1/T^2 for a rest-to-rest slew, so solutions without limits lead to a horizon near
-        the shortest feasible one, where the program with a free horizon starts. If the program fails, it is
-        solved again from a longer horizon.
+        The current of a rest-to-rest slew scales with 1/T^2, so solutions without limits lead to a horizon
+        near the shortest feasible horizon. There the nonlinear program with a free horizon starts. If the
+        program has no solution, it is started again from a longer horizon.
         """
         if self.warm is not None:
             program = self.program_at(asked)
@@ -176,9 +176,9 @@ class HorizonSearch:
     ) -> tuple[PathProgram, Trial | None]:
         """Return a path over at least `asked` s, by continuation from horizons at which a path was found.
 
-        If the torque of the thread exceeds that of the coil, only the horizons of the body's swings are
-        feasible. From a horizon with a known path, the horizon is changed in steps, each started from the
-        last path. Shorter horizons are tried first.
+        If the torque of the thread exceeds the torque of the coil, only horizons that fit the free
+        oscillation of the body are feasible. From a horizon with a known path, the horizon is changed in
+        steps, each started from the last path. Shorter horizons are tried first.
         """
         stretched: tuple[PathProgram, Trial] | None = None
         for factor in _ANCHORS:
@@ -230,7 +230,7 @@ class HorizonSearch:
         return trial
 
     def _shortest(self, program: PathProgram, start: Trial, asked: float, longest: float) -> Trial | None:
-        """Return the shortest path of at least `asked` s, with minimum energy if its horizon is `asked`."""
+        """Return the shortest path of at least `asked` s; a path of exactly `asked` s has minimum energy."""
         time_cost = SHORTEST_COST * program.bang_power
         trial = program.limited(start, FreeHorizon(asked, longest, time_cost))
         if trial is None or trial.horizon > asked * (1.0 + _AT_BOUND):
@@ -526,14 +526,14 @@ def plan_step(
 
     The path is optimised by virtual motion camouflage (Sease 2013, eqs. (5.8) to (5.15)) with NLopt's SLSQP,
     under the current limit of the plant and |angle| <= 1.496 rad at every time, beyond which the coil has
-    almost no torque. If no path over the horizon keeps the limits, the horizon is stretched to the shortest
-    feasible one and the status of the plan is "stretched". A plan takes about 2 ms.
+    almost no torque. If no path of the requested duration keeps the limits, the duration is stretched to the
+    shortest feasible duration, and the status of the plan is "stretched". A plan takes about 2 ms.
 
-    `plan.path.motion(times)` gives angle, rate and acceleration at times (n,), s after the start, and
-    `plant.currents` the coil current for them.
+    The method `plan.path.motion(times)` returns angle, rate and acceleration at times (n,), s after the
+    start. The method `plant.currents` returns the coil currents for this motion.
 
     Args:
-        plant: inertia, torque constant, coil and thread.
+        plant: model with inertia, torque constant, coil and thread.
         start_angle: angle at the start, rad, measured from the direction of the largest torque.
         end_angle: angle at the end, rad.
         horizon: duration, s; with `time_cost` the initial guess of the duration.
@@ -541,8 +541,8 @@ def plan_step(
         end_rate: body rate at the end, rad/s.
         time_cost: cost of time, W; the duration is then optimised for minimum energy plus `time_cost` times
             duration. None keeps the horizon.
-        minimise: "heat" for the integral of R I^2, "supply" for that of V |I|, the energy taken from a
-            chopped supply.
+        minimise: "heat" to minimise the integral of R I^2, or "supply" to minimise the integral of V |I|,
+            which is the energy taken from the supply with pulse-width modulation.
         nodes: number of nodes of the path, 8 to 40.
         max_stretch: largest ratio of the duration to `horizon`.
 

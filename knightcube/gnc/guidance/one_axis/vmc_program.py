@@ -1,10 +1,10 @@
 """The nonlinear programs of virtual motion camouflage (Sease, eqs. (5.8) to (5.14)), solved with SLSQP.
 
 A path has the values q2 = q_r + v (q_p - q_r) on N nodes, where q_p is the prey path and q_r the reference
-point (Sease, eqs. (5.10) to (5.12)). A path is the polynomial of degree N - 1 through its node values, so
-q2', q2'' and the current are exact between nodes too. The path control parameter v is 1 at both ends. The
-parameters v_2 and v_(N-1) follow from the boundary rates by q' = D q at the ends (Sease, eq. (5.11),
-corrected). N - 4 path control parameters are free.
+point (Sease, eqs. (5.10) to (5.12)). A path is the polynomial of degree N - 1 through the values on the
+nodes, so q2', q2'' and the current are exact between nodes too. The path control parameter v is 1 at both
+ends. The parameters v_2 and v_(N-1) follow from the boundary rates by q' = D q at the ends (Sease, eq.
+(5.11), corrected). N - 4 path control parameters are free.
 
 The prey path is an affine function of the horizon T, and for a fixed prey path the path is an affine function
 of v - 1. Paths are therefore parametrised as prey(T) + M y with parameters y. The columns of M are whitened
@@ -198,7 +198,7 @@ IMPOSED_MARGIN = 2e-4
 """Relative margin by which an imposed limit is tightened, so that peaks between the imposed points keep the
 limit. Without the margin the exchange method converges slowly."""
 
-# NLopt 2.11 raises its own runtime_error, and older versions raise Python's RuntimeError.
+# NLopt 2.11 raises `nlopt.runtime_error`, and older versions raise Python's RuntimeError.
 _SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
 _CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
 _EXCHANGES = 10
@@ -281,7 +281,7 @@ class PathProgram:
 
     @property
     def bang_power(self) -> float:
-        """Power R Imax^2 of the coil at its current limit, W."""
+        """Power R Imax^2 of the coil at the current limit, W."""
         return self._bang
 
     def prey(self, horizon: float) -> Trial:
@@ -357,7 +357,7 @@ class PathProgram:
         return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
 
     def from_prey(self, trial: Trial) -> FloatArray:
-        """Return the difference (N,) on the nodes between a path and the prey path over its horizon."""
+        """Return the difference (N,) on the nodes between a path and the prey path of the same horizon."""
         return np.asarray(self.family.basis @ trial.parameters)
 
     def unlimited(self, start: Trial) -> Trial | None:
@@ -453,7 +453,7 @@ class PathProgram:
 
 
 class _Variables:
-    """The variables of the optimiser: the parameters of the path and, if it is free, the scaled log horizon.
+    """The optimisation variables: path parameters and, if free, the scaled logarithm of the horizon.
 
     The logarithm log(T/T0) is scaled so that the time cost has, like the whitened energy, a curvature of
     about one.
@@ -490,7 +490,7 @@ def _contract(slopes: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 def _peaks(ratios: FloatArray) -> BoolArray:
-    """Return a mask (2, m) of the local maxima above one of |ratios| (2, m) along the rows."""
+    """Return a mask (2, m) of the local maxima of |ratios| (2, m) along each row that exceed one."""
     size = np.abs(ratios)
     peak = size > 1.0
     peak[:, 1:] &= size[:, 1:] >= size[:, :-1]

@@ -9,8 +9,8 @@ the first direction.
 
 The law of a pointing target aligns the pointing axis with the goal and the body axis `across` with a second
 direction: the velocity for goals below, nadir for the velocity itself, the celestial pole for the Sun. A
-given roll is a rotation about the pointing axis from this alignment. A free roll is the roll of the body when
-the law begins.
+given roll is an additional rotation about the pointing axis. A free roll is the roll of the body when the law
+begins.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ def ground(latitude: float, longitude: float, height: float = 0.0) -> Direction:
 def free_roll(
     axis: FloatArray, first: Direction, quaternion: FloatArray, ephemeris: Ephemeris, time: float
 ) -> AttitudeLaw:
-    """Return the law that aligns `axis` (3,) with `first` at the roll of the attitude (4,) at `time` s.
+    """Return a law that aligns `axis` (3,) with `first` and keeps the roll of an attitude (4,) at `time`, s.
 
     The roll is held inertially if the direction is inertially fixed, otherwise in the orbital axes.
     """
@@ -210,7 +210,7 @@ def free_roll(
     shown = attitude_matrix(quaternion).T @ across
     when = np.array([time])
     wanted = first(ephemeris, when)[0]
-    # The second direction rotates with the axis by the shortest rotation to the final direction.
+    # The second direction is rotated by the shortest rotation that aligns the axis with the first direction.
     shown = _turned(attitude_matrix(quaternion).T @ axis, wanted, shown)
     moved = float(np.linalg.norm(first(ephemeris, when + 10.0)[0] - wanted))
     if moved < 1e-4:
@@ -295,7 +295,7 @@ def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArra
 
 
 def _any_across(axis: FloatArray) -> FloatArray:
-    """Return the coordinate direction (3,) farthest from `axis`, made normal to it."""
+    """Return a unit vector (3,) normal to `axis`, close to the coordinate axis farthest from `axis`."""
     unit = np.eye(3)[int(np.argmin(np.abs(axis)))]
     return _unit(unit - axis * float(axis @ unit))
 

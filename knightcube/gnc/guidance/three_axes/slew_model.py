@@ -1,20 +1,21 @@
 """The task of the slew planner: equations of motion, end conditions, exclusion cones and environment.
 
 The state (7,) consists of attitude and body rate, and the control (3,) is the dipole moment m of the coils.
-With the field b = A(q) B and the direction of the position e = A(q) r in body axes, the motion is
+With the field b = A(q) B and the direction of the position e = A(q) r in body axes, the equations of motion
+are
 
     q' = 1/2 [w, 0] q,    J w' = (m + residual) x b + 3 mu / r^3 e x J e + d - w x J w
 
-where d is the sum of the torques of `knightcube.astro.earth.disturbance`: a constant torque in body axes, and
-the torques c x A(q) v by air and sunlight, which depend on the attitude. The torque of the coils has no
-component along the field, so not every path is feasible. All derivatives are analytic, because A(q) v is a
-quadratic form of q whose second derivatives are twice Davenport's matrix.
+The vector d is the sum of the torques of `knightcube.astro.earth.disturbance`: a constant torque in body
+axes, and the torques c x A(q) v by air and sunlight, which depend on the attitude. The torque of the coils
+has no component along the field, so not every path is feasible. All derivatives are analytic, because A(q) v
+is a quadratic form of q whose second derivatives are twice Davenport's matrix.
 
 Paths are cubic Hermite curves (de Boor 1978, chapter IV), evaluated here because scipy.interpolate would take
 20 MiB of memory in each process that flies or plans a slew.
 
 The end of a slew is an attitude, which gives three equations, or the direction of a boresight with a free
-roll, which gives two. The body rate at the end gives three more equations. All these equations are quadratic
+roll, which gives two. The body rate at the end gives three more equations. All end conditions are quadratic
 in the quaternion. An exclusion cone is a cone about a direction, such as the direction to the Sun, that a
 body axis must not enter during the slew. Field, position, and the cones of Sun, Earth and Moon are computed
 along a predicted orbit. Times of a slew count from `begin`, s of the ephemeris.
@@ -268,7 +269,7 @@ class HermiteCubic:
         return np.asarray(mean + (1.0 - s) * (1.0 - 3.0 * s) * out + s * (3.0 * s - 2.0) * into)
 
     def _parts(self, times: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the fraction of each time in its span, and the length, values and slopes of the span."""
+        """Return the span of each time: fraction passed, length, start value, step and slopes."""
         at = np.asarray(times, dtype=float)
         before = np.clip(np.searchsorted(self.times, at, side="right") - 1, 0, len(self.times) - 2)
         span = (self.times[before + 1] - self.times[before])[:, None]

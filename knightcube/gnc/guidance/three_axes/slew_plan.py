@@ -9,9 +9,10 @@ differences from the next nodes are removed with one factored Newton matrix (mul
 method). The energy of a slew is the heat produced in the coils, J. The planner is deterministic and has no
 side effects.
 
-`plan_order` plans a slew in orbit from one pointing target to another that starts within a window. The
-direction of the field during the slew changes the energy of the slew by a factor of up to ten along an orbit.
-Coarse slews are therefore planned from several start times, and the best one is planned in full.
+The function `plan_order` plans a slew in orbit between two pointing targets, which starts within a window of
+time. The direction of the field during the slew changes the energy of the slew by a factor of up to ten along
+an orbit. Slews are therefore planned on a coarse grid for several start times, and the best slew is planned
+on the fine grid.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ _STEPS = 4
 """Number of Runge-Kutta steps per collocation interval, an even number."""
 _ROUNDS, _CLOSED, _LOST = 6, 1e-7, 1e-4
 """Largest number of corrections of a path, node error (half angle, rad) below which the corrections end, and
-node error above which they have failed."""
+node error above which the corrections have failed."""
 
 
 def closed(
@@ -149,7 +150,7 @@ class SlewPlan:
         status: whether the requested duration was kept or stretched.
         horizon_asked, horizon: requested and planned duration, s.
         energy: heat of the coils during the slew, J.
-        peak: largest ratio of a coil's dipole moment to its limit.
+        peak: largest ratio of a coil's dipole moment to the dipole limit.
         clearance: smallest angle between the path and each exclusion cone, in the order of the task's cones,
             rad.
         steps: total number of Newton steps of the search.
@@ -323,8 +324,8 @@ class OrderedSlew:
         order: requested slew.
         task: planning task for the chosen start time.
         plan: planned path of the slew.
-        begin: start of the slew, s of the ephemeris; in a result of `knightcube.plan_slew`, s after the
-            argument `time`.
+        begin: start of the slew, in s of the ephemeris. In results of `knightcube.plan_slew`, the start is in
+            s after the argument `time`.
         compared: number of start times that were planned.
     """
 

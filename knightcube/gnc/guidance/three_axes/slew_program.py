@@ -2,8 +2,8 @@
 
 The motion is discretised by separated Hermite-Simpson collocation, which is of fourth order (Betts, Practical
 Methods for Optimal Control, 2010, section 4.5). The dipole is linear on each interval, so a dipole that keeps
-the limits at all nodes keeps them at all times. The unknowns are the states at nodes and midpoints of the
-intervals, and the dipoles at the nodes.
+the limits at all nodes keeps the limits at all times. The unknowns are the states at nodes and midpoints of
+the intervals, and the dipoles at the nodes.
 
 The vector of unknowns and Lagrange multipliers has 31 elements per interval: the state (7) and the dipole (3)
 of the first node, the multipliers of the midpoint's equations (7), the state of the midpoint (7) and the

@@ -61,8 +61,8 @@ _STEPS_FREE = 25
 """Maximum number of Newton steps for a path without the dipole limit."""
 _LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
 """Stages of an iteration with all limits: the number of Newton steps of each stage, and the constraint
-violation above which the iteration is abandoned after the stage. Half of the iterations that would fail
-exceed the bound of the first stage, but only one in twenty of those that would succeed."""
+violation above which the iteration is abandoned after the stage. The bound of the first stage stops half of
+the iterations that would fail, but only one in twenty of the iterations that would succeed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +93,7 @@ class SlewSolver:
 
     The angles `extra` (cones, 2 nodes), rad, widen the cones at the points of the fine grid. Paths use at
     most the fraction `share` of the dipole limit. The counter `steps` is the number of Newton steps, and
-    `work` the sum over these steps of the number of intervals.
+    `work` is the number of Newton steps multiplied by the number of intervals.
     """
 
     def __init__(self, task: SlewTask) -> None:
@@ -112,7 +112,7 @@ class SlewSolver:
         return equations.cost(found.at) * equations.scale * power / float(equations.weights @ self._limit**2)
 
     def peak(self, found: SolvedPath) -> float:
-        """Return the largest ratio of a path's dipole to its limit."""
+        """Return the largest ratio of a dipole component along a path to the dipole limit."""
         return float((np.abs(found.at.dipoles) / self._limit).max())
 
     def is_kept(self, found: SolvedPath) -> bool:
@@ -200,7 +200,7 @@ class SlewSolver:
 
 
 def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
-    """Return a path interpolated on the grid of other equations and scaled to their duration.
+    """Return a path interpolated on the grid of `equations` and scaled to the duration of `equations`.
 
     The dipoles are multiplied by the square of the old duration divided by the new duration.
     """
@@ -417,8 +417,8 @@ cone."""
 _BEYOND = math.radians(0.02)
 """Additional widening (rad) of a cone that a path crosses between two points."""
 _BETWEEN = 16
-"""Number of intervals of an intermediate grid, used if a path does not converge on the fine grid from the
-coarse one."""
+"""Number of intervals of an intermediate grid, used if a path from the coarse grid does not converge directly
+on the fine grid."""
 _LOST, _EASED_STEP = 1.5, 1.03
 """Ratio of the flown dipole to the dipole limit above which a path is abandoned, and additional factor by
 which the duration of other paths above the limit is lengthened."""
@@ -436,7 +436,7 @@ class HorizonContinuation:
         self._lost: set[tuple[float, float, float]] = set()
 
     def within(self, start: SolvedPath) -> SolvedPath | None:
-        """Return a path on the fine grid within the limits, found from one without the dipole limit."""
+        """Return a fine path within the limits, found from a coarse path without the dipole limit."""
         solver, nodes, time = self._solver, self._task.nodes, start.horizon
         if solver.is_kept(start):
             equations = solver.equations(time, nodes)
@@ -468,7 +468,7 @@ class HorizonContinuation:
         return None if best is None else self._refined(best, shortest, time_cost)
 
     def distinct(self, relaxed: list[SolvedPath]) -> list[SolvedPath]:
-        """Return paths without the dipole limit, free of duplicates and in the order of their energy."""
+        """Return the paths `relaxed` without duplicates, sorted by energy."""
         ordered = sorted(relaxed, key=self._solver.energy)
         costs = [(found.horizon, self._solver.energy(found)) for found in ordered]
         return ordered[:1] + [
