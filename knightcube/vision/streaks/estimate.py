@@ -3,15 +3,16 @@
 The bright regions of the frame give initial guesses of the motion, and each guess is fitted to the brightest
 stars. A matched filter along each fitted motion detects faint stars. The result is a joint fit of the motion
 and the bright stars, in which the flux of the faint stars is modelled. A final check verifies that each
-modelled streak matches one complete streak. A rotation that is too small divides a streak into segments, and
-a rotation that is too large joins several streaks. The functions of this module are pure and deterministic.
+modelled streak matches one complete streak in the frame. If the fitted rotation is too small, one streak is
+modelled as several segments; if it is too large, several streaks are modelled as one. All functions of this
+module are pure and deterministic.
 
 With a rolling shutter, a star that moves in the readout direction is exposed longer than a star that moves
 against it. With a rolling shutter, a motion and its time reversal produce streaks of different lengths. A
 prior rate determines the sign of the rotation before the fit. Without a prior rate, both signs of the
-rotation are fitted, and the better fit is selected. If neither sign fits significantly better, the sign
-remains unknown, and the rate is the mean of one fit and the reversed other fit. The covariance of the
-averaged rate includes the difference between the two fits.
+rotation are fitted, and the better fit is selected. If neither sign of the rotation fits significantly
+better, the sign remains unknown, and the rate is the mean of one fit and the time reversal of the other fit.
+The covariance of the averaged rate includes the difference between the two fits.
 """
 
 from __future__ import annotations
@@ -81,9 +82,9 @@ from knightcube.vision.streaks.uncertainty import (
     rotation_uncertainty,
 )
 
-# Relative difference between two rotation angles that count as equal.
+# Relative difference below which two rotation angles count as equal.
 _SAME_ANGLE = 0.05
-# Relative difference between two rotation vectors that count as the same motion.
+# Relative difference below which two rotation vectors count as the same motion.
 _SAME_MOTION = 0.005
 # Number of the brightest stars in a preliminary fit of the motion.
 _FIRST_STARS = 12
@@ -95,9 +96,9 @@ _MOST_GROWING = 2
 _MOST_ANGLES = 2
 # Maximum number of iterations of the fit for a camera at rest.
 _STILL_ROUNDS = 12
-# Minimum number of complete streaks for a guess of the rotation angle from streak lengths alone.
+# Minimum number of complete streaks from whose lengths alone the rotation angle is guessed.
 _WHOLE = 8
-# Maximum fraction of the flux in overlong regions, for a guess of the rotation angle from streak lengths.
+# Maximum fraction of the flux in regions longer than a guessed rotation angle, for an accepted guess.
 _CONTRADICTED = 0.3
 # Minimum number of stars in a preliminary fit that is accepted without comparison with other fits.
 _MANY = 3
@@ -105,7 +106,7 @@ _MANY = 3
 _EXPLAINED = 0.4
 # Minimum fraction of confirmed streak ends in a preliminary fit that is accepted without comparison.
 _IN_PLACE = 0.6
-# Minimum explained chi-square of a preliminary fit that is accepted without comparison.
+# Minimum chi-square explained by a preliminary fit that is accepted without comparison with other fits.
 _EVIDENT = 3000.0
 # Largest median chi-square per degree of freedom of a usable preliminary fit.
 _WORST_FIRST = 12.0
@@ -113,23 +114,23 @@ _WORST_FIRST = 12.0
 _CROWDED = 0.05
 # Explained chi-square below which a frame of blended stars is scanned completely.
 _BEYOND_CROWD = 100_000.0
-# Largest residual chi-square of a well-fitted star, relative to the star's squared significance.
+# Largest excess chi-square of a well-fitted star, relative to the star's squared significance.
 _MOST_RESIDUAL = 0.01
-# Upper limit of a star's significance (standard deviations) in the explained chi-square.
+# Upper limit of a star's significance (standard deviations) in the sum of explained chi-squares.
 _ENOUGH = 200.0
-# Weight of the flux in regions that are longer than the guessed streak length.
-# The weight is below 1, because a long region may be a blend of two streaks.
+# Weight of the flux in regions longer than the guessed streak, when guesses are compared.
+# This weight is below 1, because a long region may be a blend of two streaks.
 _CONTRADICTION = 0.6
-# Last step (standard deviations) below which a preliminary fit counts as converged.
+# Last step of the fit (standard deviations) below which a preliminary fit counts as converged.
 _CALM = 2.0
-# Fraction of confirmed streak ends that a wrong rotation reaches by matching one end of each streak.
+# Expected fraction of confirmed streak ends for a wrong rotation, which can match one end of each streak.
 _ENDS_BY_CHANCE = 0.4
 
 
 def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -> Iterator[StreakFit]:
     """Yield preliminary fits of the motion to the brightest stars, most likely motion first.
 
-    `near` (rad) is the rotation angle expected from a prior rate, or None.
+    The argument `near` (rad) is the rotation angle expected from a prior rate, or None.
     """
     rivals: list[tuple[float, StreakFit]] = []
     yielded: list[FloatArray] = []
@@ -169,10 +170,10 @@ def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -
 def _likelier(
     camera: FitProblem, regions: BrightRegions, explained: float, done: StreakFit
 ) -> StreakFit | None:
-    """Return a fit from a scan of the whole frame that explains more chi-square than the fit `done`.
+    """Return a fit, from a scan of the whole frame, that explains more chi-square than the fit `done`.
 
-    Returns None if the scan finds no better fit, if the frame has few blended stars, or if `done` already
-    explains enough chi-square.
+    Returns None if the scan finds no better fit, if the frame has few blended stars, or if the fit `done`
+    already explains enough chi-square.
     """
     if regions.lit <= _CROWDED or explained >= _BEYOND_CROWD:
         return None
@@ -235,7 +236,7 @@ def alike(one: FloatArray, other: FloatArray) -> bool:
 def _guesses(camera: FitProblem, regions: BrightRegions, near: float | None) -> Iterator[MotionGuess]:
     """Yield initial guesses of the motion, most likely guess first.
 
-    The guesses are derived from streak lengths if many streaks are complete, otherwise from a scan.
+    The rotation angles are derived from streak lengths if many streaks are complete, otherwise from a scan.
     """
     guess = find_axis(regions, camera.pinhole)
     if guess is None:
@@ -255,7 +256,7 @@ def _guesses(camera: FitProblem, regions: BrightRegions, near: float | None) -> 
 
 
 def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakFit] | None:
-    """Fit the motion of `guess`; return the explained chi-square, whether the fit is convincing, and the fit.
+    """Return the explained chi-square of a fit to `guess`, whether the fit is convincing, and the fit.
 
     A convincing fit is accepted without comparison with other fits. Returns None if the fit does not succeed.
     """
@@ -270,13 +271,13 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
-    # A wrong rotation angle leaves a residual at one end of each streak.
+    # With a wrong rotation angle, the model has large residuals at one end of each streak.
     light = done.scene.light**2 / np.maximum(done.solution.joint[:, _LIGHT, _LIGHT], 1e-30)
     residual = done.evaluation.chi2 - done.evaluation.pixels
     good = residual < _MOST_RESIDUAL * light + done.evaluation.pixels
     calm = 1.0 if done.last_step < _CALM else 0.3
     evidence, share = calm * float(np.sum(np.minimum(light, _ENOUGH**2)[good])), float(np.mean(good))
-    # `ends` is the smaller of two fractions: confirmed streak ends, and streaks without gaps.
+    # The variable `ends` is the smaller of the fractions of confirmed ends and of unbroken streaks.
     correct = true_ends(camera, done.scene)
     judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
     ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
@@ -298,15 +299,15 @@ def still_fit(camera: FitProblem, regions: BrightRegions) -> StreakFit | None:
 
 # Largest fraction of stars that look like segments of a longer streak.
 _MOST_CHAINED = 0.45
-# Minimum fraction of confirmed streak ends, for an accepted and for a doubtful motion.
+# Minimum fraction of streak ends that are confirmed, for an accepted motion and for a doubtful motion.
 _TRUE_ENDS = (0.75, 0.6)
-# Largest fraction of streaks with gaps, for an accepted and for a doubtful motion.
+# Largest fraction of streaks with gaps, for an accepted motion and for a doubtful motion.
 _BROKEN = (0.12, 0.35)
-# Minimum number of streaks with two confirmed ends for which gaps in other streaks are tolerated.
+# Minimum number of streaks with two confirmed ends at which gaps in other streaks are tolerated.
 _CONFIRMING = 3
-# Minimum fraction of the flux of complete streaks that comes from streaks consistent with the motion.
+# Minimum fraction of the flux of complete streaks that belongs to streaks consistent with the motion.
 _AGREEING_LIGHT = 0.5
-# Relative change of the rate above which streaks are tested for flux beyond their ends.
+# Relative change of the rate during the exposure above which streaks are tested for flux beyond their ends.
 _UNEVEN = 0.4
 # Largest fraction of stars with flux beyond a streak end.
 _MOST_TRAILING = 0.5
@@ -321,12 +322,12 @@ class StreakVerdict(Enum):
 
 
 def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> StreakVerdict:
-    """Return whether the trusted streaks of `scene` have confirmed ends and no gaps.
+    """Return a verdict on whether the trusted streaks of `scene` have confirmed ends and no gaps.
 
-    In a crowded frame, one apparent star may be a blend of several stars. A motion is only doubtful if a few
-    streaks have gaps, and is accepted if enough other streaks have two confirmed ends. A motion is also
-    doubtful if no streak has both ends in the frame, or if most streaks with both ends in the frame
-    contradict the motion. A motion with too many wrong streak ends is rejected.
+    In a crowded frame, one apparent star may be a blend of several stars. A motion is doubtful if a few
+    streaks have gaps, unless enough other streaks have two confirmed ends. A motion is also doubtful if no
+    streak has both ends in the frame, or if most streaks with both ends in the frame contradict the motion. A
+    motion is rejected if too many streak ends are wrong.
     """
     stars = np.concatenate([scene.stars, faint.stars])
     light = np.concatenate([scene.light, faint.light])
@@ -359,22 +360,22 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
 
 
 def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
-    """Return whether untrusted stars have most of the flux of the bright, complete streaks."""
+    """Return whether stars that contradict the motion have most of the flux of bright, complete streaks."""
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     inside = np.ones(len(scene.stars), dtype=np.bool_)
     for time in times.T:
         inside &= camera.pinhole.contains(positions(camera.pinhole, scene.motion, scene.stars, time))
-    # Stars fainter than all trusted stars are ignored, because they were never tested for agreement.
+    # Stars fainter than all trusted stars are ignored, because they were never compared with the motion.
     bright = inside & (scene.light >= scene.light[scene.trusted].min())
     light = scene.light[bright]
     return float(light[scene.trusted[bright]].sum()) < _AGREEING_LIGHT * float(light.sum())
 
 
-# Largest distance (px) between two fits of the same star, one for each sign of the rotation.
+# Largest distance (px) between the two fits of one star, with either sign of the rotation.
 _SAME_STAR = 3.0
-# Minimum chi-square difference between the two signs of the rotation for a decision.
+# Minimum difference of chi-square between the two signs of the rotation from which the sign is decided.
 _LEAST_MARGIN = 50.0
-# Minimum ratio of the chi-square difference to its scatter over the stars, for a decision on the sign.
+# Minimum ratio of this sign's chi-square difference to its scatter over the stars, for a decision.
 _LEAST_AGREEMENT = 3.0
 # Upper limit of a single star's chi-square difference in the decision on the sign of the rotation.
 _MOST_DIFFERENCE = 50.0
@@ -386,11 +387,11 @@ class _Candidate:
 
     Attributes:
         result: estimation result with the motion.
-        rotation: (3,) rad, rotation vector over the exposure.
+        rotation: rotation vector over the exposure (3,), rad.
         verdict: verdict of the streak check on the motion.
-        middles: (n, 2) px, centres of the bright streaks. The array `middles` is empty for a global shutter.
-        excess: (n,) chi-square minus the number of pixels of each bright streak. The array `excess` is empty
-            for a global shutter.
+        middles: centres of the n bright streaks (n, 2), px. For a global shutter, `middles` is empty.
+        excess: chi-square minus the number of pixels of each bright streak (n,). For a global shutter,
+            `excess` is empty.
     """
 
     result: MotionResult
@@ -401,7 +402,7 @@ class _Candidate:
 
     @property
     def possible(self) -> bool:
-        """Whether the motion passed the streak check, at least as doubtful."""
+        """Whether the streak check accepted the motion or found it doubtful, but did not reject it."""
         return self.verdict is not StreakVerdict.REJECTED
 
 
@@ -416,7 +417,7 @@ def _rolling_result(
 
     Args:
         fit_along: function that fits a motion whose rotation has a positive component along a vector (3,).
-        axis: (3,) initial guess of the rotation axis, with arbitrary sign.
+        axis: initial guess of the rotation axis (3,), with arbitrary sign.
         prior_rate: (3,) rad/s; None if unknown.
         prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
         sigmas: minimum significance (standard deviations) with which the prior rate determines the sign.
@@ -435,7 +436,7 @@ def _rolling_result(
         return None
     known = [found for found in both if found.result.rate is not None]
     if len(known) < 2:
-        # If the fit for one sign of the rotation does not succeed, the sign may still be the true one.
+        # If the fit for one sign of the rotation fails, this sign may still be the true one.
         return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
     one, other = known
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)
@@ -454,13 +455,13 @@ def _rolling_result(
     return replace(first, rate=first.rate - 0.5 * sum_of_both, covariance=covariance)
 
 
-# Indices of rate, acceleration, x and y among the shared parameters and the parameters of a star.
+# Indices of rate, acceleration, x and y among the shared parameters followed by the parameters of a star.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
-# Index of the flux among the shared parameters and the parameters of a star.
+# Index of the flux among the shared parameters followed by the parameters of a star.
 _LIGHT = 9
-# Last step (standard deviations) above which the joint fit counts as not converged.
+# Last step of the joint fit (standard deviations) above which the fit counts as not converged.
 _UNSETTLED = 2.0
-# Minimum decrease of chi-square by which a motion that reverses during the exposure is preferred.
+# Minimum decrease of chi-square at which a rotation that reverses during the exposure is preferred.
 _REVERSED = 30.0
 # Largest distance (px) between two streaks that count as a double image of one star.
 # Vibration causes double images, because a star spends most time at the turning points of the vibration.
@@ -474,11 +475,11 @@ _SAME = 1.5
 
 
 def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> MotionResult:
-    """Return the result `seen` with the fitted stars, their streak ends and the covariances."""
+    """Return the result `seen` with the fitted stars, the ends of their streaks and the covariances."""
     settings, joint = camera.settings, last.solution.joint
     significance = last.scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
     kept = np.flatnonzero(significance > settings.faint_sigmas)
-    # If a fit moves one star onto another, only the brighter star is kept.
+    # If the fit has moved one star onto another star, only the brighter star is kept.
     stars, light = last.scene.stars[kept], last.scene.light[kept]
     near = np.linalg.norm(stars[:, None] - stars, axis=2) < _SAME
     kept = kept[~(near & (light > light[:, None])).any(axis=1)]
@@ -548,7 +549,7 @@ def _rejection(
     verdict: StreakVerdict,
     known: RotationUncertainty,
 ) -> str:
-    """Return the reason for rejecting a fitted motion, or an empty string if it is accepted."""
+    """Return the reason why a fitted motion is rejected, or an empty string if it is accepted."""
     settings, common = camera.settings, known.common_motion
     distance = np.linalg.norm(result.stars[result.used, None] - result.stars, axis=2)
     bright = result.flux > _DOUBLE_RATIO * result.flux[result.used, None]
@@ -579,7 +580,7 @@ def _rejection(
     return reason
 
 
-# Maximum number of motions for which the joint fit is run before a frame is rejected.
+# Maximum number of preliminary motions for which the joint fit is run before a frame is rejected.
 _MOST_MOTIONS = 2
 # Median region length (px) below which a frame without a common motion shows stars at rest.
 _AT_REST = 4.0
@@ -653,14 +654,14 @@ def estimate_motion(
         prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
         previous_checksum: checksum of the previous frame. A frame with the same checksum indicates a frozen
             camera.
-        prior_course: course of the rotation during the exposure, as estimated by the navigation filter; None
-            if unknown.
+        prior_course: rotation as a function of time during the exposure, as estimated by the navigation
+            filter; None if unknown.
 
     Raises FlightError for an invalid frame, exposure or prior. If the frame yields no rate, the `status` and
     `reason` of the result say why.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
-    # A frame may saturate at a lower count than the settings say, but never at a higher count.
+    # The actual saturation level of a frame may be lower than the configured one, but never higher.
     saturation = min(saturation_count(pixels), settings.saturation or np.inf)
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
@@ -747,7 +748,7 @@ def _best_motion(
         return leading
     # A doubtful motion is accepted if a scan of the whole frame gives the same rotation angle.
     # A scan of the whole frame takes less time than the fit of another motion.
-    # Streaks in fragments often give the correct rotation axis but a wrong angle.
+    # If streaks are broken into fragments, the rotation axis is often correct but the angle wrong.
     angles = _frame_angles(camera, leading.rotation)
     if leading.possible and _has_angle(leading.rotation, angles):
         return leading
@@ -797,7 +798,7 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
     if result.status is StreakStatus.FAILED:
         verdict = StreakVerdict.REJECTED
     if camera.shutter.delay_per_row:
-        # The residuals of the brightest streaks are evaluated without clipping of outlier pixels.
+        # The residuals of the brightest streaks are evaluated without excluding outlier pixels.
         whole = camera.evaluate(scene, last.windows, clip=0.0)
         bright = slice(camera.settings.most_stars)
         stars = scene.stars[bright]

@@ -1,16 +1,16 @@
-"""Detection of faint star streaks under a known motion, and search for the rotation angle, on polar grids.
+"""Detection of faint star streaks for a known motion, and search for the rotation angle, on polar grids.
 
-The 3 x 3 pixel sums of the frame are sampled on circles about the rotation axis, where all streaks are
+The sums of 3 x 3 pixels of the frame are sampled on circles about the rotation axis, where all streaks are
 straight and equally long. The matched filter of a streak is a running sum over the length of the streak.
 Along a circle, the filter response of a star is a triangle that is truncated at the border of the detector.
-Across the circles, the filter response of a star is the star's profile. Peaks of the filter response are
-stars, and a linear system separates the heights of overlapping peaks. For bright stars, the second difference
-along the circle separates overlapping triangles.
+Across the circles, the filter response has the shape of the star's profile. Peaks of the filter response are
+stars, and the solution of a linear system gives the heights of overlapping peaks. For bright stars, the
+second difference of the response along the circle separates overlapping triangles.
 
-If the brightest regions do not determine the rotation angle, all circles are searched. A search of all
-circles is necessary if streaks are faint and fragmented, or if the border truncates all streaks. The mean of
-the pixels in a box along a circle is compared with the mean of the pixels on both sides of the box. The box
-length with the largest sum of squared significances is the length of the streaks.
+If the brightest regions do not determine the rotation angle, all circles are searched. All circles about the
+rotation axis must be searched if streaks are faint and fragmented, or if the border truncates all streaks.
+The mean of the pixels in a box along a circle is compared with the mean of the pixels on both sides of the
+box. The box length with the largest sum of squared significances is the length of the streaks.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from knightcube.vision.streaks.geometry import CameraMotion, paths
 
 # Spacing (px) of neighbouring circles of the polar grid.
 _ACROSS = 1.8
-# Spacing (px) of the samples along a circle.
+# Spacing (px) of the samples along a circle of the polar grid.
 _ALONG = 4.0
 # Number of circles processed at once, small enough for the samples to fit into the processor's cache.
 _CHUNK = 64
-# Smallest angle (rad) between a circle of the grid and the rotation axis.
+# Smallest angle (rad) between a circle of the polar grid and the rotation axis.
 _NEAREST = 0.003
 # Spacing (px) of the points that trace the border of the detector.
 _BORDER_STEP = 8.0
@@ -43,15 +43,16 @@ _BORDER_STEP = 8.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolarGrid:
-    """Samples (r, c) on r circles about the rotation axis.
+    """A polar grid of c samples on each of r circles about the rotation axis.
 
     Attributes:
-        frame: rows (3, 3): two unit vectors normal to the rotation axis, and the rotation axis.
-        polar: (r,) angle between each circle and the rotation axis, rad.
-        azimuth: (c,) azimuth of each sample on a circle, rad.
-        length: number of samples in the length of a streak.
+        frame: matrix (3, 3) whose rows are two unit vectors normal to the rotation axis, and the rotation
+            axis.
+        polar: angle between each circle and the rotation axis (r,), rad.
+        azimuth: azimuth about the rotation axis of each sample on a circle (c,), rad.
+        length: length of a streak, as a number of samples along a circle.
         angle: rotation angle over the exposure, rad.
-        speed: (r,) image displacement per radian of azimuth on each circle, px/rad.
+        speed: image displacement per radian of azimuth on each circle (r,), px/rad.
     """
 
     frame: FloatArray
@@ -63,16 +64,16 @@ class PolarGrid:
 
     @property
     def full(self) -> bool:
-        """Whether the circles of the grid are complete, with azimuths from 0 to 2 pi."""
+        """Whether the circles of the polar grid are complete, with azimuths from 0 to 2 pi."""
         return abs(float(self.azimuth[-1] - self.azimuth[0])) > 2.0 * np.pi - 0.05
 
     @property
     def off_centre(self) -> float:
-        """Offset (samples) of the centre of a running sum from a sample: 0.5 for an even sample count."""
+        """Offset (samples) of a running sum's centre from a sample: 0.5 for an even number of samples."""
         return 0.0 if round(self.length) % 2 else 0.5
 
     def pixels(self, pinhole: Pinhole, row: FloatArray, column: FloatArray) -> FloatArray:
-        """Return the pixel coordinates (k, 2) at fractional rows and columns (k,) of the grid."""
+        """Return the pixel coordinates (k, 2) at fractional rows and columns (k,) of the polar grid."""
         polar = self.polar[0] + row * (self.polar[1] - self.polar[0])
         azimuth = self.azimuth[0] + column * (self.azimuth[1] - self.azimuth[0])
         local = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
@@ -80,7 +81,7 @@ class PolarGrid:
 
 
 def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarGrid:
-    """Return a polar grid whose circles cross the detector, with one in `every` circles kept."""
+    """Return a polar grid of circles that cross the detector, with one in `every` circles kept."""
     angle = float(np.linalg.norm(motion.rotation))
     axis = motion.rotation / angle
     middle = np.array([0.0, 0.0, 1.0])
@@ -108,11 +109,12 @@ def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarG
 def sampled(
     sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, room: int, unit: float
 ) -> Iterator[tuple[slice, slice, Float32Array, BoolArray]]:
-    """Yield groups of circles as rows, columns, samples, and a mask of the samples on the detector.
+    """Yield the polar grid by groups of circles: rows, columns, samples, and a mask of usable samples.
 
-    The samples are taken from the pixel sums `sums`, which must be zero along the border of the frame. The
-    samples are rounded to integer multiples of `unit`, so that sums of them are fast and exact. If the
-    circles are complete, the columns include a margin of `room` samples on both sides of the detector.
+    The samples are values of the 3 x 3 pixel sums `sums`, which must be zero along the border of the frame.
+    The samples are rounded to integer multiples of `unit`, so that sums of them are fast and exact. The mask
+    excludes samples beside the detector. If the circles are complete, a margin of `room` samples is included
+    on both sides of the detector.
     """
     # A direction divided by the sine of its polar angle is the sum of an azimuth term and a polar term.
     turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
@@ -155,7 +157,7 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slic
     for start in range(0, len(grid.polar), _CHUNK):
         part = slice(start, min(start + _CHUNK, len(grid.polar)))
         near = (polar > grid.polar[start] - margin) & (polar < grid.polar[part.stop - 1] + margin)
-        # The azimuth pi points from the rotation axis away from the image centre.
+        # The direction of azimuth pi points from the rotation axis away from the image centre.
         behind = grid.pixels(pinhole, np.array([start]), np.zeros(1))
         if grid.full and pinhole.contains(behind, margin=2.0)[0]:
             yield part, slice(0, count)
@@ -171,7 +173,7 @@ Int32Array = npt.NDArray[np.int32]
 
 # Side (px) of the square of pixels that is summed for one sample.
 _BOX = 3.0
-# Largest cumulative sum of samples, in units of the rounding step.
+# Largest cumulative sum of samples that can be represented, in units of the rounding step.
 _HIGHEST = 2.0**30
 
 
@@ -181,10 +183,10 @@ class RunningSums:
 
     Attributes:
         light: (r, c) counts.
-        count: (r, c) number of samples on the detector in each running sum.
-        span: (r, 2) first and last column of each circle on the detector. The span is infinite if the samples
-            of a circle on the detector are not contiguous.
-        excess: (r,) noise of the running sums on each circle, relative to the noise of independent samples.
+        count: number of samples on the detector in each running sum (r, c).
+        span: indices of the first and last column of each circle that lie on the detector (r, 2). The range
+            `span` is infinite if the samples of a circle on the detector are not contiguous.
+        excess: noise of the running sums on each circle, relative to the noise for independent samples (r,).
     """
 
     light: Float32Array
@@ -196,19 +198,19 @@ class RunningSums:
 def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: float) -> RunningSums:
     """Return the running sums over one streak length, centred on each sample of the polar grid.
 
-    `sums` must be zero along the border of the frame, because samples outside the frame take the border's
-    value. The samples are rounded to multiples of `unit` counts.
+    The pixel sums `sums` must be zero along the border of the frame, because samples outside the frame take
+    the border's value. The samples are rounded to multiples of `unit` counts.
     """
     width = max(round(grid.length), 1)
     before, after = width // 2, width - width // 2
     rows, columns = len(grid.polar), len(grid.azimuth)
-    # Memory is only allocated for elements that are written, which lie on the detector.
+    # Memory is only used for array elements that are written, which lie on the detector.
     response, count = np.zeros((rows, columns), dtype=np.float32), np.zeros((rows, columns), dtype=np.int32)
     span = np.tile([-np.inf, np.inf], (rows, 1))
     unit = max(unit, float(sums.max()) * width / _HIGHEST)
     for part, crossing, samples, inside in sampled(sums, pinhole, grid, width, unit):
         wide = samples.shape[1]
-        # Samples and mask are padded by one streak length on both sides.
+        # The samples and their mask are padded by one streak length on both sides.
         padded = np.zeros((2, len(samples), wide + 2 * width + 1), dtype=np.int32)
         middle = slice(width + 1, width + 1 + wide)
         padded[0, :, middle] = samples
@@ -225,7 +227,7 @@ def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: fl
         count[part, low:high] = held[1]
         begin, end = inside.argmax(axis=1), wide - 1 - inside[:, ::-1].argmax(axis=1)
         whole = inside.sum(axis=1) == end - begin + 1
-        # The centre of an even number n of samples lies half a sample before the sample with index n/2.
+        # The centre of a running sum of an even number n of samples lies half a sample before the sample n/2.
         edges = np.stack([begin - 0.5, end + 0.5], axis=1) + crossing.start + grid.off_centre
         span[part] = np.where(whole[:, None], edges, span[part])
     # On circles near the rotation axis, neighbouring samples share pixels, so that their noise is correlated.
@@ -239,7 +241,7 @@ def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: fl
 
 
 def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Float32Array:
-    """Return the cumulative sums (r, c + 1) of the samples before each sample of a circle."""
+    """Return the cumulative sums (r, c + 1) of all samples on a circle before each sample."""
     out = np.zeros((len(grid.polar), len(grid.azimuth) + 1), dtype=np.float32)
     for part, crossing, samples, _ in sampled(sums, pinhole, grid, 0, 1.0):
         out[part, crossing.start + 1 : crossing.stop + 1] = np.cumsum(samples, axis=1, dtype=np.float64)
@@ -249,7 +251,7 @@ def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Fl
 
 # Minimum fraction of a streak that must lie on the detector for its detection.
 _LEAST_SEEN = 0.35
-# Number of circles between two stars at which their profiles no longer overlap.
+# Number of grid circles between two stars at which their profiles no longer overlap.
 _FARTHEST = 5
 # Standard deviation (px) of a star's profile across the streak, as assumed by the filter.
 _WIDTH = 1.05
@@ -271,9 +273,9 @@ _NEIGHBOURS = sorted(
     key=lambda step: abs(step[0]) + abs(step[1]),
 )
 
-# Number of entries per px in the table of a star's profile across the circles.
+# Number of entries per px in the table of a star's brightness profile across the circles.
 _PER_PX = 50.0
-# Profile of a star as a function of the distance across the circles.
+# Table of a star's brightness profile against the distance across the circles.
 _PROFILE = ndtr((np.arange(400) / _PER_PX + 1.5) / _WIDTH) - ndtr((np.arange(400) / _PER_PX - 1.5) / _WIDTH)
 _PROFILE /= _PROFILE[0]
 
@@ -281,7 +283,8 @@ _PROFILE /= _PROFILE[0]
 def overlap_of(one: FloatArray, other: FloatArray, span: FloatArray, length: float) -> FloatArray:
     """Return the fraction of the streak length by which streaks at columns `one` and `other` (...) overlap.
 
-    `span` (..., 2) is the range of columns on the detector. `length` is in samples.
+    The argument `span` (..., 2) is the range of columns of a circle that lie on the detector. `length` is in
+    samples.
     """
     first = np.maximum(np.maximum(one, other) - 0.5 * length, span[..., 0])
     last = np.minimum(np.minimum(one, other) + 0.5 * length, span[..., 1])
@@ -297,11 +300,11 @@ def profile(distance: FloatArray) -> FloatArray:
 def sharp_peaks(
     held: RunningSums, place: IntArray, deviation: FloatArray, grid: PolarGrid
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rows and columns of bright stars, found by the second difference of the filter response.
+    """Return grid rows and columns of bright stars, found by the second difference of the filter response.
 
     The peaks of the second difference are narrow, so that stars close to each other on one circle are
-    separated. `place` (p,) are flat indices of high filter responses, and `deviation` (p,) is the noise at
-    these indices.
+    separated. The flat indices `place` (p,) are those of high filter responses, whose noise is `deviation`
+    (p,).
     """
     step = _SHARP_STEP
     if grid.length < _SHARP_FROM:
@@ -311,7 +314,7 @@ def sharp_peaks(
     bend += flat.take(place + step, mode="clip")
     np.subtract(np.float32(2.0) * flat[place], bend, out=bend)
     bend *= np.float32(grid.length / (2.0 * step))
-    # The second difference is scaled to the response of an isolated star, which also scales its noise.
+    # The second difference of the response is scaled to that of an isolated star, as is its noise.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
     sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
@@ -324,10 +327,10 @@ def sharp_peaks(
 def standing_peaks(
     significance: Float32Array, span: FloatArray, place: IntArray, grid: PolarGrid, sigmas: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return fractional rows and columns of the peaks that stronger peaks do not explain, strongest first.
+    """Return fractional grid rows and columns of the peaks not explained by stronger peaks, strongest first.
 
-    Only the flat indices `place` (p,) of the filter response are searched. `span` (r, 2) is the range of
-    columns on the detector, as in `RunningSums`.
+    Only the flat indices `place` (p,) of the filter response are searched. The range `span` (r, 2) of columns
+    on the detector is that of `RunningSums`.
     """
     row, column = _local_maxima(significance, place)
     value, spans = significance[row, column].astype(np.float64), span[row]
@@ -359,7 +362,7 @@ def standing_peaks(
 
 
 def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the local maxima among the flat indices `place` (p,), highest first."""
+    """Return grid rows and columns of local maxima among the flat indices `place` (p,), highest first."""
     flat, columns = values.reshape(-1), values.shape[1]
     value = flat[place]
     # If the circles are complete, the first column of a circle is a neighbour of the last column.
@@ -372,7 +375,7 @@ def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntA
 
 
 def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: int) -> FloatArray:
-    """Return the fractional positions of peaks along `axis`, each from a parabola through three values."""
+    """Return the fractional indices of peaks along `axis`, each from a parabola through three values."""
     place = (row, column)[axis]
     size = significance.shape[axis]
     before, after = np.maximum(place - 1, 0), np.minimum(place + 1, size - 1)
@@ -395,11 +398,11 @@ _TINY = 1e-6
 _SOLVED = 1e-4
 # Maximum number of conjugate-gradient iterations for the peak heights.
 _MOST_GRADIENTS = 200
-# Number of filter responses computed at once, which limits the memory.
+# Number of values of the filter response computed at once, which limits the memory.
 _SOME_PLACES = 1 << 16
-# Minimum streak length (px) for the matched filter.
+# Minimum streak length (px) for which the matched filter is used.
 _LEAST_LENGTH = 6.0
-# Fraction of a star's flux within three pixels across the streak.
+# Fraction of a star's flux that lies within three pixels across the streak.
 _CAPTURED = 0.83
 # Noise of a sum of n overlapping 3 x 3 samples, relative to the noise of a pixel times sqrt(n).
 _SAMPLE_NOISE = 3.1
@@ -407,7 +410,7 @@ _SAMPLE_NOISE = 3.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaintStars:
-    """Detected streaks: positions (n, 2) px at mid-exposure, fluxes (n,) counts and significances (n,)."""
+    """Detected streaks: positions at mid-exposure (n, 2), px, fluxes (n,), counts, and significances (n,)."""
 
     stars: FloatArray
     light: FloatArray
@@ -424,7 +427,8 @@ def find_faint(
 ) -> FaintStars:
     """Return the `most` significant streaks along `motion` after subtraction of the modelled stars.
 
-    `modelled` holds flat pixel indices (m,) and the modelled counts (m,) of these pixels.
+    The pair `modelled` holds the flat indices of m pixels (m,) and the counts of the modelled stars there
+    (m,).
     """
     middle = paths(pinhole, motion, np.array([pinhole.centre]), np.zeros(1)).velocity
     reach = (
@@ -435,7 +439,7 @@ def find_faint(
     grid = polar_grid(pinhole, motion)
     usual = _SAMPLE_NOISE * float(np.sqrt(np.median(frame.floor[::97])))
     held = running_sums(_residual_sums(frame, modelled), pinhole, grid, usual / _ROUNDING)
-    # The noise of a running sum depends on its number of samples. Sums of too few samples are excluded.
+    # The noise of a running sum depends on the number of its samples. Sums of too few samples are excluded.
     noise = usual * np.sqrt(np.arange(max(round(grid.length), 1) + 1.0))
     noise[: math.ceil(_LEAST_SEEN * grid.length)] = np.inf
     row, column, height = _found_stars(held, noise, grid, sigmas, most)
@@ -453,7 +457,7 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
     """Return the 3 x 3 sums (rows * columns,) of the frame without modelled stars and bad pixels."""
     pixels, light = modelled
     signal, floor = frame.signal[pixels], frame.floor[pixels]
-    # Residuals of bright stars are attenuated, because they are mostly photon noise of the subtracted stars.
+    # Residuals of subtracted bright stars are attenuated, because they are mostly photon noise.
     share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))
     left = (signal - light) * share
     left[frame.bad[pixels]] = 0.0
@@ -471,11 +475,11 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
 def _found_stars(
     held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: float, most: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return fractional rows, columns and peak heights of the stars that reproduce the response `held`.
+    """Return fractional grid rows, columns and heights of the peaks that reproduce the response `held`.
 
     Each pass finds peaks in the residual response, solves for the heights of all stars, and subtracts these
-    stars. `noise` is the noise of a running sum, indexed by its number of samples. All passes search only the
-    indices whose initial response is significant.
+    stars. The array `noise` holds the noise of a running sum by the number of its samples. All passes search
+    only those samples whose initial response is significant.
     """
     flat = held.light.reshape(-1)
     place = np.flatnonzero(flat > sigmas * noise.min())
@@ -526,7 +530,7 @@ def _responses(
     column: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Return the summed filter responses (p,) of stars at the ascending flat indices `place` (p,)."""
+    """Return the sum of the filter responses of all stars at the ascending flat indices `place` (p,)."""
     rows, columns = held.light.shape
     # On each neighbouring circle, the filter response of a star covers a contiguous range of columns.
     circle = row.astype(np.int64)[:, None] + np.arange(1 - _FARTHEST, _FARTHEST + 1)
@@ -542,7 +546,7 @@ def _responses(
     circle, weight = circle.reshape(-1)[reached], weight.reshape(-1)[reached]
     star = reached // (2 * _FARTHEST)
     out = np.zeros(len(place))
-    # Ranges of columns are processed in groups, which limits the memory.
+    # The ranges of columns are processed in groups, which limits the memory.
     cuts = np.searchsorted(np.cumsum(count), np.arange(_SOME_PLACES, int(count.sum()), _SOME_PLACES))
     for some in np.split(np.arange(len(reached)), np.unique(cuts)):
         many = count[some]
@@ -562,7 +566,7 @@ def _responses(
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
     """Return the peak heights (k,) of stars whose overlapping responses add up to the measured response."""
     middle = np.rint(row).astype(int)
-    # The arrays `one` and `other` list all pairs of stars that may overlap, including each star with itself.
+    # The indices `one` and `other` list all pairs of stars that may overlap, including a star with itself.
     order = np.argsort(row, kind="stable")
     first = np.searchsorted(row[order], row - _FARTHEST, side="right")
     count = np.searchsorted(row[order], row + _FARTHEST) - first
@@ -589,7 +593,7 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
 def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArray) -> FloatArray:
     """Return the solution (k,) of sparse symmetric linear equations by conjugate gradients.
 
-    The nonzero matrix elements `overlap` (e,) are at the rows `one` (e,) and columns `other` (e,).
+    The e nonzero matrix elements `overlap` (e,) are in the rows `one` (e,) and columns `other` (e,).
     """
     k = len(right)
     scale = 1.0 / np.sqrt(overlap[one == other])
@@ -609,21 +613,21 @@ def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArr
     return np.asarray(x * scale)
 
 
-# Ratio of consecutive box lengths in the angle search.
+# Ratio of consecutive box lengths in the search for the rotation angle.
 _FACTOR = 1.1
-# Shortest box length (samples) in the angle search.
+# Shortest box, as a number of samples, in the search for the rotation angle.
 _SHORTEST = 5
-# Factor by which the angle search reduces the number of circles.
+# Factor by which the search for the rotation angle reduces the number of circles.
 _SPARSE = 2
-# Minimum significance (standard deviations) of a box in the angle search.
+# Minimum significance (standard deviations) of a box in the search for the rotation angle.
 _LEAST_SIGMAS = 5.0
-# Upper limit of the significance (standard deviations) of a box in the angle search.
+# Upper limit of the significance (standard deviations) of a box in the search for the rotation angle.
 _ENOUGH = 40.0
 
 
 def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
     """Return the `most` likely rotation angles (rad) about the axis of `rotation` (3,), most likely first."""
-    # The sampling is chosen for a rotation by one radian, the largest angle in the search.
+    # The sampling is that for a rotation by one radian, which is the largest angle in this search.
     grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
     step = grid.angle / grid.length
     held = cumulative_sums(frame.sums, pinhole, grid)
@@ -651,7 +655,8 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
 def _box_significance(padded: Float32Array, room: int, width: int) -> float:
     """Return the sum of squared significances over all locally best boxes of `width` samples.
 
-    `padded` (c, r) holds the cumulative sums along the azimuth, with a margin of `room` samples at both ends.
+    The array `padded` (c, r) holds cumulative sums along the azimuth on r circles, with a margin of `room`
+    samples at both ends.
     """
     stretches = (len(padded) - 2 * room - width) // width
     outer, inner, behind, beyond = (
@@ -662,7 +667,7 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
     light *= np.float32(2.0)
     light -= beyond
     light += outer
-    # Each circle is divided into intervals of one box length, and only local maxima over the intervals count.
+    # The best box of each interval of one box length counts if no adjacent interval has a better box.
     best = light.reshape(stretches, width, -1).max(axis=1)
     best *= np.float32(1.0 / np.sqrt(2.0 * width))
     around = np.pad(best, 1)

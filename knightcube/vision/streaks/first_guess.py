@@ -1,20 +1,21 @@
 """Initial guesses of the camera's motion from the bright regions of a frame.
 
-A streak at the pixel p is parallel to B(p) u, where u is the rotation vector and B(p) the image-flow matrix.
-The unit normal n of the streak therefore gives the linear equation n.B(p) u = 0, which holds for either
-direction of motion along the streak. Pairs of regions propose rotation axes, the other regions vote for the
-proposed axes, and least squares refines the axis with most votes. All stars rotate by the same angle, and the
-lengths of the regions vote for the rotation angle. A region that is truncated by the border of the frame
-gives only a lower limit of the angle. Fragments of one streak lie on one circle about the rotation axis, and
-their total length also votes for the angle.
+A streak at the pixel p is parallel to B(p) u, where u is the rotation vector of the camera and B(p) the
+image-flow matrix, which gives the motion of stars at p. The unit normal n of the streak in the image
+therefore gives the linear equation n.B(p) u = 0, which holds for either direction of motion along the streak.
+Pairs of bright regions propose rotation axes, the other regions vote for the proposed axes, and least squares
+refines the axis with most votes. All streaks subtend the same rotation angle, and the lengths of the bright
+regions vote for this angle. A bright region that is truncated by the border of the frame gives only a lower
+limit of the angle. Fragments of one streak lie on one circle about the rotation axis, and their total length
+also votes for the rotation angle.
 
 If few streaks lie completely in the frame, a scan finds the rotation angle. Along a circle about the rotation
-axis, the intensity of a star is a box function whose length is the rotation angle. The samples around the
-brightest regions are summed in boxes of each trial length, and each box is moved to the position of its
-largest sum. A box of the correct length contains all flux of a star and no background pixels. A box that is
-too long or too short by a factor of two explains only half of the chi-square. The scan therefore finds the
-angle without a good initial guess, whereas a fit of the pixels converges only from within a few point-spread
-widths.
+axis, the intensity of a star's streak is a box function whose length is the rotation angle. For each trial
+length, the pixel samples around the brightest regions are summed in boxes, and each box is moved along its
+circle to the position of its largest sum. A box of the correct length contains all flux of a star and no
+background pixels. Boxes that are too long or too short by a factor of two explain only half of the
+chi-square. The scan therefore finds the rotation angle without a good initial guess, whereas a fit of the
+pixels converges only from within a few point-spread widths.
 """
 
 from __future__ import annotations
@@ -32,19 +33,19 @@ from knightcube.vision.streaks.geometry import CameraMotion, image_flow, path_le
 SCANNED_STARS = 14
 """Number of the brightest regions that are used in the scan for the rotation angle."""
 
-# Spacing (px) of samples along the circle with the fastest image motion.
+# Spacing (px) of samples along that circle about the rotation axis on which stars move fastest.
 _STEP = 2.0
 # Ratio of consecutive box lengths in the scan for the rotation angle.
 _FACTOR = 1.04
-# Shortest box length (samples) in the scan for the rotation angle.
+# Shortest box, as a number of samples, in the scan for the rotation angle.
 _SHORTEST = 6
-# Number of the most likely angles among which the prior rate chooses.
+# Number of the most likely rotation angles among which the prior rate chooses.
 _WEIGHED = 3
-# Upper limit of a sample relative to its region's median, which limits the effect of crossing stars.
+# Upper limit of a sample relative to the median of its region, which limits the effect of crossing stars.
 _CAP = 2.0
-# Upper limit of the significance (standard deviations) of a star in the scan.
+# Upper limit of the significance (standard deviations) of a star in the scan for the rotation angle.
 _ENOUGH = 60.0
-# Minimum significance (standard deviations) of a star that the scan passes to the fit.
+# Minimum significance (standard deviations) of a star that the scan for the rotation angle passes to the fit.
 _CERTAIN = 8.0
 # Minimum fraction of a streak that lies in the frame, for a star that the scan passes to the fit.
 _LEAST_SEEN = 0.25
@@ -52,12 +53,13 @@ _LEAST_SEEN = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Circles:
-    """Circles (n,) about the rotation axis, each through one of the brightest regions.
+    """Circles about the rotation axis, each through the centroid of one of the n brightest regions.
 
     Attributes:
-        frame: rows (3, 3): two unit vectors normal to the rotation axis, and the rotation axis.
-        height: (n,) cosine of the angle between each circle and the rotation axis.
-        azimuth: (n,) azimuth of the centroid of each region, rad.
+        frame: matrix (3, 3) whose rows are two unit vectors normal to the rotation axis, and the rotation
+            axis.
+        height: cosine of the angle between each circle and the rotation axis (n,).
+        azimuth: azimuth about the rotation axis of the centroid of each region (n,), rad.
     """
 
     frame: FloatArray
@@ -67,11 +69,11 @@ class Circles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AngleCandidate:
-    """A candidate for the rotation angle, with the stars found under it.
+    """A candidate for the rotation angle, with the stars found under this angle.
 
     Attributes:
         angle: rad.
-        stars: (n, 2) positions of the stars at mid-exposure, px.
+        stars: positions of the n stars at mid-exposure (n, 2), px.
         light: (n,) counts.
     """
 
@@ -83,7 +85,7 @@ class AngleCandidate:
 def scan_angles(
     frame: ReducedFrame, pinhole: Pinhole, circles: Circles, most: int, near: float | None = None
 ) -> Iterator[AngleCandidate]:
-    """Yield the `most` likely rotation angles, nearest to `near` (rad) first if `near` is given."""
+    """Yield the `most` likely rotation angles, sorted by the distance from `near` (rad) if it is given."""
     boxes = _boxes(frame, pinhole, circles)
     longest = boxes.total.shape[1] - 2
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
@@ -92,7 +94,7 @@ def scan_angles(
     # The weight of a bright star is limited, because it may be a blend of two stars.
     scale = np.minimum(_ENOUGH**2 / np.maximum(gain.max(axis=0), 1.0), 1.0)
     score = gain @ scale
-    # If the border truncates all stars, longer rotations explain no more flux, and the shortest is chosen.
+    # If the border truncates all streaks, longer rotations explain no more flux, and the shortest is chosen.
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
     peak = np.flatnonzero((score > before) & (score >= after))
     peak = peak[np.argsort(-score[peak], kind="stable")]
@@ -105,7 +107,7 @@ def scan_angles(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BestBoxes:
-    """Best boxes (n,): chi-square, first sample, flux, and number of samples in the frame."""
+    """The best box for each of n regions: chi-square, first sample, flux, and sample count in the frame."""
 
     gain: FloatArray
     first: IntArray
@@ -115,9 +117,9 @@ class _BestBoxes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Boxes:
-    """Cumulative sums (n, c + 1) along the circles: samples, and number of samples in the frame.
+    """Cumulative sums along n circles (n, c + 1) of the c samples, and of the number of samples in the frame.
 
-    The first azimuth is `begin` (rad), and the spacing of the samples is `step` (rad).
+    The azimuth of the first sample is `begin` (rad), and the spacing of the samples is `step` (rad).
     """
 
     total: FloatArray
@@ -128,7 +130,7 @@ class _Boxes:
     step: float
 
     def best(self, width: int) -> _BestBoxes:
-        """Return the box of `width` samples with the largest chi-square at each region."""
+        """Return, for each region, the box of `width` samples with the largest chi-square."""
         last = self.total.shape[1] - 1
         first = self.middle[:, None] - np.arange(width + 1)
         start, stop = np.clip(first, 0, last), np.clip(first + width, 0, last)
@@ -141,7 +143,7 @@ class _Boxes:
 
 
 def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
-    """Return cumulative sums of samples on the circles, each at most `_CAP` times the region's median."""
+    """Return cumulative sums along circles of samples, each at most `_CAP` times its region's median."""
     sine = np.sqrt(np.maximum(1.0 - circles.height**2, 1e-12))
     step = _STEP / (pinhole.focal_length * float(sine.max()))
     inside_field = float(np.arccos(np.clip(abs(circles.frame[2, 2]), 0.0, 1.0)))
@@ -176,7 +178,7 @@ def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
 def _refined_angle(
     boxes: _Boxes, pinhole: Pinhole, circles: Circles, scale: FloatArray, width: int
 ) -> AngleCandidate:
-    """Return the best rotation angle near `width` samples, with the stars found under it."""
+    """Return the best rotation angle near `width` samples, with the stars found under this angle."""
     room = max(2, round(_FACTOR * width) - width + 1)
     widths = np.arange(max(width - room, 2), width + room + 1)
     held = [boxes.best(int(each)) for each in widths]
@@ -184,7 +186,7 @@ def _refined_angle(
     best = int(np.argmax(score))
     chosen, across = held[best], int(widths[best])
     certain = (chosen.gain > _CERTAIN**2) & (chosen.seen > _LEAST_SEEN * across)
-    # A star's position along its path is determined only if at least one end of its streak is in the frame.
+    # The position of a star along its path is determined only if at least one streak end is in the frame.
     bounded = np.zeros(len(certain), dtype=np.bool_)
     for sample in (chosen.first, chosen.first + across):
         here = np.clip(sample, 0, boxes.exist.shape[1] - 2)
@@ -208,9 +210,9 @@ def _refined_angle(
 
 # Number of bright regions whose pairs propose rotation axes.
 _PROPOSERS = 16
-# Smallest sine of the angle between the equations of two regions that propose a rotation axis.
+# Smallest sine of the angle between the linear equations of two regions that propose a rotation axis.
 _PARALLEL = 1e-9
-# Product (px) of the standard error of a region's orientation and the region's length.
+# Product (rad px) of the standard error of a region's orientation and the region's length.
 _SIDE_ERROR = 1.2
 # Minimum standard error (rad) of a region's orientation.
 _LEAST_ERROR = 0.012
@@ -220,7 +222,7 @@ _LEAST_LENGTH = 3.5
 _LENGTH_ERROR = 1.0
 # Part of the standard error of a region's length that is proportional to the length.
 _LENGTH_SHARE = 0.015
-# Maximum number of rotation angles from each of the two rankings of the votes.
+# Maximum number of rotation angles taken from each ranking, with and without the contradicting regions.
 _MOST_HYPOTHESES = 3
 # Largest distance (px) across the circles between two fragments of one star.
 _SAME_CIRCLE = 2.0
@@ -230,7 +232,7 @@ _LIKELY_LENGTH = 0.2
 _INSTANTS = 65
 # Minimum number of complete regions for an estimate of the angular acceleration.
 _LEAST_GROWING = 3
-# Minimum relative change of the rate for which an initial guess includes an angular acceleration.
+# Minimum relative change of the rate at which an initial guess includes an angular acceleration.
 _LEAST_GROWTH = 0.4
 
 
@@ -240,9 +242,9 @@ class MotionGuess:
 
     Attributes:
         motion: guessed motion of the camera.
-        stars: (n, 2) centres of the streaks, px.
+        stars: centres of the n streaks (n, 2), px.
         light: (n,) counts.
-        contradicted: fraction of the flux in regions that are too long for the guessed rotation.
+        contradicted: fraction of the flux that is in regions too long for the guessed rotation angle.
     """
 
     motion: CameraMotion
@@ -252,7 +254,7 @@ class MotionGuess:
 
 
 def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, BoolArray] | None:
-    """Return the rotation axis (3,) on which most regions agree, and a mask (n,) of these regions.
+    """Return the rotation axis (3,) with which most bright regions agree, and a mask (n,) of these regions.
 
     The sign of the axis is arbitrary. Returns None if fewer than two regions agree.
     """
@@ -262,7 +264,7 @@ def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, Bo
     flow = image_flow(pinhole, regions.centre)
     equation = np.einsum("ni,nij->nj", regions.normal, flow)
     tolerance = np.maximum(_SIDE_ERROR / np.maximum(regions.length, 1.0), _LEAST_ERROR)
-    # Long and bright regions get a large weight, because they are rarely blends of several stars.
+    # Long and bright regions get a large weight, because they rarely consist of several stars.
     worth = np.sqrt(regions.flux) * np.minimum(regions.length, 100.0)
     leaders = long[np.argsort(-worth[long], kind="stable")[:_PROPOSERS]]
     i, j = (leaders[index] for index in np.triu_indices(len(leaders), k=1))
@@ -294,19 +296,20 @@ def _misalignment(axes: FloatArray, equation: FloatArray, flow: FloatArray) -> F
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxisGuess:
-    """A rotation axis on which regions agree, and the n regions as arcs about this axis.
+    """A rotation axis with which bright regions agree, and the n regions as arcs about this axis.
 
     Attributes:
-        agree: (n,) whether each region agrees with the rotation axis.
-        frame: rows (3, 3): two unit vectors normal to the rotation axis, and the rotation axis.
-        height: (n,) cosine of the angle between each region and the rotation axis.
-        middle: (n,) azimuth of the centroid of each region, rad.
-        first: (n,) lowest azimuth of each region, rad.
-        last: (n,) highest azimuth of each region, rad.
-        width: (n,) arc length of each region from its second moment, rad.
-        speed: (n,) image displacement per radian of azimuth at each region, px/rad.
-        cut_first: (n,) whether the border of the frame truncates the end at the lowest azimuth.
-        cut_last: (n,) whether the border of the frame truncates the end at the highest azimuth.
+        agree: whether each bright region agrees with the rotation axis (n,).
+        frame: matrix (3, 3) whose rows are two unit vectors normal to the rotation axis, and the rotation
+            axis.
+        height: cosine of the angle between each region and the rotation axis (n,).
+        middle: azimuth about the rotation axis of the centroid of each region (n,), rad.
+        first: lowest azimuth about the rotation axis in each region (n,), rad.
+        last: highest azimuth about the rotation axis in each region (n,), rad.
+        width: arc length of each region from the second moment of its brightness (n,), rad.
+        speed: image displacement per radian of rotation at each region (n,), px/rad.
+        cut_first: whether the border of the frame truncates each region at its lowest azimuth (n,).
+        cut_last: whether the border of the frame truncates each region at its highest azimuth (n,).
     """
 
     agree: BoolArray
@@ -322,14 +325,14 @@ class AxisGuess:
 
 
 def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
-    """Return the rotation axis and the regions as arcs about it, or None if fewer than two regions agree."""
+    """Return the rotation axis and the bright regions as arcs about it, or None if too few regions agree."""
     found = guess_axis(regions, pinhole)
     if found is None:
         return None
     axis, agree = found
     n, owner, light = len(regions), regions.owner, regions.light
     middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
-    # The azimuth zero points to the image centre, and is arbitrary if the axis is at the image centre.
+    # Azimuth zero is the direction of the image centre, and is arbitrary if the rotation axis is there.
     first = middle - (middle @ axis) * axis
     if np.linalg.norm(first) < 1e-3:
         first = np.eye(3)[int(np.argmin(np.abs(axis)))]
@@ -348,7 +351,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     height = np.bincount(owner, light * z, n) / flux
     speed = np.linalg.norm(image_flow(pinhole, regions.centre) @ axis, axis=-1)
     low, high = _outermost(azimuth, owner, n)
-    # The variance of a uniform arc is its squared length / 12 plus the variance of the point spread.
+    # The brightness variance along a uniform arc is its squared length / 12 plus that of the point spread.
     width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
     return AxisGuess(
         agree,
@@ -367,9 +370,9 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
 def motions_by_length(
     guess: AxisGuess, regions: BrightRegions, pinhole: Pinhole, most: int, growth: float = 0.0
 ) -> list[MotionGuess]:
-    """Return guesses from the lengths of the regions, most likely first, each with at most `most` stars.
+    """Return initial guesses from the lengths of regions, most likely first, each with at most `most` stars.
 
-    `growth` is the relative change of the rate over the exposure, see `measured_rate_change`.
+    The argument `growth` is the relative change of the rate over the exposure, see `measured_rate_change`.
     """
     guesses = []
     for wide, contradicted in _angles(guess, regions):
@@ -385,10 +388,10 @@ def motions_by_length(
 def motion_by_course(
     course: CameraMotion, regions: BrightRegions, pinhole: Pinhole, most: int
 ) -> MotionGuess:
-    """Return a guess with the known motion `course` and the brightest regions of matching length."""
+    """Return an initial guess with the known motion `course` and the brightest regions of matching length."""
     time = np.linspace(-0.5, 0.5, _INSTANTS)
     progress = course.progress(time)
-    # The second moment of a region is the variance of the star's position over the exposure.
+    # The second moment of a region equals the variance of the star's position over the exposure.
     wide = np.sqrt(12.0 * np.var(progress))
     length = path_lengths(pinhole, course, regions.centre) * wide
     likely = np.abs(regions.length - length) < _LENGTH_ERROR + _LIKELY_LENGTH * length
@@ -402,8 +405,8 @@ def measured_rate_change(guess: AxisGuess, regions: BrightRegions) -> float:
     """Return the relative change of the rate over the exposure from the asymmetry of the regions.
 
     If the rate increases linearly from zero, the centroid of a streak lies a sixth of its length from its
-    midpoint. The sign is positive if the rate increases in magnitude during the exposure. The result is 0 if
-    the change is small.
+    midpoint. The relative change is positive if the rate increases in magnitude during the exposure. A change
+    of the rate that is too small to be significant counts as 0.
     """
     whole = guess.agree & ~regions.cut & (guess.width * guess.speed > _LEAST_LENGTH)
     if np.count_nonzero(whole) < _LEAST_GROWING:
@@ -416,7 +419,7 @@ def measured_rate_change(guess: AxisGuess, regions: BrightRegions) -> float:
 def motions_by_scan(
     guess: AxisGuess, frame: ReducedFrame, pinhole: Pinhole, most: int, near: float | None
 ) -> Iterator[MotionGuess]:
-    """Yield guesses from a scan for the rotation angle, see `scan_angles`."""
+    """Yield initial guesses of motion and stars from a scan for the rotation angle, see `scan_angles`."""
     chosen = np.flatnonzero(guess.agree)[:SCANNED_STARS]
     circles = Circles(guess.frame, guess.height[chosen], guess.middle[chosen])
     for candidate in scan_angles(frame, pinhole, circles, _MOST_HYPOTHESES, near):
@@ -446,7 +449,7 @@ def _at_border(regions: BrightRegions, pinhole: Pinhole, pixel: IntArray) -> Boo
 
 
 def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float]]:
-    """Return the most likely rotation angles (rad), each with the fraction of flux in longer regions."""
+    """Return the most likely rotation angles (rad), each with the flux fraction in regions that exceed it."""
     whole = guess.agree & ~regions.cut & (guess.width > 0.0)
     candidates, weight = guess.width[whole], np.sqrt(regions.flux[whole])
     spread = _LENGTH_ERROR / guess.speed[whole] + _LENGTH_SHARE * candidates
@@ -459,7 +462,7 @@ def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float
         return [(float(np.max(reach[cut])), 0.0)] if cut.any() else []
     nearness = np.exp(-0.5 * ((candidates[:, None] - candidates) / np.hypot(spread[:, None], spread)) ** 2)
     votes = nearness @ weight
-    # A region that is longer than the rotation angle contradicts it, or is a blend of two stars.
+    # A region that is longer than the rotation angle contradicts this angle, or is a blend of two stars.
     long = guess.agree & (guess.speed * reach > 20.0)
     longer = (reach - 10.0 / guess.speed)[long] > candidates[:, None] + 3.0 * spread[:, None]
     doubted = votes - longer @ np.sqrt(regions.flux[long])
@@ -479,10 +482,10 @@ def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float
 
 
 def _joined(guess: AxisGuess, regions: BrightRegions) -> FloatArray:
-    """Return rotation angle, standard error and weight (k, 3) from pairs of fragments on one circle."""
+    """Return rotation angle, standard error and weight (k, 3) from k pairs of fragments on one circle."""
     part = np.flatnonzero(guess.agree & ~regions.cut)
     sine = np.sqrt(np.maximum(1.0 - guess.height[part] ** 2, 1e-12))
-    # The factor `scale` converts a difference of `height`, a cosine, into px across the circles.
+    # The factor `scale` converts a difference of the cosines `height` into px across the circles.
     scale = guess.speed[part] / sine**2
     near = np.abs(guess.height[part, None] - guess.height[part]) * scale < _SAME_CIRCLE
     gap = guess.first[part][None, :] - guess.last[part][:, None]
@@ -503,7 +506,7 @@ def _stars_of_angle(
     reach = np.abs(guess.last - guess.first)
     one = guess.cut_first ^ guess.cut_last
     cut = guess.agree & regions.cut & one & (reach < angle + 6.0 * spread) & (reach > 0.25 * angle)
-    # The centre of a truncated streak follows from its end inside the frame.
+    # The centre of a truncated streak is computed from its end inside the frame.
     # A bright region extends about 2 px beyond the end of the streak.
     past = 2.0 / guess.speed
     middle = np.where(guess.cut_first, guess.last - past - 0.5 * angle, guess.first + past + 0.5 * angle)

@@ -1,8 +1,8 @@
 """Preparation of a frame for the fit: background, noise, unusable pixels, bright regions and star width.
 
-If the point spread is several pixels wide, the frame is binned (`Binning`). A binned frame determines the
-motion equally well in a fraction of the computing time. The responses of a colour camera's raw pixels are
-equalised, and extended sources such as the Earth's limb are excluded.
+If the point spread is several pixels wide, the frame is binned (`Binning`). If the point spread is wide, a
+binned frame determines the motion equally well in a fraction of the computing time. The responses of a colour
+camera's raw pixels are equalised, and extended sources such as the Earth's limb are excluded.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from knightcube.vision.streaks.streak_result import MotionResult
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedFrame:
-    """A frame as flat arrays of rows * columns pixels, in counts of the analogue-to-digital converter.
+    """A frame prepared for the fit, as flat arrays of rows * columns pixels, in raw counts.
 
     Attributes:
         shape: rows, columns.
-        signal: counts above the background, of each pixel.
-        sums: sums of `signal` over 3 x 3 pixels.
+        signal: counts of each pixel above the background.
+        sums: sum of `signal` over the 3 x 3 pixels around each pixel.
         floor: noise variance of each pixel without a star, counts^2.
         counts: raw counts.
-        top: raw counts from which a pixel is saturated.
+        top: saturation level, the raw counts from which a pixel is saturated.
         bad: mask of the saturated and hot pixels, which the fit excludes.
         gain: gain of the camera, electrons per count.
         hot_pixels: number of hot pixels in the frame.
@@ -65,7 +65,7 @@ def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> Reduce
     pixels, step, offset = in_steps(pixels)
     top, gain = (top - offset) / step, gain * step
     background = estimate_background(pixels)
-    # The arithmetic is in place, because allocating large arrays takes more time than the arithmetic.
+    # Arrays are changed in place, because allocating large arrays takes more time than the arithmetic.
     signal = background.map(background.level)
     np.subtract(pixels, signal, out=signal)
     floor = background.map(np.square(background.noise))
@@ -94,19 +94,19 @@ _BORDER = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BrightRegions:
-    """Connected regions of bright pixels, brightest first, and the pixels of these regions.
+    """The n connected regions of bright pixels, brightest first, and the m pixels of these regions.
 
     Attributes:
-        centre: (n, 2) centroid of each region, px.
-        normal: (n, 2) unit vector perpendicular to each region's long axis.
-        length: (n,) length of the uniform line with the second moments of each region, px.
+        centre: centroid of each region (n, 2), px.
+        normal: unit vector in the image perpendicular to each region's long axis (n, 2).
+        length: length of the uniform line that has the same second moments as each region (n,), px.
         flux: (n,) counts.
-        cut: (n,) whether each region touches the border of the frame.
-        owner: (m,) index of the region to which each pixel belongs.
-        column: (m,) column index of each pixel.
-        row: (m,) row index of each pixel.
-        light: (m,) counts of each pixel above the background.
-        lit: fraction of the frame's pixels that exceed the threshold.
+        cut: whether each region touches the border of the frame (n,).
+        owner: index of the region to which each pixel belongs (m,).
+        column: column index of each pixel of a region (m,).
+        row: row index of each pixel of a region (m,).
+        light: counts above the background of each pixel of a region (m,).
+        lit: fraction of the frame's pixels that exceed the threshold for bright regions.
     """
 
     centre: FloatArray
@@ -158,7 +158,7 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
     )
 
 
-# Minimum mean width (px) of a limb or a reflection, twice the width of the brightest stars.
+# Minimum mean width (px) of a limb or a reflection, which is twice the width of the brightest stars.
 _BROAD = 25.0
 # Minimum length (px) by which the area of a region is divided to obtain the mean width.
 _LEAST_LENGTH = 40.0
@@ -169,7 +169,7 @@ _ABOUT = 12
 
 
 def without_glare(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
-    """Return `frame` with limbs and reflections excluded, or None if there are none.
+    """Return `frame` without the pixels of limbs and reflections, or None if it has none.
 
     A limb or a reflection is a region that contains a square larger than any star. A net of crossing streaks
     is not excluded, because it contains no square larger than a star. A margin around limbs and reflections
@@ -205,14 +205,14 @@ _LEAST_MOSAIC_REGIONS = 6
 _UNEVEN_RESPONSE = 0.06
 # Minimum deviation (standard deviations) of a response from the mean that indicates a colour mosaic.
 _UNEVEN_SIGMAS = 8.0
-# Interquartile range of a normal distribution, in standard deviations.
+# Ratio of the interquartile range of a normal distribution to its standard deviation.
 _QUARTILES = 1.35
 MEDIAN_ERROR = 1.25
 """Standard error of the median of normal values, relative to the standard error of their mean."""
 
 
 def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
-    """Return `frame` with equalised pixel responses, or None if the responses are already equal.
+    """Return `frame` with the filter responses of a colour mosaic equalised, or None if they are equal.
 
     The raw pixels of a colour camera lie behind a repeated pattern of 2 x 2 filters. Each bright region has
     about the same flux on the four pixels of the pattern, so that the ratios of their sums are the responses
@@ -241,8 +241,8 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     )
 
 
-# Displacements (px) at which the autocorrelation of a streak is measured.
-# The displacement zero is not used, because noise adds to the autocorrelation there.
+# Displacements (px) at which the autocorrelation of a streak's pixels is measured.
+# The displacement zero is omitted, because pixel noise adds to the autocorrelation there.
 _NEAR, _FAR = 1, 3
 # Maximum number of bright regions from which the point-spread width is estimated.
 _MOST_WIDTH_REGIONS = 12
@@ -254,9 +254,9 @@ def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | N
     """Return the standard deviation (px) of the point spread before pixel convolution, or None if unknown.
 
     The autocorrelation of a streak of Gaussian width w at a displacement d across the streak is proportional
-    to exp(-d^2/(4 w^2)). The product of the autocorrelations along columns and rows is also Gaussian, for
-    every direction and curvature of the streak. The median over the brightest regions is insensitive to
-    blended stars and bright limbs.
+    to exp(-d^2/(4 w^2)). The product of the autocorrelations along columns and along rows is also Gaussian,
+    whatever the direction and curvature of the streak. The median of the width over the brightest regions is
+    insensitive to blended stars and bright limbs.
     """
     chosen = np.flatnonzero(regions.owner < _MOST_WIDTH_REGIONS)
     owner, columns = regions.owner[chosen], frame.shape[1]
@@ -307,13 +307,13 @@ class Binning:
         return cls(1, (0, 0), pinhole)
 
     def frame(self, pixels: Image, top: float) -> tuple[Image, float]:
-        """Return the binned `pixels`, and the value of bins with a pixel of at least `top` counts."""
+        """Return the binned `pixels`, and the value of bins that contain a pixel of at least `top` counts."""
         if self.size == 1:
             return pixels, top
         x, y = self.first
         shape = self.pinhole.rows, self.size, self.pinhole.columns, self.size
         cut = pixels[y : y + shape[0] * self.size, x : x + shape[2] * self.size].reshape(shape)
-        # The saturated value is an integer, so that all bins remain multiples of one count.
+        # The value of saturated bins is an integer, so that all bins remain multiples of one count.
         full = max(int(cut.max()), int(np.ceil(top))) * self.size**2
         sums = cut.sum(axis=(1, 3), dtype=np.uint64)
         sums[at_least(cut, top).any(axis=(1, 3))] = full
@@ -354,7 +354,7 @@ class Binning:
 
 
 def _centred_count(length: int, size: int) -> int:
-    """Return the number of bins of `size` pixels in `length`, reduced by one if an odd number remains."""
+    """Return the number of bins of `size` pixels in `length` pixels that leaves equal margins if possible."""
     count = length // size
     return count - 1 if (length - size * count) % 2 and size % 2 else count
 
@@ -369,7 +369,7 @@ _WIDER = 1.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedFrame:
-    """A binned frame, its bright regions, and the point-spread width `sigma` in binned pixels."""
+    """A frame prepared for the fit, its bright regions, and the point-spread width `sigma` in its pixels."""
 
     binning: Binning
     frame: ReducedFrame
@@ -380,7 +380,7 @@ class PreparedFrame:
 def prepare_frame(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings
 ) -> PreparedFrame:
-    """Return `pixels` (rows, columns) prepared for the configured or a much larger measured point spread.
+    """Return the frame `pixels` prepared for the configured or, if much larger, the measured point spread.
 
     `saturation` is the count from which a pixel is saturated.
     """

@@ -1,11 +1,11 @@
 """Paths of stars over the detector of a rotating camera, and the derivatives of these paths.
 
-Time is measured in exposures and is zero at mid-exposure. With the rate u at mid-exposure and the angular
+Times are measured in exposures and are zero at mid-exposure. With the rate u at mid-exposure and the angular
 acceleration g in camera axes, the rate at time t is u + g t, and the direction v of a star obeys v' = -(u + g
 t) x v. The rotation vector since mid-exposure is u t + g t^2/2 + (u x g) t^3/12 (Magnus expansion). The
-Magnus expansion is exact if g is zero, and otherwise has an error of fourth order in t. Terms of third and
-higher order in t that the navigation filter provides are added to the rotation vector. A star is identified
-by its pixel coordinates at mid-exposure.
+Magnus expansion is exact if the acceleration g is zero, and otherwise has an error of fourth order in t.
+Terms of third and higher order in t that the navigation filter provides are added to the rotation vector. A
+star is identified by its pixel coordinates at mid-exposure.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from knightcube.vision.camera.lens import Pinhole
 
 PIXEL_VARIANCE = 1.0 / 12.0
 """Variance (px^2) of a uniform distribution over one pixel."""
-# Number of iterations for the inversion of the lens distortion, which is about 1 % of the radius.
+# Number of iterations for the inversion of the distortion, which is about 1 % of the image radius.
 _ROUNDS = 6
 _TINY = 1e-12
 
@@ -30,13 +30,14 @@ _TINY = 1e-12
 class DistortedPinhole(Pinhole):
     """A pinhole camera with small calibration errors: image centre, focal length and cubic distortion.
 
-    The inherited projections are those of the ideal pinhole, and only the function `paths` applies the
-    distortion.
+    The inherited projections are those of the ideal pinhole; only the functions `paths` and `positions` apply
+    the distortion.
 
     Attributes:
         shift: displacement (x, y) of the image centre, px.
         scale: relative error of the focal length.
-        cubic: cubic distortion at the corner of the image, as a fraction of the distance from the centre.
+        cubic: cubic distortion at the corner of the image, as a fraction of the corner's distance from the
+            centre.
     """
 
     shift: tuple[float, float]
@@ -48,13 +49,13 @@ class DistortedPinhole(Pinhole):
         return self.cubic / float(np.hypot(*self.centre)) ** 2
 
     def distorted(self, points: FloatArray) -> FloatArray:
-        """Return the distorted positions (m, 2), px, of ideal `points` (m, 2), px."""
+        """Return the image positions (m, 2), px, with lens distortion, of ideal `points` (m, 2), px."""
         away = points - np.array(self.centre)
         grown = self.scale + self._per_square * np.sum(away**2, axis=1, keepdims=True)
         return np.asarray(points + np.array(self.shift) + grown * away)
 
     def undistorted(self, points: FloatArray) -> FloatArray:
-        """Return the ideal positions (m, 2), px, of distorted `points` (m, 2), px."""
+        """Return the image positions (m, 2), px, without the lens distortion of `points` (m, 2), px."""
         shifted = points - np.array(self.centre) - np.array(self.shift)
         away = shifted
         for _ in range(_ROUNDS):
@@ -69,9 +70,9 @@ class DistortedPinhole(Pinhole):
         return np.asarray(grown[:, None, None] * np.eye(2) + 2.0 * self._per_square * outer)
 
     def curvature(self, points: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return the acceleration (m, 2) of distorted image points whose ideal `velocity` is constant.
+        """Return the acceleration (m, 2), px per exposure^2, that the distortion gives image points.
 
-        The ideal `points` (m, 2) are in px, the `velocity` (m, 2) in px per exposure.
+        The ideal `points` (m, 2), px, move with a constant `velocity` (m, 2), px per exposure.
         """
         away = points - np.array(self.centre)
         closing = np.sum(away * velocity, axis=1, keepdims=True)
@@ -84,9 +85,9 @@ class CameraMotion:
     """Rotation of the camera over one exposure, in camera axes, with the exposure as unit of time.
 
     Attributes:
-        rate: (3,) rate at mid-exposure, rad per exposure.
-        acceleration: (3,) angular acceleration, rad per exposure^2.
-        higher_terms: (k, 3) known coefficients of t^3, t^4, ... in the rotation vector, rad.
+        rate: angular rate at mid-exposure (3,), rad per exposure.
+        acceleration: angular acceleration at mid-exposure (3,), rad per exposure^2.
+        higher_terms: known coefficients of t^3, t^4, ... in the rotation vector (k, 3), rad.
     """
 
     rate: FloatArray
@@ -110,7 +111,7 @@ class CameraMotion:
         return not (self.acceleration.any() or self.higher_terms.any())
 
     def directed(self, direction: FloatArray) -> CameraMotion:
-        """Return this motion or its time reversal, whichever has a positive rotation along `direction` (3,).
+        """Return this motion or its time reversal, whichever rotates in the sense of `direction` (3,).
 
         A motion and its time reversal have the same angular acceleration.
         """
@@ -120,7 +121,7 @@ class CameraMotion:
         return CameraMotion(-self.rate, self.acceleration, odd[:, None] * self.higher_terms)
 
     def scaled_to(self, rotation: FloatArray) -> CameraMotion:
-        """Return this motion with a mean rate that gives `rotation` (3,), rad, or the opposite rotation."""
+        """Return this motion with the mean rate `rotation` (3,), rad per exposure, or the opposite rate."""
         sign = -1.0 if self.rotation @ rotation < 0.0 else 1.0
         return replace(self, rate=self.rate + sign * rotation - self.rotation)
 
@@ -136,7 +137,7 @@ class CameraMotion:
 
     @property
     def relative_acceleration(self) -> float:
-        """Relative change of the rate along the mean rotation axis over the exposure."""
+        """Change of the rate along the mean rotation axis over the exposure, relative to the mean rate."""
         square = float(self.rotation @ self.rotation)
         rate = self.higher(np.array([-0.5, 0.5]), 1)
         change = self.acceleration + rate[:, 1] - rate[:, 0]
@@ -148,13 +149,13 @@ class CameraMotion:
         return np.asarray(self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY))
 
     def relative_rate(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the relative rate along the mean rotation axis at `time` (m,), or its derivative."""
+        """Return the rate about the mean axis at `time` (m,) relative to the mean rate, or its derivative."""
         vector = _rate(self, time) if derivative == 0 else self.acceleration[:, None] + self.higher(time, 2)
         relative = self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY)
         return np.asarray(np.broadcast_to(relative, time.shape))
 
     def higher(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the rotation (3, m) due to `higher_terms` at `time` (m,), or a time derivative of it."""
+        """Return the rotation vector (3, m) from `higher_terms` at `time` (m,), or its time derivative."""
         out = np.zeros((3, len(time)))
         for power, term in enumerate(self.higher_terms, start=3):
             factor = (1, power, power * (power - 1))[derivative]
@@ -164,7 +165,7 @@ class CameraMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarPaths:
-    """Points on the paths of stars: position (m, 2), velocity (m, 2) and acceleration (m, 2).
+    """The m points on the paths of stars: position (m, 2), velocity (m, 2) and acceleration (m, 2).
 
     The position is in px, the velocity in px per exposure, and the acceleration in px per exposure^2.
     """
@@ -175,7 +176,7 @@ class StarPaths:
 
 
 def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> StarPaths:
-    """Return points at `time` (m,) on the paths of stars with the pixels `stars` (m, 2) at mid-exposure."""
+    """Return points at `time` (m,) on the paths of stars that are at `stars` (m, 2), px, at mid-exposure."""
     v = _rotated(_rotation_until(motion, time), _directions(pinhole, stars))
     w = _rate(motion, time)
     velocity = _cross(v, w)  # -omega x v
@@ -199,7 +200,7 @@ def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: Float
 
 
 def positions(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
-    """Return only the positions (m, 2), px, of `paths`, in less time than `paths`."""
+    """Return the positions (m, 2), px, of the points from `paths`, faster than `paths`."""
     v = _rotated(_rotation_until(motion, time), _directions(pinhole, stars))
     points = _pixels(pinhole, v[:2] / v[2])
     return pinhole.distorted(points) if isinstance(pinhole, DistortedPinhole) else points
@@ -216,27 +217,28 @@ def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
 def sensitivities(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool = True
 ) -> FloatArray:
-    """Return the derivatives (m, 2, 8) of pixels at `time` (m,), see `sensitivities_and_velocity`."""
+    """Return the derivatives (m, 2, 8) of star positions at `time` (m,), see `sensitivities_and_velocity`."""
     return sensitivities_and_velocity(pinhole, motion, stars, time, growing)[0]
 
 
 def sensitivities_and_velocity(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool = True
 ) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives (m, 2, 8) of pixels at `time` (m,), and velocities (m, 2), px per exposure.
+    """Return derivatives (m, 2, 8) of star positions at `time` (m,), and velocities (m, 2), px per exposure.
 
-    The parameters are the rate (3), the acceleration (3) and the star's pixel at mid-exposure (2). The
-    derivatives with respect to rate and star are exact. Derivatives with respect to the acceleration have an
-    error of second order in the rotation angle, and are zero unless `growing`.
+    The derivatives are with respect to rate (3), acceleration (3) and the star's position at mid-exposure
+    (2). The derivatives with respect to the rate and the star's position are exact. The derivatives with
+    respect to the acceleration have an error of second order in the rotation angle, and are zero unless the
+    acceleration is fitted (`growing`).
     """
     turned = _rotation_until(motion, time)
     v = _rotated(turned, _directions(pinhole, stars))
     there = v[:2] / v[2]
     out = np.zeros((2, 8, len(time)))
     # A change of the rate rotates the camera by a small vector psi, which moves the direction v by v x psi.
-    # The vector psi is the time integral, over t', of the rotation from t' to t.
+    # This vector psi at the time t is the integral over t' of the rotation from t' to t.
     flow = _flow(pinhole, there)
-    # The rotation is approximated by the mean rate since mid-exposure, with an error of higher order.
+    # The rotation in psi is that at the mean rate since mid-exposure, with an error of higher order.
     mean = motion.rate[:, None] + 0.5 * time * motion.acceleration[:, None]
     if motion.higher_terms.any():
         mean += motion.higher(time) / np.where(np.abs(time) < _TINY, 1.0, time)
@@ -258,17 +260,17 @@ def sensitivities_and_velocity(
     if isinstance(pinhole, DistortedPinhole):
         jacobian = pinhole.jacobian(_pixels(pinhole, there))
         change, pace = jacobian @ change, (jacobian @ pace[..., None])[..., 0]
-        # Pixels at mid-exposure are distorted, so that their derivatives need the inverse Jacobian.
+        # Positions at mid-exposure include distortion, so that their derivatives need the inverse Jacobian.
         change[..., 6:] = change[..., 6:] @ np.linalg.inv(pinhole.jacobian(pinhole.undistorted(stars)))
     return change, pace
 
 
-# The functions below use vector arrays (..., 3, m), so that each component is contiguous in memory.
-# The public functions above return transposed views of (..., 3, m) arrays.
+# The functions below this line use arrays of m vectors (..., 3, m), whose components are contiguous.
+# The public functions above this line return transposed views of such arrays (..., 3, m).
 
 
 def _flow(pinhole: Pinhole, there: FloatArray) -> FloatArray:
-    """Return the image flow (2, 3, m), px/rad, at normalised image coordinates `there` (2, m)."""
+    """Return image-flow matrices (2, 3, m), px/rad, at the normalised image coordinates `there` (2, m)."""
     x, y = there
     xy = x * y
     out = np.empty((2, 3, len(x)))
@@ -290,7 +292,7 @@ def _directions(pinhole: Pinhole, stars: FloatArray) -> FloatArray:
 
 
 def _pixels(pinhole: Pinhole, there: FloatArray) -> FloatArray:
-    """Return the ideal pixels (m, 2) of normalised image coordinates `there` (2, m), x/z and y/z."""
+    """Return the ideal image positions (m, 2), px, of normalised coordinates `there` (2, m), x/z and y/z."""
     pixel = pinhole.focal_length * there
     pixel += np.array(pinhole.centre)[:, None]
     return pixel.T
@@ -343,11 +345,11 @@ def _rotated(rotation: tuple[FloatArray, FloatArray, FloatArray], v: FloatArray)
 
 @dataclass(frozen=True, slots=True)
 class Shutter:
-    """Exposure times of the rows of a detector with a rolling or global shutter.
+    """Exposure delays of the rows of a detector with a rolling or global shutter.
 
     Attributes:
-        delay_per_row: delay from one row to the next, in exposures. The delay is 0 for a global shutter.
-        middle: row that is at mid-exposure at time zero.
+        delay_per_row: delay from one row to the next, in exposures. For a global shutter, the delay is 0.
+        middle: index of the row whose mid-exposure is at time zero.
     """
 
     delay_per_row: float = 0.0
@@ -355,19 +357,19 @@ class Shutter:
 
     def delay(self, rows: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
         """Return the exposure delay of `rows` relative to the middle row, in exposures."""
-        # Scalars of the same type as `rows` keep float32 arrays from being converted to float64.
+        # The scalars have the type of `rows`, so that float32 arrays are not converted to float64.
         return np.asarray((rows - rows.dtype.type(self.middle)) * rows.dtype.type(self.delay_per_row))
 
 
 # Number of polynomial coefficients that represent the rate over an exposure.
 _COURSE_TERMS = 7
-# Largest departure (px) of a star's motion from uniform motion that is neglected.
+# Largest departure (px) of a star from uniform motion during the exposure that is neglected.
 _UNEVEN = 0.05
-# Number of instants at which the departure from uniform motion is evaluated.
+# Number of instants of the exposure at which the departure from uniform motion is evaluated.
 _INSTANTS = 65
 # Largest uncertainty (px per exposure) of the navigation filter's motion that the fit accepts.
 _MOST_VAGUE = 3.0
-# Ratio of the resulting error of the mean rate to the error of the navigation filter's rate.
+# Ratio of the error of the mean rate, from a fit with this motion, to the error of the filter's rate.
 _COURSE_SHARE = 0.15
 
 
@@ -375,13 +377,13 @@ _COURSE_SHARE = 0.15
 class Course:
     """Rotation of the camera over the exposure as a polynomial in time, from gyro and commanded torque.
 
-    The pixels of the frame determine the rate and its linear change. Higher-order terms, for example of a
-    step of the rate, are better known from the navigation filter and are held fixed in the fit.
+    The pixels of the frame determine the rate and the linear change of the rate. Higher-order terms, for
+    example of a step of the rate, are better known from the navigation filter and are held fixed in the fit.
 
     Attributes:
-        terms: (k, 3) coefficients of t, t^2, ... in the rotation vector since mid-exposure, in camera axes,
+        terms: coefficients of t, t^2, ... in the rotation vector since mid-exposure (k, 3), in camera axes,
             rad.
-        sigma: standard deviation of the rate times the exposure, rad.
+        sigma: standard deviation of the rate, multiplied by the exposure, rad.
     """
 
     terms: FloatArray
@@ -389,9 +391,9 @@ class Course:
 
     @classmethod
     def of_rates(cls, rates: FloatArray, exposure: float, sigma: float) -> Course:
-        """Return the course for `rates` (n, 3), rad/s, at n equidistant times over the exposure.
+        """Return the rotation during the exposure for `rates` (n, 3), rad/s, at n equidistant times.
 
-        The exposure is in s; `sigma` is the standard deviation of the rates, rad/s.
+        The exposure is in s, and `sigma` is the standard deviation of the rates, rad/s. rad/s.
         """
         times = np.linspace(-0.5, 0.5, len(rates))[:, None]
         powers = np.arange(_COURSE_TERMS)
@@ -400,14 +402,14 @@ class Course:
         return cls(fitted * exposure / (powers[:, None] + 1.0), exposure * float(np.hypot(sigma, missed)))
 
     def motion(self, focal_length: float) -> CameraMotion | None:
-        """Return the motion for a camera of `focal_length` px, or None if uncertain or nearly uniform."""
+        """Return the motion to fit at `focal_length` px, or None if it is uncertain or nearly uniform."""
         motion = CameraMotion(self.terms[0], 2.0 * self.terms[1], self.terms[2:])
         time = np.linspace(-0.5, 0.5, _INSTANTS)
         uneven = (motion.progress(time) - time) * float(np.linalg.norm(motion.rotation)) * focal_length
         return motion if np.ptp(uneven) > _UNEVEN and self.sigma * focal_length < _MOST_VAGUE else None
 
     def covariance(self, exposure: float) -> FloatArray:
-        """Return the covariance (3, 3), rad^2/s^2, of the mean rate from errors of the course."""
+        """Return the covariance (3, 3), rad^2/s^2, of a fitted mean rate due to errors of this motion."""
         return np.eye(3) * (_COURSE_SHARE * self.sigma / exposure) ** 2
 
 
@@ -418,11 +420,11 @@ class StreakScene:
     Attributes:
         motion: rotation of the camera over the exposure.
         width: standard deviation of the point spread convolved with a pixel, px.
-        stars: (n, 2) positions of the stars at mid-exposure, px.
-        light: (n,) flux of each star over the exposure, counts.
-        sky: (n,) sky level around each star relative to the frame's background, counts per pixel.
-        trusted: (n,) whether each star contributes to the shared parameters. For untrusted stars, only flux,
-            position and sky level are fitted.
+        stars: positions of the n stars at mid-exposure (n, 2), px.
+        light: flux of each star over the exposure (n,), counts.
+        sky: sky level around each star relative to the frame's background (n,), counts per pixel.
+        trusted: whether each star contributes to motion and point spread (n,). Of a star that is not trusted,
+            only flux, position and sky level are fitted.
     """
 
     motion: CameraMotion
@@ -442,7 +444,7 @@ class StreakScene:
         return select(self, chosen, "motion", "width")
 
     def with_stars(self, stars: FloatArray, light: FloatArray) -> StreakScene:
-        """Return the scene with more untrusted stars at `stars` (m, 2) px with flux `light` (m,) counts."""
+        """Return the scene with more untrusted stars at `stars` (m, 2), px, of flux `light` (m,), counts."""
         return replace(
             self,
             stars=np.concatenate([self.stars, stars]),
@@ -455,12 +457,12 @@ class StreakScene:
 def exposure_bounds(
     pinhole: Pinhole, motion: CameraMotion, shutter: Shutter, stars: FloatArray
 ) -> FloatArray:
-    """Return the start and end times (n, 2) of the exposure of each of `stars` (n, 2), px."""
+    """Return the start and end times (n, 2) between which each of `stars` (n, 2), px, is exposed."""
     times = np.tile([-0.5, 0.5], (len(stars), 1))
     if shutter.delay_per_row == 0.0:
         return times
-    # The row in which a path ends depends on the end time, which is found by fixed-point iteration.
-    # The iteration converges, because a star crosses few rows during the delay of one row.
+    # The row in which a streak ends depends on the end time, which is found by fixed-point iteration.
+    # This iteration converges, because a star crosses few rows during the delay of one row.
     for _ in range(4):
         for end, nominal in enumerate((-0.5, 0.5)):
             row = positions(pinhole, motion, stars, times[:, end])[:, 1]
@@ -471,7 +473,7 @@ def exposure_bounds(
 def mid_exposure_positions(
     pinhole: Pinhole, motion: CameraMotion, shutter: Shutter, middles: FloatArray
 ) -> FloatArray:
-    """Return the positions (n, 2), px, at mid-exposure of streaks centred at `middles` (n, 2), px."""
+    """Return the star positions (n, 2), px, at mid-exposure for streaks centred at `middles` (n, 2), px."""
     if not len(middles):
         return middles
     if not motion.constant:
@@ -483,7 +485,7 @@ def mid_exposure_positions(
 
 
 def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> FloatArray:
-    """Return the path lengths (n,), px, of stars at pixels `stars` (n, 2)."""
+    """Return the path lengths (n,), px, during the exposure of stars that are at `stars` (n, 2), px."""
     samples = 9
     time = np.tile(np.linspace(-0.5, 0.5, samples), len(stars))
     there = positions(pinhole, motion, np.repeat(stars, samples, axis=0), time).reshape(-1, samples, 2)
@@ -493,14 +495,14 @@ def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> F
 
 # Largest distance (px) across the streak between two segments of one streak.
 _CHAIN_ASIDE = 1.3
-# Range of the distance along the streak between two segments, relative to the rotation angle.
+# Range of the distance along the streak between two segments of one streak, relative to the rotation angle.
 _CHAIN_APART = (0.55, 1.7)
 # Largest flux ratio of two segments of one streak.
 _CHAIN_RATIO = 2.5
 
 
 def polar_angles(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the angles (n,) of `stars` (n, 2) px from the rotation axis, and their azimuths (n,), rad."""
+    """Return the angles (n,), rad, of `stars` (n, 2), px, from the rotation axis, and their azimuths (n,)."""
     axis = motion.rotation / max(float(np.linalg.norm(motion.rotation)), 1e-12)
     first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first = first / np.linalg.norm(first)
@@ -516,10 +518,10 @@ def azimuth_differences(azimuth: FloatArray, other: FloatArray) -> FloatArray:
 def chained_stars(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, light: FloatArray, judged: int
 ) -> BoolArray:
-    """Return whether each of the first `judged` of `stars` (n, 2) px looks like a segment of a longer streak.
+    """Return which of the first `judged` of `stars` (n, 2), px, look like segments of a longer streak.
 
     If the assumed rotation is too small, each streak is modelled as a chain of shorter streaks of equal flux
-    `light` (n,) on one circle about the rotation axis, and each segment fits as well as a complete streak.
+    on one circle about the rotation axis, and each short streak fits its pixels as well as a complete streak.
     Different stars rarely form a chain of equal segments by chance.
     """
     polar, azimuth = polar_angles(pinhole, motion, stars)
@@ -534,7 +536,7 @@ def chained_stars(
 def near_streaks(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, others: FloatArray, distance: float
 ) -> BoolArray:
-    """Return which streaks of `stars` (n, 2) px pass within `distance` px of a streak of `others` (m, 2)."""
+    """Return which streaks of `stars` (n, 2), px, pass within `distance` px of those of `others` (m, 2)."""
     polar, azimuth = polar_angles(pinhole, motion, stars)
     other_polar, other_azimuth = polar_angles(pinhole, motion, others)
     beside = np.abs(polar[:, None] - other_polar) * pinhole.focal_length < distance

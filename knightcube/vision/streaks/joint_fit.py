@@ -1,12 +1,13 @@
-"""Joint fit of the motion and the brightest stars, together with all stars on the same pixels.
+"""Joint fit of the motion and the brightest stars, together with all other stars on the same pixels.
 
 The fit iterates until the steps of the shared parameters are small. The fit covers only a few pixels beyond
-the ends of the streaks, so that it can converge to a wrong rotation angle. With a rotation that is too small,
-the model may match only one end of every streak. The function `true_ends` detects flux beyond the modelled
-streak ends. With a rotation that is too large, the modelled streaks extend over dark pixels. The function
-`unbroken` detects streaks with dark segments. If a modelled end lies more than a few point-spread widths
-beyond the true end, the pixels around it contain no starlight and do not attract the end. The function
-`stretched` therefore searches a longer distance for the true ends and corrects the streak length.
+the ends of the streaks, so that it can converge to a wrong rotation angle. If the fitted rotation is too
+small, the model may match only one end of every streak. The function `true_ends` detects flux beyond the
+modelled streak ends. If the fitted rotation is too large, the modelled streaks extend over dark pixels. The
+function `unbroken` detects gaps, which are dark segments within a streak. If a modelled end lies more than a
+few point-spread widths beyond the true end, the pixels around it contain no starlight and do not attract the
+end. The function `stretched` therefore searches a longer distance for the true ends and corrects the streak
+length.
 """
 
 from __future__ import annotations
@@ -51,12 +52,12 @@ from knightcube.vision.streaks.normal_equations import (
 )
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
-# Work (pixels) after which no further motion is fitted.
-# A fit in progress is always completed, so that the work on a frame may be twice the limit.
+# Work on a frame, in processed pixels, after which no further motion is fitted.
+# A fit in progress is always completed, so that the work on a frame may reach twice this limit.
 _MOST_WORK = 1_600_000
-# Fixed overhead of one model evaluation, in equivalent pixels.
+# Fixed overhead of one evaluation of the model, expressed as a number of processed pixels.
 _EVALUATION = 15_000
-# Work of a pass over the frame, relative to a model evaluation of the same number of pixels.
+# Work per pixel of a pass over the frame, relative to an evaluation of the model.
 _PASS = 0.15
 
 
@@ -80,27 +81,27 @@ class WorkBudget:
         return self._spent > _MOST_WORK
 
 
-# Largest displacement (px) of a streak end in one step of the fit.
+# Largest displacement (px) of a streak end in one iteration of the fit.
 _LONGEST_STEP = 3.0
-# Displacement (px) of a streak end after which the fit windows are selected again.
+# Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
-# Displacement (px) of an untrusted star in the first iteration after which fit windows are selected again.
-# Later iterations ignore untrusted stars, because the positions of some are poorly determined.
+# Displacement (px) of an untrusted star in the first iteration after which the fit's pixels are reselected.
+# Later iterations ignore displacements of untrusted stars, because some of these are poorly determined.
 _FAINT_DRIFT = 3.2
-# Change of the acceleration, relative to the rotation, after which the fit windows are selected again.
+# Change of the acceleration, relative to the rotation, after which the fit's pixels are reselected.
 _GROWN = 0.1
 # Step of the shared parameters (standard deviations) at which the fit is converged.
-# The final step is applied, so that the remaining error is of second order.
+# The last step of the fit is applied, so that the remaining error is of second order in the step.
 SETTLED = 0.4
-# Largest ratio of consecutive steps that counts as progress of the fit.
+# Largest ratio of the lengths of consecutive steps that counts as progress of the fit.
 _LEAST_PROGRESS = 0.7
-# Number of iterations after which the selection of clipped pixels is final.
+# Number of iterations after which the set of pixels excluded as outliers no longer changes.
 _LOOKS = 1
 # Probability of a false alarm of the score test for a changing rate.
 _BY_CHANCE = 1e-4
-# Ratio of the approximate test statistic to its limit below which the exact statistic is not computed.
+# Fraction of its limit below which the approximate test statistic makes the exact statistic unnecessary.
 _FAR_BELOW = 0.5
-# Number of acceleration components, which are the degrees of freedom of the score test.
+# Number of acceleration components, which is the number of degrees of freedom of the score test.
 _GROWTHS = 3
 GROWING = np.ones(SHARED, dtype=np.bool_)
 """Mask of the shared parameters that are free in a fit with a changing rate."""
@@ -115,12 +116,13 @@ class IterationLimits:
     """Limits of the iteration.
 
     Attributes:
-        rounds: maximum number of iterations.
-        clipped: whether pixels with residuals far beyond the noise are excluded.
+        rounds: maximum number of iterations of the fit.
+        clipped: whether pixels with residuals far beyond the noise are excluded from the fit.
         tolerance: largest step (px) of a streak end or of the width at which the fit is converged.
         settled: largest step (standard deviations) of the shared parameters at which the fit is converged.
-        conjugate: maximum number of conjugate-gradient iterations for stars that share pixels.
-        patience: number of iterations before the first check of progress.
+        conjugate: maximum number of conjugate-gradient iterations by which the coupling of stars on shared
+            pixels is included.
+        patience: number of iterations before the progress of the fit is first checked.
     """
 
     rounds: int
@@ -138,18 +140,19 @@ LAST = IterationLimits(7, clipped=True, tolerance=0.003, settled=SETTLED, conjug
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitProblem:
-    """A frame with the data and settings of its fit.
+    """A frame with the camera data and settings for a fit of motion and stars.
 
     Attributes:
         frame: the frame.
         pinhole: projection of the camera.
-        shutter: exposure times of the rows.
+        shutter: exposure delay between the rows of the detector.
         settings: settings of the estimator.
         sigma: initial standard deviation of the point spread, px.
-        growing: whether the angular acceleration is fitted.
-        sense: (3,) direction along which the rotation must have a positive component; None for either sense.
+        growing: whether the angular acceleration is fitted, so that the rate may change.
+        sense: direction (3,) along which the rotation vector must have a positive component; None for either
+            sense.
         course: motion from the navigation filter, or None if it is unknown or nearly uniform.
-        work: work spent on this frame so far.
+        work: computing work spent on this frame so far.
     """
 
     frame: ReducedFrame
@@ -164,7 +167,7 @@ class FitProblem:
 
     @property
     def free(self) -> BoolArray:
-        """Mask of the shared parameters that are fitted."""
+        """Mask of those parameters shared by all stars that are fitted."""
         return np.array([True] * 3 + [self.growing] * 3 + [True])
 
     @property
@@ -173,7 +176,7 @@ class FitProblem:
         return self.settings.rate_model == "auto" and not self.growing
 
     def windows(self, scene: StreakScene) -> FitWindows:
-        """Return the windows of pixels near the streaks of `scene`."""
+        """Return the fit windows, which hold the pixels near the streaks of `scene`."""
         return cut_windows(self.frame, self.pinhole, self.shutter, scene, self.settings.reach)
 
     def evaluate(self, scene: StreakScene, windows: FitWindows, clip: float) -> Evaluation:
@@ -191,10 +194,10 @@ class StreakFit:
         scene: the fitted scene.
         solution: last step.
         evaluation: normal equations of the last step.
-        last_step: last step of the shared parameters in standard deviations. The value is 0 if the fit is
-            converged.
+        last_step: last step of the shared parameters, in standard deviations. The last step is 0 if the fit
+            is converged.
         windows: fitted pixels.
-        free: (SHARED,) mask of the shared parameters that were fitted.
+        free: mask (SHARED,) of those parameters shared by all stars that were fitted.
         hidden: stars on the fitted pixels that were subtracted instead of fitted; None without any.
     """
 
@@ -211,7 +214,7 @@ class StreakFit:
 
         The test accounts for the scatter of the accelerations of single stars (Hotelling's T-squared test).
         """
-        # An approximation that neglects shared pixels is sufficient in most cases.
+        # An approximation that neglects pixels shared by several stars is sufficient in most cases.
         for conjugate, share in ((0, _FAR_BELOW), (LAST.conjugate, 1.0)):
             solution = solve(self.evaluation, self.scene, GROWING, conjugate)
             if solution is None:
@@ -233,14 +236,14 @@ def iterate(
     how: IterationLimits,
     windows: FitWindows | None = None,
 ) -> StreakFit | None:
-    """Return the fit of all stars and of the shared parameters in the mask `free` (SHARED,), or None."""
+    """Return the fit of all stars and of the shared parameters selected by `free` (SHARED,), or None."""
     faint_drift, cut_at = _FAINT_DRIFT if windows is None else np.inf, scene
     windows = whole = windows or camera.windows(scene)
     last_step, previous, before = np.inf, np.inf, np.zeros(SHARED)
     widest = _WIDER * scene.width if how.clipped else _WIDEST
     solution, evaluation = None, None
     for turn in range(how.rounds):
-        evaluation = None  # Deleting the old equations frees tens of MB before the next evaluation.
+        evaluation = None  # Tens of MB of old normal equations are freed before the next evaluation.
         evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
         solution = solve(evaluation, scene, free, how.conjugate)
         if solution is None:
@@ -255,7 +258,7 @@ def iterate(
         if last_step <= how.settled or wanted <= how.tolerance:
             last_step = 0.0
             break
-        # Consecutive steps in the same direction also count as progress.
+        # Two consecutive steps of the fit in the same direction also count as progress.
         onward = (
             float(np.sum(solution.shared * before / np.maximum(np.diag(solution.covariance), 1e-30))) > 0.0
         )
@@ -263,11 +266,11 @@ def iterate(
             break
         previous, before = wanted, solution.shared
         if _drifted(camera, cut_at, scene, faint_drift if turn == 0 else np.inf):
-            del windows, whole  # Deleting the old windows frees tens of MB before new windows are selected.
+            del windows, whole  # Tens of MB of old fit windows are freed before new ones are selected.
             windows = whole = camera.windows(scene)
             cut_at = scene
         elif how.clipped and turn >= _LOOKS:
-            # The fit would not converge while the selection of clipped pixels changes.
+            # The fit cannot converge while the set of pixels excluded as outliers changes.
             windows = whole.only(*evaluation.kept)
     if solution is None or evaluation is None:
         return None
@@ -275,10 +278,10 @@ def iterate(
 
 
 def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint: float) -> bool:
-    """Return whether the fit windows must be selected again, because ends moved or the acceleration changed.
+    """Return whether new fit windows are needed, because streak ends moved or the acceleration changed.
 
-    `faint` is the displacement (px) of an untrusted star's streak ends above which windows are selected
-    again.
+    The argument The argument `faint` is the displacement (px) of an untrusted star's streak ends above which
+    the fit windows are selected again. star's streak ends above which the fit windows are selected again.
     """
     grown = float(np.linalg.norm(after.motion.acceleration - before.motion.acceleration))
     if grown > _GROWN * float(np.linalg.norm(after.motion.rotation)):
@@ -292,7 +295,7 @@ def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint:
 
 
 def misfit(evaluation: Evaluation, stars: IntArray | slice = slice(None)) -> float:
-    """Return the median chi-square per degree of freedom of selected `stars`, or NaN if there are none."""
+    """Return the median chi-square per degree of freedom of the selected `stars`, or NaN without stars."""
     freedom = np.maximum(evaluation.pixels[stars] - ALONE - 1.0, 1.0)
     return float(np.median(evaluation.chi2[stars] / freedom)) if len(freedom) else float("nan")
 
@@ -303,37 +306,37 @@ _STRETCH = 0.1
 _LEAST_STRETCH = 8.0
 # Distance (px) between the streak end and the segments compared on both sides of it.
 _FROM_END = 4.0
-# Number of samples along a segment at a streak end.
+# Number of samples along a segment of a path at a streak end.
 _SAMPLES = 24
-# Number of segments into which a path is divided to find gaps.
+# Number of segments into which a streak is divided to find gaps, which are dark segments.
 _WITHIN = 10
-# Number of samples in each segment of a path that is searched for gaps.
+# Number of samples in each segment of a streak that is searched for gaps.
 _WITHIN_SAMPLES = 10
-# Offsets (px) of samples across the path of a star.
+# Distances (px) from a star's path at which the pixels are sampled.
 _ASIDE = np.array([-1.0, 0.0, 1.0])
-# Mean intensity of the three central pixels across a streak, relative to the flux per px of length.
+# Mean counts of the three central pixels across a streak, relative to the flux per px of streak length.
 _MIDDLE = 0.287
-# Ratio of measured to expected intensity below which a segment counts as dark.
+# Ratio of measured to expected intensity below which a segment of a streak counts as dark.
 _HALF = 0.5
-# Minimum fraction of usable pixels in a segment whose intensity is measured.
+# Minimum fraction of usable pixels in a streak segment whose intensity is measured.
 _LEAST_VALID = 0.7
-# Minimum expected intensity (standard deviations) of a segment that is tested.
+# Minimum expected intensity (standard deviations) of a streak segment that is tested for darkness.
 _LEAST_SIGNIFICANCE = 4.0
-# Number of instants at which the progress of the rotation is evaluated.
+# Number of instants of the exposure at which the rotation angle is evaluated.
 _INSTANTS = 65
-# Minimum relative speed of a star in the expected intensity of its streak.
-# The point spread limits the intensity of segments where the star is slow.
+# Minimum speed of a star, relative to its mean speed, in the expected intensity of its streak.
+# The point spread limits the intensity of streak segments in which the star is slow.
 _SLOW = 0.5
-# Minimum intensity beyond a streak end, relative to the mean of the streak, that counts as a trail.
+# Minimum intensity beyond a streak end that counts as a trail, relative to the streak's mean intensity.
 _TRAIL = 0.08
 # Largest fraction of dark segments in a streak without gaps.
 _DARK = 0.15
 
 
 def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
-    """Return an array (n, 2) with 1 for confirmed streak ends and 0 for wrong streak ends.
+    """Return 1 for each confirmed and 0 for each wrong end of the streaks of `scene`, as an array (n, 2).
 
-    A confirmed end has starlight only on the inner side.
+    At a confirmed streak end, there is starlight only on the inner side.
 
     Ends outside the detector and ends of very short streaks are NaN.
     """
@@ -344,12 +347,12 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
         return out
     scene, length = scene.select(long), length[long]
     instants = np.linspace(-0.5, 0.5, _INSTANTS)
-    # The small linear term makes the progress strictly increasing while the camera is at rest.
+    # A small linear term makes the rotation angle strictly increasing while the camera is at rest.
     progress = np.maximum.accumulate(scene.motion.progress(instants)) + 1e-9 * np.arange(_INSTANTS)
     stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
     for end, sign, steady, there, speed in _end_motions(camera, scene):
-        # The expected intensity of a segment is proportional to the time that the star spends in it.
+        # The expected intensity of a streak segment is proportional to the time that the star spends in it.
         near, far = _FROM_END / speed, (_FROM_END + stretch) / speed
         last = progress[-1 if sign > 0.0 else 0]
         begin, stop = (np.interp(last - sign * distance, progress, instants) for distance in (near, far))
@@ -364,7 +367,7 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
 
 
 def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
-    """Return the fraction of the tested stars with faint flux, a trail, beyond a streak end.
+    """Return the fraction of the tested stars with a trail, which is faint flux beyond a streak end.
 
     A wrong angular acceleration in the fit causes trails of flux beyond streak ends.
     """
@@ -383,9 +386,9 @@ def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
 def _end_motions(
     camera: FitProblem, scene: StreakScene
 ) -> Iterator[tuple[int, float, CameraMotion, FloatArray, FloatArray]]:
-    """Yield index, outward sign, uniform motion, positions (n, 2) px and speeds (n,) for both streak ends.
+    """Yield column index, outward sign, a uniform motion, and end positions and speeds for both streak ends.
 
-    The uniform motion extrapolates the paths, because the motion itself may come to rest at a streak end.
+    A uniform motion extrapolates the paths, because the true motion may come to rest at a streak end.
     """
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     steady = CameraMotion.steady(scene.motion.rotation)
@@ -396,7 +399,7 @@ def _end_motions(
 
 
 def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
-    """Return an array (k,) with 1 for stars whose streaks have no gaps, and 0 for other stars.
+    """Return an array (k,) with 1 for stars whose streaks have no gaps, and 0 for all other tested stars.
 
     Only the part of a path on the detector is tested. Stars with very short or very faint streaks are
     omitted.
@@ -423,7 +426,7 @@ def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
 
 
 def expected_brightness(light: FloatArray, length: FloatArray) -> FloatArray:
-    """Return the expected intensity (n,) of streaks of flux `light` (n,) counts and `length` (n,) px."""
+    """Return the expected intensity (n,) of streaks with flux `light` (n,), counts, and `length` (n,), px."""
     return np.asarray(_MIDDLE * light / length)
 
 
@@ -432,8 +435,8 @@ def brightness(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean counts (n,) of pixels along path segments, and the standard errors (n,) of these means.
 
-    `time` (n, s) holds the sampling times of each path segment. The mean is NaN if a segment has too few
-    usable pixels.
+    The argument `time` (n, s) holds s sampling times for each of the n path segments. The mean is NaN if a
+    segment has too few usable pixels.
     """
     frame, pinhole, samples = camera.frame, camera.pinhole, time.shape[1]
     there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time.reshape(-1))
@@ -452,15 +455,15 @@ def brightness(
     return np.where(enough, total / count, np.nan), np.sqrt(variance) / count
 
 
-# Half length of the search for a streak end around the modelled end, relative to the path length.
+# Half length of the search range for a streak end around the modelled end, relative to the path length.
 _REACH = 0.08
-# Minimum and maximum half length (px) of the search for a streak end.
+# Minimum and maximum half length (px) of the search range for a streak end.
 _LEAST_REACH, _MOST_REACH = 10.0, 40.0
-# Number of samples in the search for a streak end.
+# Number of samples in the search range for a streak end.
 _STEPS = 41
-# Minimum significance (standard deviations) of the intensity near a streak end that is measured.
+# Minimum significance (standard deviations) of the flux near a streak end that is measured.
 _EDGE_SIGNIFICANCE = 5.0
-# Upper limit of the intensity relative to the expected intensity, which limits the effect of other stars.
+# Upper limit of a sample's intensity, relative to the expectation, which limits the effect of other stars.
 _CAP = 2.0
 # Minimum number of streaks with a wrong length for a correction of the rotation angle.
 _LEAST_STREAKS = 3
@@ -468,7 +471,7 @@ _LEAST_STREAKS = 3
 _LEAST_OFF = 4.0
 # Largest difference (px) between the length errors of streaks that agree with each other.
 _ALIKE = 3.0
-# Minimum ratio of streaks with a wrong length to streaks with a correct length.
+# Minimum ratio of the number of streaks with a wrong length to that of streaks with the correct length.
 _MORE = 2
 # Largest relative change of the rate at which the rotation angle is corrected.
 _MOST_STRETCHED_CHANGE = 0.5
@@ -496,7 +499,7 @@ def find_light_ends(camera: FitProblem, scene: StreakScene) -> tuple[FloatArray,
         mean, deviation = brightness(camera, motion, repeated, time.reshape(-1, 1))
         mean, deviation = mean.reshape(-1, _STEPS), np.maximum(deviation.reshape(-1, _STEPS), 1e-6)
         seen = np.minimum(np.maximum(mean, -expected), _CAP * expected)
-        # The log-likelihood ratio between starlight and a dark background is accumulated outwards.
+        # The log-likelihood ratio of starlight to a dark background is summed outwards.
         explained = np.cumsum((seen - 0.5 * expected) * expected / deviation**2, axis=1)
         last = np.argmax(explained, axis=1)
         sure = np.sum((expected / deviation) ** 2, axis=1) > _EDGE_SIGNIFICANCE**2
@@ -510,8 +513,8 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     """Return `scene` with the rotation corrected so that modelled and measured streak ends agree.
 
     Returns None if no correction is needed, or if the rate changes so much that the intensity varies along a
-    streak. Each star is moved to the middle between its ends, or to half a streak length from its only end in
-    the frame.
+    streak. Each star is moved to the middle between its measured ends, or by half a streak length from its
+    only end in the frame.
     """
     if abs(scene.motion.relative_acceleration) > _MOST_STRETCHED_CHANGE:
         return None
@@ -530,7 +533,7 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     if stretch == 0.0:
         return None
     off = beyond / np.maximum(length, 1.0)[:, None]
-    # Each measured end gives the time of mid-exposure under the uncorrected motion.
+    # Each measured streak end gives the time of mid-exposure on the uncorrected path of the star.
     middle = np.stack([0.5 * stretch - off[:, 0], off[:, 1] - 0.5 * stretch], axis=-1)
     known = np.isfinite(middle)
     time = np.where(known, middle, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
@@ -540,28 +543,28 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
 
 
 # Largest change of the rate over the exposure, relative to the rate at mid-exposure.
-# The relative change is 2 for a motion that starts or ends at rest.
+# The rate of a motion that starts or ends at rest changes by 2 in this measure.
 _MOST_CHANGE = 2.2
-# Deviation (standard deviations) of a star from the majority above which it is untrusted.
+# Deviation (standard deviations) of a star's motion from that of the majority above which it is untrusted.
 _TRUST_SIGMAS = 3.5
-# Model error (px) of a streak's ends in the consistency test of the stars.
+# Model error (px) of the ends of a streak, assumed when the motions of the stars are compared.
 _END_FLOOR = 0.01
-# Model error (px) of a streak's width in the consistency test of the stars.
+# Model error (px) of the width of a streak, assumed when the motions of the stars are compared.
 _WIDTH_FLOOR = 0.002
-# Distance (half widths of a fit window) between two streaks below which they are fitted together.
+# Distance between two streaks, in half widths of a fit window, below which they are fitted together.
 _NEAR = 1.4
 # Displacement (px) of the streak ends during the fit above which faint stars are searched again.
 _FAR = 6.0
 # Maximum number of searches for faint stars.
 _MOST_REPEATS = 2
-# Relative error of the modelled flux of a subtracted star on a pixel.
+# Relative error of the modelled counts of a subtracted star on a pixel.
 _SUBTRACTION_ERROR = 0.35
-# Maximum number of pixels in all fit windows, which limits memory and time.
-# A pixel in several windows counts once for each window.
+# Maximum number of pixels in all fit windows together, which limits memory and time.
+# A pixel that lies in several fit windows counts once for each of these windows.
 _MOST_PIXELS = 60_000
-# Fraction of the pixel limit for the brightest streaks in a fit with all their neighbours.
+# Fraction of the maximum number of fitted pixels for a fit of the brightest streaks and their neighbours.
 _BRIGHTEST_SHARE = 0.5
-# Minimum number of streaks in a fit of the brightest streaks with all their neighbours.
+# Minimum number of bright streaks in a fit of the brightest streaks with all their neighbours.
 _LEAST_BRIGHTEST = 10
 # Minimum significance (standard deviations) of faint stars on the pixels of bright streaks.
 # Undetected faint stars would shift the ends of the bright streaks.
@@ -573,8 +576,9 @@ _AT_ONCE = 16
 def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
     """Return the joint fit of the brightest stars, and the faint stars that were not fitted.
 
-    Faint stars are searched again if the fit differs much from the motion of `first`, or if modelled and
-    measured streak ends disagree. A fit whose streaks have wrong ends after the second search is rejected.
+    Faint stars are searched a second time if the fit differs much from the motion of the fit `first`, or if
+    modelled and measured streak ends disagree. A fit is rejected if its streaks still have wrong ends after
+    the second search.
     """
     other = None
     for _ in range(_MOST_REPEATS):
@@ -597,7 +601,7 @@ def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
 
 
 def _far(camera: FitProblem, before: StreakScene, after: StreakScene) -> bool:
-    """Return whether streak ends moved so far that faint stars must be searched again."""
+    """Return whether streak ends moved so far during the fit that faint stars must be searched again."""
     changed = float(np.linalg.norm(after.motion.rotation - before.motion.rotation))
     turn = float(np.linalg.norm(after.motion.rotation))
     length = float(np.median(path_lengths(camera.pinhole, after.motion, before.stars)))
@@ -605,9 +609,9 @@ def _far(camera: FitProblem, before: StreakScene, after: StreakScene) -> bool:
 
 
 def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
-    """Return the joint fit of stars detected along the motion of `first`, and the other faint stars.
+    """Return the joint fit of stars detected along the motion of the fit `first`, and the other faint stars.
 
-    The rate is constant unless the settings or the pixels require a changing rate.
+    A constant rate is fitted unless the settings or the pixels require a changing rate.
     """
     settings, before = camera.settings, first.scene
     if not before.motion.constant:
@@ -636,7 +640,7 @@ def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
 
 
 def _find_along(camera: FitProblem, first: StreakFit) -> FaintStars:
-    """Return faint streaks along the motion of `first` that are not included in its fit."""
+    """Return the faint streaks along the motion of the fit `first` that are not included in this fit."""
     settings, motion = camera.settings, first.scene.motion
     camera.work.passed(camera.frame.signal.size)
     light = light_of(camera.pinhole, camera.shutter, first.scene, first.windows)
@@ -655,8 +659,9 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
     """Return the fit of `scene` with the motion on which the stars agree; None if the fit fails.
 
     A score test on the pixels decides between a constant and a changing rate. The brightest untrusted stars
-    are fitted while all windows together have at most `room` times the usual number of pixels. The other
-    untrusted stars are subtracted from the frame.
+    are also fitted, as long as the fit windows of all stars together have at most `room` times the usual
+    number of pixels. The remaining stars that do not agree with the common motion (untrusted stars) are
+    subtracted from the frame.
     """
     fitted = _affordable(camera, scene, room)
     hidden = scene.select(~fitted)
@@ -668,7 +673,7 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
     if done is None or _excessive(done.scene.motion):
         return None
     scene, windows = replace(done.scene, trusted=_trusted(camera, done)), [done.windows]
-    del done  # Deleting the fit frees tens of MB, and `pop` lets the iteration free the windows too.
+    del done  # The fit is deleted to free tens of MB, and `pop` lets the iteration free its fit windows too.
     done = iterate(camera, scene, camera.free, LAST, windows.pop())
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
@@ -678,7 +683,7 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
 def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
     """Return the joint fit repeated from `last` with another `camera`, or None if it does not succeed.
 
-    All bright stars are initially trusted.
+    At the start of this fit, all bright stars are trusted.
     """
     scene = last.scene
     leading = np.arange(len(scene.light)) < max(camera.settings.most_stars, 1)
@@ -688,11 +693,11 @@ def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
 
 
 def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
-    """Return a fit of the brightest streaks of `last` with all stars on their pixels.
+    """Return a fit of the brightest streaks of the fit `last` with all stars on the pixels of these streaks.
 
-    Faint stars hidden in a bright streak shift the fitted streak ends. If the pixel limit excluded hidden
-    stars from the joint fit, a fit of fewer streaks with all their hidden stars is more accurate. Returns
-    None if the joint fit included all stars, or if the new fit does not succeed or diverges.
+    Faint stars hidden in a bright streak shift the fitted streak ends. If the limit on fitted pixels excluded
+    hidden stars from the joint fit, a fit of fewer streaks with all their hidden stars is more accurate.
+    Returns None if the joint fit included all stars, or if the new fit does not succeed or diverges.
     """
     others, scene = last.hidden, last.scene
     if others is None or not len(others.light):
@@ -714,9 +719,9 @@ def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
 
 
 def _excessive(motion: CameraMotion) -> bool:
-    """Return whether the angular acceleration exceeds the range of the model.
+    """Return whether the angular acceleration of a motion exceeds the range of the model.
 
-    The check does not reject a motion from the navigation filter.
+    A motion estimated by the navigation filter is never rejected.
     """
     if motion.higher_terms.any():
         return False
@@ -724,7 +729,7 @@ def _excessive(motion: CameraMotion) -> bool:
 
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
-    """Return which trusted stars agree with the majority, or all trusted stars if too few agree."""
+    """Return which trusted stars agree with the motion of the majority, or all of them if too few agree."""
     estimates = star_estimates(rough.evaluation, rough.scene, camera.free)
     before = rough.scene.trusted
     if estimates is None:
@@ -745,7 +750,7 @@ def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
 
 
 def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArray:
-    """Return a mask (n,) of stars to fit: trusted stars and the brightest others within the pixel limit."""
+    """Return a mask (n,) of the trusted stars and of the brightest other stars within the pixel limit."""
     room = window_areas(camera.pinhole, scene, camera.settings.reach)
     order = np.lexsort((-scene.light, ~scene.trusted))
     needed = np.empty(len(room))
@@ -754,7 +759,7 @@ def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArra
 
 
 def _subtracted(camera: FitProblem, others: StreakScene) -> FitProblem:
-    """Return `camera` with the stars `others` subtracted and the subtraction error added to the noise."""
+    """Return `camera` with the stars `others` subtracted from the frame and the error added to the noise."""
     if not len(others.light):
         return camera
     signal, floor = camera.frame.signal.copy(), camera.frame.floor.copy()

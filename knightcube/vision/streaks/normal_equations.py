@@ -1,9 +1,10 @@
 """Selection of the fitted pixels, and the normal equations of a scene (Fisher scoring).
 
-Long streaks are fitted on strips of pixels, and spots on square patches. The flux per px of a streak is
-inversely proportional to the speed of the star. The strip model expands the flux per px to first order around
-each block, which does not hold if the speed is near zero. A patch covers the slow part of each streak if the
-rate increases from zero or decreases to zero.
+Long streaks are fitted on strips of pixels along their paths, and spots on square patches of pixels. The flux
+per px of a streak is inversely proportional to the speed of the star. The model of a streak on a strip
+expands the flux per px to first order around each block of pixels, which does not hold near zero speed. If
+the rate increases from zero or decreases to zero, a square patch of pixels covers the slow part of each
+streak.
 
 The weight of a pixel is the inverse of the variance that the model predicts. The iteration therefore
 converges to the maximum likelihood for Poisson noise. The residual of a pixel is its value minus the modelled
@@ -40,37 +41,38 @@ from knightcube.vision.streaks.streak_model import STEEPEST, Patches, Strips, cu
 
 # Path length, in point-spread widths, below which a star is fitted as a spot.
 _SPOT_WIDTHS = 8.0
-# Margin below saturation, in standard deviations of the modelled value, within which a pixel is excluded.
-# The modelled value is used, because a selection by the measured value would be biased by its noise.
+# Margin below saturation, in standard deviations of the modelled counts, within which a pixel is excluded.
+# The modelled counts are used, because a selection by the measured counts would be biased by their noise.
 _MARGIN = 3.0
 # Number of instants at which the position of a star on its path is evaluated.
 _INSTANTS = 9
-# Residual, relative to the modelled value, up to which a pixel is never clipped.
+# Residual, relative to the modelled counts, up to which a pixel is never excluded as an outlier.
 _UNRESOLVED = 0.1
-# Largest relative change of a star's speed over one point-spread width within a strip.
+# Largest relative change of a star's speed over one point-spread width of a path fitted on a pixel strip.
 _STEADY = 0.05
-# Minimum length of the fast part of a path, in point-spread widths, that is fitted on a strip.
+# Minimum length (point-spread widths) of the fast part of a path that is fitted on a pixel strip.
 _LEAST_FAST = 4.0
-# Lower limit (px per exposure) of speeds by which the code divides.
+# Lower limit (px per exposure) of a star's speed in denominators.
 _SLOWEST = 1e-3
-# Number of instants at which the rate is evaluated to find the slow part of a path.
+# Number of instants at which the rate is evaluated to find the slow part of a star's path.
 _SAMPLES = 129
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockPixels:
-    """Frame data on b blocks of pixels. Arrays have the shape (b, ...) unless stated otherwise.
+    """Values of the frame on blocks of pixels near stars; the first axis of most arrays is that of b blocks.
 
     Attributes:
-        slot: index of each pixel among all fitted pixels. Stars that share a pixel share its slot. The slot
-            of a pixel outside the frame is the number of fitted pixels.
-        inside: mask of the pixels that are fitted.
+        slot: index of each pixel in the list of all fitted pixels, in which every pixel of the frame occurs
+            once. Where two stars share a pixel, both of its copies have the same `slot`. A pixel outside the
+            frame has the number of fitted pixels as its `slot`.
+        inside: mask of the pixels of the blocks that are fitted.
         signal: counts of each pixel above the background.
         floor: noise variance of each pixel without a star, counts^2.
         ceiling: counts above the background from which each pixel is saturated.
         gain: gain of the camera, electrons per count.
-        crowded: (e,) flat indices, in the blocks, of the pixels that several stars share.
-        common: (e,) indices of the pixels `crowded` in the list of all shared pixels.
+        crowded: flat indices, in the blocks, of the e pixels that several stars share (e,).
+        common: index of each shared pixel in the list of all pixels that several stars share (e,).
     """
 
     slot: IntArray
@@ -83,10 +85,10 @@ class BlockPixels:
     common: IntArray
 
     def residual(self, total: Float32Array, clip: float) -> tuple[Float32Array, Float32Array]:
-        """Return weights and residuals of the pixels for the modelled counts `total`, indexed by slot.
+        """Return weights and residuals of the pixels for the modelled counts `total` of all fitted pixels.
 
         The weight is the inverse variance, or 0 for an excluded pixel. Pixels whose residuals exceed `clip`
-        standard deviations plus a tenth of the modelled value are excluded; `clip` 0 excludes none.
+        standard deviations plus a tenth of the modelled counts are excluded; `clip` 0 excludes none.
         """
         model = total.take(self.slot)
         variance = np.maximum(model, np.float32(0.0))
@@ -106,17 +108,20 @@ class BlockPixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitWindows:
-    """The fitted pixels: strips along long streaks and patches around spots.
+    """The fitted pixels: strips of pixels along long streaks, and square patches of pixels around spots.
 
     Attributes:
-        long: (a,) indices of the stars with a strip. A streak with a slow part also has a patch.
-        spot: (b,) indices of the stars with a patch.
-        strips: pixels of the strips. Star i of `strips` is the star with the index `long[i]`.
-        patches: pixels of the patches. Patch i belongs to the star with the index `spot[i]`.
-        pixels: (m,) flat indices of the fitted pixels in the frame, ordered by slot.
-        slot: slots of the pixels of all blocks, as a flat array.
-        on_strips: frame data on the strips.
-        on_patches: frame data on the patches.
+        long: indices of the stars whose long streak is fitted on a strip of pixels (a,). If part of the
+            streak is slow, the star also has a square patch of pixels for this part.
+        spot: indices of the stars that are fitted on a square patch of pixels (b,).
+        strips: pixels of the strips along long streaks. The star with index i in `strips` has the index
+            `long[i]` in the scene.
+        patches: pixels of the square patches around spots. The patch with index i belongs to the star with
+            the index `spot[i]` in the scene.
+        pixels: flat indices in the frame of all m fitted pixels (m,), each given once.
+        slot: for each pixel of all strips and patches, its index in the list `pixels`, as a flat array.
+        on_strips: values of the frame on the strips of pixels along long streaks.
+        on_patches: values of the frame on the square patches of pixels around spots.
         shared: number of pixels that belong to more than one star.
     """
 
@@ -131,15 +136,15 @@ class FitWindows:
     shared: int
 
     def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
-        """Return the summed counts (m + 1,) of all stars by slot, from the counts of each star's own pixels.
+        """Return the summed counts (m + 1,) of all stars on the m fitted pixels, from each star's own counts.
 
-        The last element sums the counts on pixels outside the frame.
+        The last element is the sum of the counts on pixels outside the frame.
         """
         light = np.concatenate([on_strips.reshape(-1), on_patches.reshape(-1).astype(np.float32)])
         return np.bincount(self.slot, light, len(self.pixels) + 1).astype(np.float32)
 
     def only(self, on_strips: BoolArray, on_patches: BoolArray) -> FitWindows:
-        """Return the windows reduced to the pixels in the masks `on_strips` and `on_patches`."""
+        """Return the fit windows reduced to the pixels selected by the masks `on_strips` and `on_patches`."""
         return replace(
             self,
             on_strips=replace(self.on_strips, inside=on_strips),
@@ -150,7 +155,8 @@ class FitWindows:
 def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:
     """Return the approximate number of pixels (n,) within `reach` point-spread widths of each star's path.
 
-    The strips of all stars are assumed to be as wide, in pixels, as the strip of the most oblique path.
+    All strips of pixels are assumed to be as wide, in pixels, as that along the path most oblique to rows and
+    columns.
     """
     n, room = len(scene.stars), reach * scene.width
     if n == 0:
@@ -168,12 +174,12 @@ def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArr
 def cut_windows(
     frame: ReducedFrame, pinhole: Pinhole, shutter: Shutter, scene: StreakScene, reach: float
 ) -> FitWindows:
-    """Return windows with the pixels of `frame` within `reach` point-spread widths of the stars' paths."""
+    """Return fit windows with all pixels of `frame` within `reach` point-spread widths of the paths."""
     long, spot, strips, patches = _strips_and_patches(pinhole, shutter, scene, reach * scene.width)
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
     named = index[inside]
-    # Each pixel gets the index of its last occurrence, so that only memory of fitted pixels is written.
+    # Only array elements of fitted pixels are written, each with the index of the pixel's last occurrence.
     order = np.arange(len(named), dtype=np.int32)
     number = np.empty(frame.signal.size, dtype=np.int32)
     number[named] = order
@@ -205,9 +211,9 @@ def cut_windows(
 def _strips_and_patches(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, room: float
 ) -> tuple[IntArray, IntArray, Strips, Patches]:
-    """Return the stars with strips (a,), the stars with patches (b,), the strips and the patches.
+    """Return the indices of stars with long streaks (a,) and of spots (b,), and the pixel strips and patches.
 
-    Strips and patches cover the pixels within `room` px of the paths.
+    The pixel strips and patches contain the pixels within `room` px of the paths.
     """
     times = exposure_bounds(pinhole, scene.motion, shutter, scene.stars)
     fast, slow = _divided(pinhole, scene, times)
@@ -215,7 +221,7 @@ def _strips_and_patches(
     long = np.flatnonzero(whole & (fast[:, 1] > fast[:, 0]))
     spot = np.flatnonzero(~(whole & (fast[:, 1] > fast[:, 0])) | (slow[:, 1] > slow[:, 0]))
     strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
-    # A patch covers the slow part of a streak, or the complete path of a spot.
+    # A square patch of pixels covers the slow part of a streak, or the complete path of a spot.
     part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
     sampled = part[:, :1] + np.diff(part) * np.linspace(0.0, 1.0, _INSTANTS)
     stars = np.repeat(scene.stars[spot], _INSTANTS, axis=0)
@@ -228,10 +234,10 @@ def _strips_and_patches(
 
 
 def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return start and end times (n, 2) of the fast part of each path, for a strip, and of its slow part.
+    """Return start and end times (n, 2) of the fast part of each star's path, and of its slow part.
 
-    The slow part is at the end at which the rate is smaller. If a path has no fast or no slow part, the times
-    of that part are equal.
+    The slow part of a path is at the streak end at which the rate is smaller. If a path has no fast part or
+    no slow part, the start and end times of the missing part are equal.
     """
     motion = scene.motion
     if motion.constant or not motion.rotation.any():
@@ -256,7 +262,7 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
 
 
 def _without_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntArray) -> Strips:
-    """Return the strips without the pixels that also belong to a patch of the same star."""
+    """Return the pixel strips without those pixels that also belong to a patch of the same star."""
     both = np.isin(long, spot)
     if not both.any():
         return strips
@@ -280,7 +286,7 @@ def _block_pixels(
     crowded: IntArray,
     common: IntArray,
 ) -> BlockPixels:
-    """Return frame data on the blocks of pixels with the flat indices `index`."""
+    """Return the values of the frame on blocks of pixels, given by the pixels' flat indices `index`."""
     signal = frame.signal.take(index)
     return BlockPixels(
         slot.reshape(index.shape),
@@ -296,32 +302,34 @@ def _block_pixels(
 
 
 SHARED = 7
-"""Number of shared parameters: rate (3), acceleration (3) and point-spread width (1)."""
+"""Number of parameters that all stars share: rate (3), acceleration (3) and point-spread width (1)."""
 ALONE = 4
-"""Number of parameters of each star: x, y, flux and sky level."""
+"""Number of parameters of a single star: x, y, flux and sky level."""
 
-# Number of blocks multiplied at once, small enough for the processor's cache.
+# Number of blocks of pixels processed in one matrix product, small enough for the processor's cache.
 _AT_ONCE = 128
 # Prior standard deviation (px) of a star's position, for streaks with both ends outside the frame.
 _LOOSE = 30.0
 # Prior standard deviation (counts) of the sky level around a star, relative to the background.
 _SKY = 3.0
 PRIOR = np.array([_LOOSE**-2, _LOOSE**-2, 0.0, _SKY**-2])
-"""Prior information (ALONE,) on the parameters of a star, as inverse variances."""
+"""Prior information, as inverse variances, on the parameters (ALONE,) of a star: x, y, flux and sky level."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """The normal equations of a scene.
+    """The normal equations for the shared parameters and the stars of a scene.
 
     Attributes:
-        information: (n, SHARED + ALONE, SHARED + ALONE) Fisher information from the pixels of each star.
-        gradient: (n, SHARED + ALONE) gradient of the log-likelihood of the pixels of each star.
-        chi2: (n,) chi-square of the pixels of each star.
-        pixels: (n,) number of pixels of each star.
-        crowds: derivatives of the modelled counts on shared pixels.
+        information: Fisher information on shared and own parameters from the pixels of each star, (n, SHARED
+            + ALONE, SHARED + ALONE).
+        gradient: gradient of the log-likelihood of each star's pixels by shared and own parameters, (n,
+            SHARED + ALONE).
+        chi2: chi-square of the residuals on the pixels of each star (n,).
+        pixels: number of fitted pixels of each star (n,).
+        crowds: derivatives of the modelled counts on the pixels that several stars share.
         shared: number of pixels that several stars share.
-        kept: masks of the pixels of strips and patches that were not excluded.
+        kept: masks of the pixels that the fit used, one mask for the strips and one for the patches.
     """
 
     information: FloatArray
@@ -335,16 +343,17 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedPixels:
-    """Derivatives of the modelled counts on e shared pixels, in the order of their b blocks.
+    """Derivatives of the modelled counts on e pixels that several stars share, in the order of b blocks.
 
     Attributes:
-        star: (b,) index of the star of each block.
-        matrix: (b, i, SHARED + ALONE) coefficients of i basis images in the derivatives.
-        block: (e,) index of the block of each pixel.
-        first: (b,) index of the first pixel of each block.
-        slot: (e,) index of each pixel in the list of all shared pixels.
-        weight: (e,) inverse variance of each pixel.
-        images: (i, e) values of the basis images on the pixels.
+        star: index of the star of each block of pixels (b,).
+        matrix: coefficients of the i basis images in the derivatives by each parameter, (b, i, SHARED +
+            ALONE) for b blocks.
+        block: index of the block to which each of the e shared pixels belongs (e,).
+        first: index of the first shared pixel of each block (b,).
+        slot: index of each pixel in the list of all pixels that several stars share (e,).
+        weight: inverse variance of the counts of each of the e shared pixels (e,).
+        images: values of the i basis images on the e shared pixels (i, e).
     """
 
     star: IntArray
@@ -359,10 +368,10 @@ class SharedPixels:
 def evaluate(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, clip: float, growing: bool
 ) -> Evaluation:
-    """Return the normal equations of `scene` on its fit windows.
+    """Return the normal equations of `scene` on the pixels of its fit windows.
 
-    `clip` is the clipping limit described in `BlockPixels.residual`. `growing` states whether the angular
-    acceleration is fitted.
+    The residual limit `clip` for outlier pixels is described in `BlockPixels.residual`. The flag `growing`
+    states whether the angular acceleration is fitted.
     """
     strips = windows.strips
     images, spots, change = model_images(pinhole, shutter, scene, windows)
@@ -399,7 +408,7 @@ def evaluate(
 
 
 def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows) -> Float32Array:
-    """Return the counts (m,) of all stars of `scene` on the pixels of its windows, without the sky level."""
+    """Return the modelled counts (m,) of all stars of `scene` on the m fitted pixels, without sky level."""
     images, spots, _ = model_images(pinhole, shutter, scene, windows)
     streaks = images[:, 0] * scene.light[windows.long[windows.strips.star], None, None].astype(np.float32)
     return windows.total(streaks, spots * scene.light[windows.spot, None, None])[:-1]
@@ -408,9 +417,9 @@ def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: Fi
 def model_images(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
-    """Return basis images of strips, images of spots, and derivatives of the spot images, for unit flux.
+    """Return the basis images of long streaks, the images of spots, and the derivatives of the spot images.
 
-    The last basis image of the strips is uninitialised and later holds the residual.
+    The last basis image of each long streak is uninitialised and later holds the residual.
     """
     long, spot = scene.stars[windows.long], scene.stars[windows.spot]
     images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips, 1)
@@ -423,7 +432,7 @@ def model_images(
 def _block_coefficients(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, growing: bool
 ) -> FloatArray:
-    """Return the coefficients (b, IMAGES, SHARED + ALONE) of the basis images in the derivatives."""
+    """Return the coefficients (b, IMAGES, SHARED + ALONE) of basis images in the derivatives by parameter."""
     strips = windows.strips
     light = scene.light[windows.long[strips.star]]
     geometry = streak_model.coefficients(
@@ -446,10 +455,10 @@ def _add(
     images: Float32Array,
     matrix: FloatArray,
 ) -> None:
-    """Add blocks of pixels, in the order of their stars, to the normal equations.
+    """Add the contributions of blocks of pixels, in the order of their stars, to the normal equations.
 
-    The last image of each block is the residual. Products of the residual with the other images give the
-    gradient, and the squared residual gives chi-square.
+    The last basis image of each block of pixels holds the residual. Products of the residual with the other
+    basis images give the gradient, and the squared residual gives chi-square.
     """
     blocks, count = images.shape[:2]
     flat = images.reshape(blocks, count, -1)
@@ -496,14 +505,14 @@ def _shared_pixels(
 def _spot_images(
     scene: StreakScene, windows: FitWindows, spots: FloatArray, change: FloatArray
 ) -> Float32Array:
-    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of spot images.
+    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of n spot images of p x p pixels by parameter.
 
     The last element along the second axis is uninitialised and later holds the residual.
     """
     light = scene.light[windows.spot, None, None, None]
     images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
     images[:, :6] = change[:, :6] * light
-    # The squared width is sigma^2 plus the pixel's variance, so that d sigma / d width = width / sigma.
+    # The squared width is sigma^2 plus the variance of a pixel, so that d sigma / d width = width / sigma.
     images[:, 6] = change[:, 8] * light[:, 0] * (scene.width / scene.sigma)
     images[:, 7:9] = change[:, 6:8] * light
     images[:, 9] = spots
@@ -514,7 +523,7 @@ def _spot_images(
 def apply_information(
     evaluation: Evaluation, shared: FloatArray, alone: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the product of the information matrix of all stars with the vector (`shared`, `alone`).
+    """Return the product of the information matrix of the whole scene with a vector (`shared`, `alone`).
 
     `shared` (SHARED,) holds the shared parameters, and `alone` (n, ALONE) the parameters of each star. The
     product includes the coupling of stars by shared pixels.
@@ -541,12 +550,13 @@ _CONVERGED = 1e-2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """One step of the fit, with the covariance of the parameters.
+    """One Gauss-Newton step of the fit, with the covariance of the parameters.
 
     Attributes:
-        shared: (SHARED,) step of the shared parameters.
-        alone: (n, ALONE) step of the parameters of each star.
-        eliminated: normal equations after elimination of the star parameters, without coupling of stars.
+        shared: step of the parameters that all stars share (SHARED,).
+        alone: step of the own parameters of each star (n, ALONE).
+        eliminated: normal equations for the shared parameters alone, in which the coupling of stars by shared
+            pixels is neglected.
     """
 
     shared: FloatArray
@@ -555,7 +565,7 @@ class Solution:
 
     @property
     def covariance(self) -> FloatArray:
-        """The covariance (SHARED, SHARED) of the shared parameters."""
+        """The covariance (SHARED, SHARED) of the parameters that all stars share."""
         kept = self.eliminated.kept
         out = np.zeros((SHARED, SHARED))
         out[kept[:, None], kept] = self.eliminated.inner
@@ -563,7 +573,7 @@ class Solution:
 
     @property
     def joint(self) -> FloatArray:
-        """The joint covariance (n, SHARED + ALONE, SHARED + ALONE) of shared and each star's parameters."""
+        """The covariance (n, SHARED + ALONE, SHARED + ALONE) of the shared and each star's own parameters."""
         kept, gain, inner = self.eliminated.kept, self.eliminated.gain, self.eliminated.inner
         joint = np.zeros((len(gain), SHARED + ALONE, SHARED + ALONE))
         joint[:, :SHARED, :SHARED] = self.covariance
@@ -576,13 +586,14 @@ class Solution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EliminatedEquations:
-    """Normal equations after elimination of each star's parameters, without coupling of stars.
+    """Normal equations for the shared parameters alone, in which coupling by shared pixels is neglected.
 
     Attributes:
-        kept: (k,) indices of the fitted shared parameters.
-        own: (n, ALONE, ALONE) inverse of each star's diagonal block.
-        gain: (n, k, ALONE) product of each star's off-diagonal block and `own`.
-        inner: (k, k) covariance of the fitted shared parameters.
+        kept: indices of the k fitted parameters among the shared parameters (k,).
+        own: inverse of the block of the information matrix for each star's own parameters (n, ALONE, ALONE).
+        gain: product of `own` and the block of the information matrix that couples k shared and each star's
+            own parameters (n, k, ALONE).
+        inner: covariance of the k fitted shared parameters (k, k).
     """
 
     kept: IntArray
@@ -591,7 +602,7 @@ class EliminatedEquations:
     inner: FloatArray
 
     def solve(self, shared: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the solution for a right-hand side `shared` (SHARED,) and `alone` (n, ALONE)."""
+        """Return the solution of the equations for the right-hand sides `shared` and `alone` (n, ALONE)."""
         step = self.inner @ (shared[self.kept] - np.einsum("nij,nj->i", self.gain, alone))
         out = np.zeros(SHARED)
         out[self.kept] = step
@@ -599,14 +610,14 @@ class EliminatedEquations:
 
 
 def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | None:
-    """Return the eliminated equations, or None if they do not determine the shared parameters.
+    """Return the equations for the shared parameters alone, or None if they are singular.
 
-    The mask `free` (SHARED,) selects the shared parameters that are fitted.
+    The mask `free` (SHARED,) selects those shared parameters that are fitted.
     """
     alone = evaluation.information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
     diagonal += PRIOR
-    # A star outside the frame does not determine its flux, and a diagonal of 1 keeps its block invertible.
+    # For a star outside the frame, a diagonal element of 1 for the flux keeps the star's block invertible.
     diagonal += np.where(diagonal > 0.0, 0.0, 1.0)
     root = np.sqrt(np.einsum("nii->ni", alone))
     outer = root[:, :, None] * root[:, None, :]
@@ -628,15 +639,15 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | 
 
 
 def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: int) -> Solution | None:
-    """Return the step towards maximum likelihood, or None if the shared parameters are undetermined.
+    """Return the step of all parameters towards maximum likelihood, or None if the equations are singular.
 
-    At most `rounds` conjugate-gradient iterations account for shared pixels. If `rounds` is 0, the coupling
-    by shared pixels is neglected.
+    The coupling of stars by shared pixels is included by at most `rounds` conjugate-gradient iterations. If
+    `rounds` is 0, the coupling of stars by shared pixels is neglected.
     """
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
-    # The prior mean of the sky level is zero, and the prior mean of the position is the current position.
+    # The prior of the sky level is centred on zero, and the prior of the position on the current position.
     offset = np.stack([np.zeros_like(scene.sky)] * 3 + [scene.sky], axis=-1)
     alone = evaluation.gradient[:, SHARED:] - PRIOR * offset
     shared = np.where(free, evaluation.gradient[:, :SHARED].sum(axis=0), 0.0)
@@ -652,7 +663,7 @@ def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> Flo
     alone = np.zeros((len(evaluation.chi2), ALONE))
     out = np.empty((3, 3))
     for k in range(3):
-        # The right-hand side is scaled so that the solution is of order one and one tolerance fits all cases.
+        # The equations are scaled so that the solution is of order one and one tolerance suits all frames.
         unit = np.zeros(SHARED)
         unit[k] = 1.0 / np.sqrt(eliminated.inner[k].max())
         solved, _ = _conjugate(evaluation, eliminated, free, (unit, alone), rounds)
@@ -669,7 +680,8 @@ def _conjugate(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the solution of the coupled normal equations for the right-hand side `right`.
 
-    The uncoupled equations precondition the conjugate gradients, so that few iterations suffice.
+    The equations without coupling of stars are the preconditioner of the conjugate gradients, so that few
+    iterations suffice.
     """
     x = eliminated.solve(*right)
     if rounds == 0:
@@ -703,9 +715,10 @@ def _conjugate(
 def stepped(
     scene: StreakScene, solution: Solution, pinhole: Pinhole, longest: float
 ) -> tuple[StreakScene, float]:
-    """Return the scene after a step that is limited to `longest` px at the streak ends.
+    """Return the scene after a step of the fit that moves no streak end by more than `longest` px.
 
-    The second value is the largest displacement of a streak end or change of the width by the full step, px.
+    The second value is the largest displacement (px) of a streak end, or change of the point-spread width, by
+    the full step.
     """
     n = len(scene.stars)
     growing = bool(solution.shared[3:6].any())
@@ -731,18 +744,18 @@ def stepped(
     return after, max(ends, abs(float(solution.shared[6])))
 
 
-# Information of a star, relative to the most informative star, below which the star is ignored.
+# Fisher information of a star, relative to the most informative star, below which the star is ignored.
 _NOTHING = 1e-9
-# Smallest eigenvalue of a star's information, relative to its largest eigenvalue, that is used.
+# Smallest eigenvalue of a star's information matrix that is used, relative to the largest eigenvalue.
 _KNOWN = 1e-4
-# Minimum effective number of stars for an estimate of their scatter.
-# The effective number of stars is smaller than their number if the weights are unequal.
+# Minimum effective number of stars for an estimate of the scatter between stars.
+# The effective number of stars is smaller than the number of stars if the weights are unequal.
 _LEAST_EFFECTIVE = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarEstimates:
-    """Estimates of the shared parameters by n single stars in k directions: changes and deviations (n, k)."""
+    """Changes of k combinations of shared parameters (n, k) from each of n stars, and standard deviations."""
 
     change: FloatArray
     deviation: FloatArray
@@ -750,12 +763,12 @@ class StarEstimates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarEquations:
-    """Normal equations of each star for the free shared parameters, without the star's own parameters.
+    """Normal equations of each star for the shared parameters, after elimination of the star's parameters.
 
     Attributes:
-        kept: (k,) indices of the free shared parameters.
-        information: (n, k, k) information matrix of each star.
-        score: (n, k) gradient of each star's log-likelihood.
+        kept: indices of the k fitted parameters among the shared parameters (k,).
+        information: information matrix of each star for the k fitted parameters (n, k, k).
+        score: gradient of each star's log-likelihood by the k fitted parameters (n, k).
     """
 
     kept: IntArray
@@ -764,15 +777,16 @@ class StarEquations:
 
 
 def star_estimates(evaluation: Evaluation, scene: StreakScene, free: BoolArray) -> StarEstimates | None:
-    """Return each star's estimate of rate and width, or None if the shared parameters are undetermined."""
+    """Return each star's estimate of rate and point-spread width, or None if the equations are singular."""
     alone = star_equations(evaluation, free)
     return None if alone is None else estimates_of(alone, scene)
 
 
 def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
-    """Return each star's estimate of the rate, along the rotation axis and two normals, and of the width.
+    """Return each star's estimate of three rate components and of the point-spread width.
 
-    The estimates are changes relative to the scene, in rad per exposure for the rate and in px for the width.
+    The rate components are along the rotation axis and two normals. All estimates are changes relative to the
+    scene, in rad per exposure for the rate and in px for the width.
     """
     axis = scene.motion.rotation / max(float(np.linalg.norm(scene.motion.rotation)), 1e-12)
     across = np.linalg.svd(axis[None])[2][1:]
@@ -788,10 +802,10 @@ def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
 
 
 def step_significance(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
-    """Return the squared significance of a `step` (SHARED,) of the shared parameters, and the star count.
+    """Return the squared significance of a `step` of the shared parameters, and the number of stars.
 
-    If the stars scatter more than their noise, the scatter is used in the significance. The use of the
-    scatter prevents a single blended star from making a step significant.
+    If the estimates of the stars scatter more than their noise, the significance is computed from the
+    scatter. A single blended star can therefore not make a step significant.
     """
     alone = star_equations(evaluation, step != 0.0)
     if alone is None:
@@ -805,7 +819,7 @@ def step_significance(evaluation: Evaluation, step: FloatArray) -> tuple[float, 
 
 
 def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | None:
-    """Return the equations of each star for the `free` shared parameters, or None if undetermined."""
+    """Return the normal equations of each star for the `free` shared parameters, or None if singular."""
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
@@ -817,9 +831,10 @@ def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | N
 
 
 def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float) -> BoolArray:
-    """Return which stars (n,) lie within `sigmas` of the weighted median in all k directions.
+    """Return which stars' estimates lie within `sigmas` standard deviations of the weighted median, (n,).
 
-    `floors` (k,) are model errors that are added in quadrature to the deviations.
+    An estimate must agree in all k parameters. The model errors `floors` (k,) are added in quadrature to the
+    standard deviations.
     """
     agree = np.ones(len(estimates.change), dtype=np.bool_)
     for change, deviation, floor in zip(estimates.change.T, estimates.deviation.T, floors, strict=True):
@@ -827,31 +842,31 @@ def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float
         order = np.argsort(change)
         weight = np.cumsum(1.0 / spread[order])
         middle = change[order][np.searchsorted(weight, 0.5 * weight[-1])]
-        # With the uncertainty of the median, a star that is more accurate than all others is not rejected.
+        # A star more accurate than all others is not rejected, because the median's uncertainty is included.
         error = MEDIAN_ERROR * np.sqrt(len(spread)) / np.sum(1.0 / spread)
         agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
     return agree
 
 
 def disagreement(estimates: StarEstimates, which: BoolArray) -> float:
-    """Return the chi-square per degree of freedom between the estimates of the stars `which` (n,)."""
+    """Return the chi-square per degree of freedom of the differences between the stars `which` (n,)."""
     change, weight = estimates.change[which], estimates.deviation[which] ** -2
     if len(change) < 3:
         return 1.0
     total = weight.sum(axis=0)
     mean = np.sum(weight * change, axis=0) / total
-    # Squared weights prevent many faint stars from hiding the scatter of a few bright stars.
+    # Squared weights keep many faint stars from hiding the scatter of a few bright stars.
     effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
     found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
-    # The largest of several values exceeds one by about a standard deviation even without excess scatter.
+    # Without excess scatter, the largest of several reduced chi-squares still exceeds 1 by about its sigma.
     return float(np.max(found / (1.0 + np.sqrt(2.0 / (effective - 1.0)))))
 
 
 def contradiction(alone: StarEquations) -> float:
-    """Return the chi-square per degree of freedom of all stars' equations about their common solution.
+    """Return the chi-square per degree of freedom of all stars' estimates about their common solution.
 
-    Unlike `disagreement`, this test uses all directions that a star determines, each with the noise of that
-    star.
+    In contrast to `disagreement`, this test uses all combinations of parameters that a star determines, each
+    with the noise of that star.
     """
     total = alone.information.sum(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))

@@ -34,23 +34,23 @@ class LikelihoodSettings:
         most_neighbours: maximum number of fainter stars that are fitted because they overlap bright stars.
         most_faint: maximum number of faint stars that are detected and subtracted without a fit.
         faint_sigmas: minimum significance of a detected streak, in standard deviations.
-        reach: half width of the fitted strip along a path, in point-spread widths.
-        clip: residual above which a pixel is excluded, in standard deviations.
-        least_stars: minimum number of stars for a rate. Two stars determine a rate, but do not allow a check
-            of their agreement.
-        least_length: minimum median path length for a rate, px.
-        least_significance: minimum ratio of the rate to its standard deviation.
-        worst_misfit: chi-square per degree of freedom above which a motion is rejected if the residuals also
-            exceed `worst_displacement`.
+        reach: half width of the strip of pixels that is fitted along a star's path, in point-spread widths.
+        clip: residual above which a pixel is excluded from the fit, in standard deviations.
+        least_stars: minimum number of stars from which a rate is reported. Two stars determine a rate, but do
+            not allow a check of their agreement.
+        least_length: minimum median length of streaks from which a rate is reported, px.
+        least_significance: minimum ratio of a rate to its standard deviation, for the rate to be reported.
+        worst_misfit: chi-square per degree of freedom above which a motion is rejected, provided that the
+            residuals also exceed `worst_displacement`.
         worst_displacement: largest accepted rms displacement across the streaks for a motion with a large
             misfit, px.
-        worst_shaking: largest accepted motion common to all streaks: displacement across them (px), or
-            relative change of brightness.
+        worst_shaking: largest accepted vibration common to all streaks, as displacement across them (px) or
+            as relative change of brightness.
         worst_uncertainty: largest accepted relative uncertainty (one standard deviation) of the rate from
             model errors.
         sign_sigmas: minimum significance (standard deviations) of the prior rate along the rotation axis, for
             a decision on the sign of the rotation.
-        knowledge: accuracy of the camera's calibration.
+        knowledge: standard deviations of the camera's calibration parameters.
     """
 
     gain: float = 1.0
@@ -95,7 +95,7 @@ class LikelihoodSettings:
 
 
 def knowledge_of_pinhole(knowledge: CameraKnowledge, lens: Lens) -> CameraKnowledge:
-    """Return the accuracy of the pinhole that represents a calibrated `lens` in the fit of streaks.
+    """Return the accuracy of the pinhole camera that replaces a calibrated `lens` in the fit of streaks.
 
     The fit does not model the lens distortion. The difference between lens and pinhole therefore counts as an
     uncertainty of the pinhole.

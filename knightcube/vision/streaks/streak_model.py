@@ -1,27 +1,32 @@
 """Model of the counts of streaks and spots on the pixels, with derivatives with respect to all parameters.
 
-A long streak is fitted on strips of parallel lines of pixels across its path. The lines are columns of pixels
-if the path runs mainly along rows, otherwise rows of pixels. Ten lines form a block, over which the
-derivatives with respect to the motion are linear. Long paths are divided into parts in time, and also where
-their major axis changes between rows and columns. Each pixel is assigned to the nearest part of a path. The
-selected pixels stay fixed during the fit, and only their distances from the path are updated.
+A long streak is fitted on strips of pixels that consist of parallel lines of pixels across the star's path. A
+line of pixels across the path is part of a column if the path runs mainly along rows, and part of a row
+otherwise. Ten neighbouring lines of pixels form a block, within which the derivatives with respect to the
+motion are linear along the path. The path of a star is divided into parts if it is long, and where its
+direction changes from mainly along rows to mainly along columns. Each pixel is assigned to the nearest part
+of a path. The pixels near the paths are selected once, and during the fit only their distances from the path
+are updated.
 
-Near a pixel, the path is an arc with the speed v and the coordinates s along the arc and n across the arc. A
-star of unit flux gives each pixel the counts
+Near a pixel, the path is approximated by an arc on which the star has the speed v, and s and n are
+coordinates along and across the arc. A star of unit flux gives each pixel the counts
 
-    m = (1/v) g(n) [Phi((s - s0)/w) - Phi((s - s1)/w)] / sqrt(1 - k n),
+    m = (1/v) g(n) [Phi((s - s0)/w) - Phi((s - s1)/w)] / sqrt(1 - k n), for the cumulative normal distribution
+    Phi,
 
 where g is a Gaussian of standard deviation w, k the curvature of the arc, and s0 and s1 the path coordinates
 at the start and end of the exposure. With a rolling shutter, s0 and s1 depend on the pixel's row. The
-integration over the square pixel is included in w^2 = sigma^2 + 1/12. The fourth cumulant of the pixel,
--1/120 along each axis, is included in a correction of the profile across the path. If a parameter displaces
-the path by c(t), the counts change by
+integration over the square pixel is included in the width w by w^2 = sigma^2 + 1/12, where sigma is the width
+of the point spread. The fourth cumulant of a uniform distribution over the pixel, -1/120 along each axis,
+corrects the profile across the path. If a parameter displaces the path at time t by c(t), the modelled counts
+m of a pixel change by
 
     dm = c_n n/w^2 m + c_s(t1) e1 - c_s(t0) e0 - (dc_s/ds) m,
 
-where e0 and e1 are the counts per px of path at the two ends. All derivatives are combinations of seven basis
-images, with coefficients for each block. The first moment of the image m along the path accounts for
-derivatives that change along a block.
+where c_n and c_s are the components of c across and along the path, and e0 and e1 are the counts per px at
+the two streak ends. All derivatives of the counts are combinations of seven basis images, with coefficients
+for each block of pixels. One basis image, the first moment of m along the path, accounts for derivatives that
+change along a block of pixels.
 
 A spot is a short streak or the slow part of a longer streak. The model of a spot is a sum of Gaussians at
 instants of the exposure (Gauss-Legendre quadrature), each integrated over every pixel. The quadrature is also
@@ -50,41 +55,44 @@ from knightcube.vision.streaks.geometry import (
 )
 
 LINES = 10
-"""Number of lines of pixels in a block."""
+"""Number of lines of pixels across a path that form a block."""
 
 STEEPEST = 0.68
-"""Minimum cosine between a path and the normal of its lines, slightly below the cosine at a diagonal."""
+"""Minimum cosine between a path and the normal of a line of pixels, slightly below the cosine of 45 deg."""
 
-# Largest rotation (rad) within one part of a path, for which the part is monotonic along its major axis.
+# Largest camera rotation (rad) within one part of a path, for which its column or row changes monotonically.
 _LONGEST_ROTATION = 1.1
-# Number of instants at which a part of a path is evaluated to find its crossings with the lines.
+# Number of instants at which part of a path is evaluated to find where it crosses lines of pixels.
 _SAMPLES = 17
-# Ratio of the speeds along rows and columns at which a path is divided.
-# At a ratio of 1, the seam between two parts could follow a diagonal of pixels and lose all of them.
+# Ratio of a star's speeds along rows and columns at which the path is divided into parts.
+# With a ratio of 1, the border between two parts could follow a diagonal of pixels and lose all of them.
 _DIAGONAL = 1.03
-# Number of instants at which the direction of a part of a path is evaluated.
+# Number of instants at which the direction of part of a path is evaluated.
 _INSTANTS = 7
-# Lower limit (px per exposure) of speeds by which the code divides.
+# Lower limit (px per exposure) of a star's speed in denominators.
 _SLOWEST = 1e-3
-# Lower limit of the cosine between path and line normal, for lines beyond the end of a curved path.
+# Lower limit of the cosine between a path and a line's normal, for lines of pixels beyond the path's end.
 _MOST_BENT = 0.5
-# Width (px) of the seam between two parts of a straight path.
+# Width (px) of the gap between adjoining parts of a straight path, whose pixels belong to neither part.
 _SEAM = 0.003
-# Increase of the seam width (px) of a curved path, per cubed strip width times squared curvature.
+# Increase of the gap width (px) between parts of a curved path, per cubed strip width and squared curvature.
 _ARC = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strips:
-    """Pixels near the paths of stars, as b blocks of `LINES` lines of k pixels.
+    """Pixels near the paths of stars: b blocks, each of `LINES` lines of k pixels across the path.
 
     Attributes:
-        star: (b,) index of the star of each block, in ascending order.
-        time: (b, LINES) time at which the path crosses each line, in exposures.
-        corner: (b, LINES, 2) column and row of the first pixel of each line.
-        step: (b, 2) step in column and row from one pixel of a line to the next.
-        index: (b, LINES, k) flat index of each pixel in the frame, or 0 if the pixel is not `inside`.
-        inside: (b, LINES, k) whether each pixel is in the frame and nearest to this part of the path.
+        star: index of the star of each block of pixels (b,), in ascending order.
+        time: time at which the star crosses each line of pixels (b, LINES) of the b blocks, in exposures from
+            mid-exposure.
+        corner: column and row of the first pixel of each line of pixels, (b, LINES, 2) for b blocks.
+        step: step in column and row from one pixel of a line to the next, (b, 2) for b blocks of lines.
+        index: flat index in the frame of each of k pixels per line, (b, LINES, k), or 0 for a pixel that is
+            not `inside`.
+        inside: mask (b, LINES, k) of the pixels that are in the frame and whose nearest part of the path is
+            that of their block.
     """
 
     star: IntArray
@@ -95,7 +103,7 @@ class Strips:
     inside: BoolArray
 
     def rows(self, of: IntArray | slice) -> Float32Array:
-        """Return the row numbers (.., LINES, k) of the pixels of the blocks `of`."""
+        """Return the row indices in the frame of the pixels (.., LINES, k) of the selected blocks (`of`)."""
         along = np.arange(self.index.shape[2]) * self.step[of, 1, None, None]
         return (self.corner[of, :, 1, None] + along).astype(np.float32)
 
@@ -108,15 +116,16 @@ def cut_strips(
     width: float,
     ending: BoolArray | None = None,
 ) -> Strips:
-    """Return the pixels within `width` px of the paths of `stars` (n, 2) px in the intervals `times` (n, 2).
+    """Return the pixels within `width` px of the paths of `stars` (n, 2), px, between start and end `times`.
 
-    The mask `ending` (n, 2) states which of the times are ends of a path. Pixels beyond the ends of a path
-    are included. If `ending` is None, all times are ends of a path.
+    The start and end times (n, 2) are in exposures from mid-exposure. The mask `ending` (n, 2) states which
+    of them are ends of a streak. At the end of a streak, pixels beyond the end are included. If `ending` is
+    None, all times are ends of a streak.
     """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
     if ending is not None:
         outer &= ending[part]
-    # The positions extend by the same distance beyond both ends of each part.
+    # The sampled positions extend by the same distance beyond both ends of each part of a path.
     chosen, reach = stars[part], 1.45 * width + 1.0
     begin = low - reach / _speed(paths(pinhole, motion, chosen, low))
     end = high + reach / _speed(paths(pinhole, motion, chosen, high))
@@ -148,7 +157,7 @@ def cut_strips(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Lines of pixels (b, LINES): star and part (b,) of each block, and crossing time of each line."""
+    """Lines of pixels across paths (b, LINES), with the star and path part of each block of lines."""
 
     star: IntArray
     part: IntArray
@@ -161,13 +170,13 @@ class _Lines:
 def _parts(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, times: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
-    """Return star, start and end time of each part, and a mask (.., 2) of times that are ends of a path."""
+    """Return star, start and end time of each path part, and a mask (.., 2) of times that are streak ends."""
     turned = float(np.linalg.norm(motion.rotation)) + float(np.linalg.norm(motion.acceleration))
     pieces = max(
         1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_ROTATION)
     )
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
-    edges[:, -1] = times[:, 1]  # The comparison below needs the exact end time.
+    edges[:, -1] = times[:, 1]  # The comparison with the end time is for exact equality.
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
     owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)
@@ -183,9 +192,10 @@ def _parts(
 def _diagonals(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """Return the parts to divide, and the times at which the major axis of their paths changes.
+    """Return which path parts must be divided, and the times at which the main direction of the path changes.
 
-    The parts are given by `stars` (n, 2), px, and times from `low` to `high` (n,).
+    Each part is given by its star's position (`stars`, (n, 2), px) and by start and end times `low` and
+    `high` (n,).
     """
     instants = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _INSTANTS)
     path = paths(pinhole, motion, np.repeat(stars, _INSTANTS, axis=0), instants.reshape(-1))
@@ -202,7 +212,7 @@ def _diagonals(
 
 
 def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: IntArray) -> FloatArray:
-    """Return approximate times at which the paths cross `line` (b, LINES), which the model corrects."""
+    """Return approximate times at which paths cross lines of pixels (`line`, (b, LINES))."""
     time = np.empty(line.shape)
     bounds = np.searchsorted(owner, np.arange(len(major) + 1))
     for part in range(len(major)):
@@ -219,7 +229,7 @@ def _pixels(
     width: float,
     parts: tuple[FloatArray, FloatArray, BoolArray],
 ) -> Strips:
-    """Return the strips of `lines`, which cross the paths at the points `path` (b * LINES)."""
+    """Return the pixel strips formed by `lines`, which cross the paths at the points `path` (b * LINES)."""
     low, high, outer = parts
     shape = lines.line.shape
     along = lines.along_rows[:, None]
@@ -252,7 +262,7 @@ def _pixels(
     within &= foot < stop.astype(np.float32)
     within &= offset[:, None, None] >= np.where(lines.real, -minor, 2 * half + 1)
     within &= offset[:, None, None] < limit - minor
-    # Blocks without a pixel inside the strip are dropped.
+    # Blocks of lines without any usable pixel are dropped.
     crossed = np.flatnonzero(within.any(axis=(1, 2)))
     used = np.flatnonzero(within.any(axis=(0, 2)))
     begin, end = (int(crossed[0]), int(crossed[-1]) + 1) if len(crossed) else (0, 0)
@@ -268,11 +278,11 @@ def _pixels(
 def path_distances(
     corner: IntArray, step: IntArray, position: FloatArray, tangent: FloatArray, count: int
 ) -> tuple[Float32Array, Float32Array]:
-    """Return the distances (count, b, l) of the pixels of each line across the path and along it, px.
+    """Return distances (px) across and along the path of `count` pixels on each of l lines, (count, b, l).
 
-    `corner` and `step` are attributes of `Strips`; `position` and `tangent` (b, l, 2) describe the path where
-    it crosses each line. The pixels of a line are the first array axis, so that operations run along
-    contiguous memory.
+    The first pixel of each line (`corner`) and the step to the next pixel (`step`) are those of `Strips`;
+    `position` and `tangent` (b, l, 2) are those of the path where it crosses each line of pixels. The index
+    of a pixel within its line is the first array axis, so that operations run along contiguous memory.
     """
     offset = np.arange(count, dtype=np.float32)[:, None, None]
     dx, dy = corner[..., 0] - position[..., 0], corner[..., 1] - position[..., 1]
@@ -289,10 +299,10 @@ def _speed(path: StarPaths) -> FloatArray:
     return np.maximum(np.hypot(path.velocity[:, 0], path.velocity[:, 1]), _SLOWEST)
 
 
-# Gauss-Legendre nodes and weights for one segment of a path.
-# One node per point-spread width gives a relative accuracy of 1e-4.
+# Gauss-Legendre nodes and weights for one short segment of a star's path.
+# One quadrature node per point-spread width gives a relative accuracy of 1e-4.
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(10)
-# Length of a segment of a path, in point-spread widths.
+# Length of a path segment for the quadrature, in point-spread widths.
 _PIECE_WIDTHS = 8.0
 # Distance from a patch, in point-spread widths, up to which starlight reaches the pixels of the patch.
 _BEYOND = 5.5
@@ -306,10 +316,11 @@ class Patches:
     """Square patches of pixels around spots.
 
     Attributes:
-        column: (n, p) column numbers of the pixels of each patch.
-        row: (n, p) row numbers of the pixels of each patch.
-        index: (n, p, p) flat index of each pixel in the frame, or 0 if the pixel is not `inside`.
-        inside: (n, p, p) whether each pixel is in the frame.
+        column: column indices in the frame of the p pixels along the side of each of n patches (n, p).
+        row: row indices in the frame of the p pixels along the side of each of n patches (n, p).
+        index: flat index in the frame of each pixel of n square patches (n, p, p), or 0 for a pixel that is
+            not `inside`.
+        inside: mask of the pixels of n square patches (n, p, p) that are in the frame.
     """
 
     column: IntArray
@@ -319,7 +330,7 @@ class Patches:
 
 
 def cut_patches(pinhole: Pinhole, middles: FloatArray, half: int) -> Patches:
-    """Return square patches of pixels within `half` px of `middles` (n, 2), px, along each axis."""
+    """Return square patches of pixels within `half` px of `middles` (n, 2), px, along rows and columns."""
     corner = np.rint(middles).astype(np.int64)[:, :, None] + np.arange(-half, half + 1)
     column, row = corner[:, 0], corner[:, 1]
     inside = ((row >= 0) & (row < pinhole.rows))[:, :, None] & ((column >= 0) & (column < pinhole.columns))[
@@ -337,9 +348,9 @@ def spot_derivatives(
     sigma: float,
     patches: Patches,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return images (n, p, p) of stars (n, 2) px of unit flux, and their derivatives (n, 9, p, p).
+    """Return images (n, p, p) of n stars of unit flux on their patches, and the derivatives (n, 9, p, p).
 
-    The parameters are rate (3), acceleration (3), x, y, and the point-spread width `sigma` (px).
+    The derivatives are with respect to rate (3), acceleration (3), x, y, and point-spread width `sigma` (px).
     """
     count = len(stars)
     if not count:
@@ -375,7 +386,7 @@ def _pieces(
     sigma: float,
     patches: Patches,
 ) -> FloatArray:
-    """Return times (n, p + 1) that divide the paths near the patches into segments of equal length."""
+    """Return times (n, p + 1) that divide the paths near the patches into p segments of equal length."""
     n = len(stars)
     sampled = times[:, :1] + np.diff(times) * np.linspace(0.0, 1.0, _SPOT_SAMPLES)
     there = positions(pinhole, motion, np.repeat(stars, _SPOT_SAMPLES, axis=0), sampled.reshape(-1))
@@ -385,7 +396,7 @@ def _pieces(
     high = np.stack([patches.column[:, -1], patches.row[:, -1]], axis=-1)[:, None] + room
     near = np.all((there >= low) & (there <= high), axis=2)
     # The part of the path near the patch is extended by one sample at both ends.
-    # A path that is never near its patch is kept completely.
+    # A path that is never near its patch of pixels is divided over the complete exposure.
     near |= np.pad(near, ((0, 0), (1, 0)))[:, :-1] | np.pad(near, ((0, 0), (0, 1)))[:, 1:]
     near |= ~near.any(axis=1, keepdims=True)
     step = np.hypot(*np.moveaxis(np.diff(there, axis=1), 2, 0)) * (near[:, 1:] & near[:, :-1])
@@ -403,10 +414,11 @@ def _pieces(
 
 
 def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the fractions (n, m, p) of a star's flux on `pixels` (n, p), and two derivatives.
+    """Return the fractions (n, m, p) of a star's flux on p columns or rows of pixels, and two derivatives.
 
-    The flux has a Gaussian distribution of standard deviation `sigma` (px) around `place` (n, m). The
-    derivatives are with respect to `place` and `sigma`.
+    Each of m Gaussians of standard deviation `sigma` (px) is centred on its `place` (n, m), in px along one
+    axis. The fractions are differentiated with respect to the centre of the Gaussian (`place`) and its width
+    (`sigma`).
     """
     right = (pixels[:, None, :] + 0.5 - place[..., None]) / sigma
     left = right - 1.0 / sigma
@@ -417,13 +429,13 @@ def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatAr
 
 
 IMAGES = 7
-"""Number of basis images: m, (n/w^2) m, its first moment along the path, e0, e1, dm/dw, and 1."""
+"""Number of basis images: m, (n/w^2) m, first moment of m along the path, e0, e1, dm/dw, and a constant."""
 
 # Number of blocks computed at once, small enough for their pixels to fit into the processor's cache.
 _AT_ONCE = 256
-# Distance from a streak end, in point-spread widths, beyond which the intensity is zero or full.
+# Distance from a streak end, in point-spread widths, beyond which the end does not affect the intensity.
 _ENDS = 5.5
-# Largest distance (point-spread widths) along a path from a pixel to the crossing of the pixel's line.
+# Largest distance (point-spread widths) along a path between a pixel and the crossing of its line.
 _OBLIQUE = 7.0
 # Time step of numerical derivatives, in exposures.
 _STEP = 1e-4
@@ -440,9 +452,10 @@ def images(
     strips: Strips,
     more: int = 0,
 ) -> Float32Array:
-    """Return the basis images (b, IMAGES + more, LINES, k) of stars (n, 2) px of unit flux on their strips.
+    """Return the basis images (b, IMAGES + more, LINES, k) of stars (n, 2), px, of unit flux on pixel strips.
 
-    `width` is w in px; `more` is the number of additional images, which are left uninitialised.
+    The argument `width` is the width w of the point spread, px. The last `more` images are left uninitialised
+    for the caller.
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
@@ -465,9 +478,9 @@ def _draw(
     shutter: Shutter,
     width: float,
 ) -> None:
-    """Compute the basis images of the blocks `part` from position, tangent, speed and acceleration."""
+    """Compute the basis images of the blocks `part` from the path where it crosses the blocks' lines."""
     speed, time = path[2], strips.time[part]
-    # `gained` is the acceleration along the path, px per exposure^2.
+    # The variable `gained` is the star's acceleration along its path, px per exposure^2.
     gained = np.sum(path[3] * path[1], axis=-1)
     light, aside, s = _endless(strips, part, (*path, gained), out.shape[3], width)
     centre = time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1, keepdims=True)
@@ -483,7 +496,7 @@ def _draw(
     out[:, 5] += u
     across *= np.float32(1.0 / width**2)
     np.multiply(across, light, out=out[:, 1])
-    # `out[:, 2]` is the first moment of the counts along the path, between the streak ends.
+    # The basis image `out[:, 2]` is the first moment of the counts along the path, between the streak ends.
     along *= out[:, 1]
     across *= np.float32(width**2)
     across *= out[:, 3] - out[:, 4]
@@ -494,9 +507,9 @@ def _draw(
 def _endless(
     strips: Strips, part: slice, path: tuple[FloatArray, ...], count: int, width: float
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Return counts of a path without ends, and distances (px) of the pixels across and along the path.
+    """Return counts on the pixels of an endless streak, and the pixels' distances (px) across and along it.
 
-    All arrays have the shape (count, b, LINES) for `count` pixels per line.
+    All returned arrays have the shape (count, b, LINES) for b blocks with `count` pixels per line.
     """
     position, tangent, speed, acceleration, gained = path
     tx, ty = tangent[..., 0], tangent[..., 1]
@@ -516,7 +529,7 @@ def _endless(
     light *= np.float32(1.0) + squeeze * (np.float32(0.5) + np.float32(0.375) * squeeze)
     light *= np.float32(1.0) - s * (gained / speed**2).astype(np.float32)
     scale = _BELL / (width * speed)
-    # The factor 1 - 2 tx^2 ty^2 is the sum of the fourth powers of the tangent's components.
+    # For a path with the unit tangent (tx, ty), 1 - 2 tx^2 ty^2 is the sum of the fourth powers of tx and ty.
     square = scale * (_KURTOSIS / (24.0 * width**4)) * (1.0 - 2.0 * np.square(tx * ty))
     u = (u - np.float32(6.0)) * u
     u *= square.astype(np.float32)
@@ -534,11 +547,11 @@ def _ends(
     part: slice,
     width: float,
 ) -> None:
-    """Limit the counts in `out[:, 0]` to the path between both ends, and compute the images of the ends.
+    """Limit the counts `out[:, 0]` of an endless streak to its exposure, and compute the images of its ends.
 
-    `along` (b, LINES, k) is the distance of each pixel along the path from the centre of its block, px.
-    `lines` holds the times at which the path crosses each line (b, LINES) and the block centre (b, 1), and
-    the speed and acceleration of the star.
+    The array `along` (b, LINES, k) is the distance (px) of each pixel along the path from the centre of its
+    block of pixels. The tuple `lines` holds the times at which the path crosses each line of pixels (b,
+    LINES) and the block centre (b, 1), and the star's speed and acceleration there.
     """
     out[:, 3:6] = 0.0
     crossing, centre, speed, gained = lines
@@ -565,7 +578,7 @@ def _ends(
         bell *= before
         out[near, image] = bell
         out[near, 0] = before * ndtr(u)
-        # If the speed changes along the path, the intensity at the end differs from the block's intensity.
+        # The intensity at the end of a streak differs from that of its block of pixels if the speed changes.
         thinning = gained[near] / speed[near] ** 2
         out[near, 0] -= _wide(sign * width**2 * thinning) * bell
         bell *= u
@@ -573,7 +586,7 @@ def _ends(
 
 
 def _wide(line: FloatArray) -> Float32Array:
-    """Return values of lines (b, l) as float32 with an additional axis for the pixels of each line."""
+    """Return values of lines of pixels (b, l) as float32, with a new axis for the pixels of a line."""
     return line[..., None].astype(np.float32)
 
 
@@ -585,14 +598,14 @@ def coefficients(
     strips: Strips,
     growing: bool = True,
 ) -> FloatArray:
-    """Return the coefficients (b, IMAGES, 8) of the basis images in the derivatives of a star of unit flux.
+    """Return the coefficients (b, IMAGES, 8) of the basis images in a star's derivatives, for b blocks.
 
-    The parameters are rate (3), acceleration (3), x and y. The columns of the acceleration are zero unless
-    `growing`.
+    The eight derivatives are with respect to rate (3), acceleration (3), and the star's position x and y. The
+    derivatives with respect to the acceleration are zero unless the rate changes (`growing`).
     """
     centre = strips.time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1)
     of_block = stars[strips.star]
-    # With a rolling shutter, the streak ends depend on the block as well as on the star.
+    # With a rolling shutter, the time of a streak's end depends on the row of the block of pixels.
     delay = np.zeros(len(stars))
     ending, spread = stars, strips.star
     if shutter.delay_per_row != 0.0:
@@ -618,7 +631,7 @@ def coefficients(
 def _displacements(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return displacements per parameter along the path (exposures) and across it (px), and the speeds."""
+    """Return the displacements of a path along and across it by each parameter, and the star speeds."""
     change, velocity = sensitivities_and_velocity(pinhole, motion, stars, time, growing)
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
     tx, ty = (velocity / speed[:, None]).T[:, :, None]

@@ -1,4 +1,4 @@
-"""Results of an estimate from star streaks, and checks of the arguments that all estimators share.
+"""Results of a motion estimate from star streaks, and checks of the arguments that all estimators share.
 
 The control process reads results that worker processes compute. The module imports no estimator, because the
 control process needs only the results. A single frame does not distinguish the rate omega from -omega. A
@@ -62,19 +62,20 @@ class FrameMotion:
     """The motion of the camera in one frame, and the star streaks.
 
     Attributes:
-        status: outcome of the frame. With `rate`, the rate is known; with `ambiguous`, the rate is known
-            except for its sign; otherwise there is no rate.
+        status: outcome of the frame. With the status `rate`, the rate is known; with `ambiguous`, the rate is
+            known except for its sign; otherwise no rate was found.
         checksum: checksum of the pixels, which differs between any two exposures of a working sensor.
         exposure: exposure time, s.
         length: median length of the used streaks, otherwise of all streaks or regions found, px; NaN if none
             is found.
-        endpoints: (found, 2, 2) streak ends, px. If the frame has a rate, the first ends of all streaks are
-            simultaneous. With status `rate`, the first ends are earlier than the second ends.
-        used: (found,) whether each streak contributes to the rate.
-        rate: (3,) rate of the camera relative to the stars, in camera axes, rad/s; None if unknown.
-        covariance: (3, 3) covariance of `rate`, rad^2/s^2; None if unknown.
-        residual: rms error of a streak end, rad; NaN if unknown.
-        hot_pixels: number of hot pixels, which are repaired or excluded.
+        endpoints: both ends (x, y) of each of the streaks found (found, 2, 2), px. If a rate was found, the
+            first ends of all streaks belong to the same instant. With the status `rate`, the first end of
+            each streak is earlier than its second end.
+        used: whether each of the streaks found contributes to the rate (found,).
+        rate: angular rate of the camera relative to the stars (3,), in camera axes, rad/s; None if unknown.
+        covariance: covariance of `rate` (3, 3), rad^2/s^2; None if unknown.
+        residual: rms error of the ends of the streaks, rad; NaN if unknown.
+        hot_pixels: number of hot pixels in the frame, which are repaired or excluded.
     """
 
     status: StreakStatus
@@ -108,28 +109,29 @@ class FrameMotion:
 class MotionResult(FrameMotion):
     """The maximum-likelihood motion over one exposure, and the stars of the frame.
 
-    The attribute `rate` is the mean rate over the exposure. The stars in the mask `used` determine the
-    motion. The attributes `length` and `residual` (the expected error) refer to the used stars.
+    The attribute `rate` is the mean rate over the exposure. The mask `used` selects the stars that determine
+    the motion. The attributes `length` and `residual` refer to the used stars only, and `residual` is the
+    expected error of a streak end.
 
     Attributes:
-        stars: (n, 2) positions of the stars at mid-exposure, px.
-        star_covariance: (n, 2, 2) covariance of each star position, px^2.
-        endpoint_covariance: (n, 2, 2, 2) covariance of each end of each streak, px^2.
-        directions: (n, 3, 3) unit vectors at the start, middle and end of each streak, in camera axes.
-        flux: (n,) counts of each star over the exposure.
-        significance: (n,) flux of each star over its standard deviation.
-        faint_endpoints: (m, 2, 2) ends (px, accurate to about 1 px) of streaks that were detected but not
-            fitted.
+        stars: positions of the n stars at mid-exposure (n, 2), px.
+        star_covariance: covariance of each star position (n, 2, 2), px^2.
+        endpoint_covariance: covariance (2, 2) of both ends of each streak (n, 2, 2, 2), px^2.
+        directions: unit vectors at the start, middle and end of each streak (n, 3, 3), in camera axes.
+        flux: total counts of each star over the exposure (n,).
+        significance: flux of each star divided by its standard deviation (n,).
+        faint_endpoints: both ends of m streaks that were detected but not fitted (m, 2, 2), px, accurate to
+            about 1 px.
         faint_flux: (m,) counts.
-        faint_significance: (m,) flux of each faint star over its standard deviation.
+        faint_significance: flux of each of the m faint stars divided by its standard deviation (m,).
         psf_sigma: fitted standard deviation of the point spread, px.
         misfit: median chi-square per degree of freedom of the bright stars.
         rate_model: fitted model of the rate, `constant` or `accelerating`.
-        acceleration: (3,) fitted angular acceleration, rad/s^2, or None if it was not fitted.
-        reason: one-line reason for a missing rate. The reason is empty if there is a rate.
-        course: rotation from the navigation filter whose higher-order terms the fit used; None if it used
-            none.
-        line_time_sigma: standard deviation of the shutter's line time, s.
+        acceleration: fitted angular acceleration (3,), rad/s^2, or None if it was not fitted.
+        reason: one-line reason why no rate was found. The reason is empty if a rate was found.
+        course: rotation estimated by the navigation filter, from which the fit took the higher-order terms;
+            None if it used none.
+        line_time_sigma: standard deviation of the delay between the exposures of successive rows, s.
     """
 
     stars: FloatArray = field(default_factory=no_rows(2))
@@ -158,10 +160,10 @@ class MotionResult(FrameMotion):
         return None if self.rate is None else from_rotation_vector(self.rate * self.exposure)
 
     def line_time_displacement(self, chosen: IntArray, middle_row: float) -> FloatArray:
-        """Return displacements (m, 2), px, of stars `chosen` (m,) by one standard deviation of the line time.
+        """Return the displacements (m, 2), px, of the stars `chosen` (m,) by a line time error of one sigma.
 
-        The delay of a star is proportional to the distance of its row from `middle_row`. The result is an
-        empty array (0, 2) if the line time is exactly known.
+        The delay of a star is proportional to the distance of its row from `middle_row`. An exactly known
+        line time gives an empty array (0, 2).
         """
         if not self.line_time_sigma:
             return np.empty((0, 2))
@@ -203,7 +205,7 @@ def validate(
 def admit(
     pixels: Image, previous_checksum: int | None, saturation: float, saturated_fraction: float
 ) -> tuple[int, StreakStatus | None]:
-    """Return the checksum of `pixels`, and the status of an unusable frame or None.
+    """Return the checksum of `pixels`, and the status if the frame is unusable, otherwise None.
 
     A frame equal to the previous frame indicates a frozen camera, because noise makes any two exposures
     differ.
@@ -226,10 +228,10 @@ def in_time(result: Result, prior_rate: FloatArray | None, prior_sigma: float, s
 
 
 def direction_of_time(rate: FloatArray, prior_rate: FloatArray, prior_sigma: float, sigmas: float) -> int:
-    """Return the sign (+1, -1) that gives `rate` (3,) the sense of the prior rate, or 0 if undetermined.
+    """Return the sign (+1, -1) by which `rate` (3,) must be multiplied to agree with the prior rate, or 0.
 
-    The component of the prior rate along `rate` must exceed `sigmas` times its standard deviation
-    `prior_sigma`.
+    The result is 0 unless the component of the prior rate along `rate` exceeds `sigmas` times its standard
+    deviation `prior_sigma`.
     """
     projection = float(rate @ prior_rate / np.linalg.norm(rate))
     if abs(projection) <= sigmas * prior_sigma:

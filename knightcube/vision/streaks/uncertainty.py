@@ -1,10 +1,10 @@
 """Covariance of the fitted rotation, including errors that the model does not describe.
 
 Photon noise gives a lower limit of the covariance. The covariance is increased by the scatter of the stars
-beyond their noise, and by calibration errors of the camera that the stars do not determine. Two errors affect
-all stars equally and cause no scatter: a point spread with an unexpected width or shape, which moves the ends
-of all streaks, and vibration of the body. The residuals at the ends and along the streaks limit the errors
-from point spread and vibration.
+beyond their noise, and by those calibration errors of the camera that the stars do not determine. Two errors
+affect all stars equally and cause no scatter: a point spread with an unexpected width or shape, which moves
+the ends of all streaks, and vibration of the body. The residuals at the streak ends and along the streaks
+limit the errors from point spread and vibration.
 """
 
 from __future__ import annotations
@@ -42,22 +42,23 @@ from knightcube.vision.streaks.streak_result import MotionResult
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
-# Increase of the residual limit for foreign flux, as a fraction of the brightest modelled pixel of a line.
+# Increase of the residual limit for another star's flux, relative to a line's brightest modelled pixel.
 _FOREIGN_SHARE = 0.6
-# Minimum sensitivity of a pixel to a displacement, relative to the most sensitive pixel of its block.
+# Minimum sensitivity of a pixel to a displacement of a streak, relative to the block's most sensitive pixel.
 _LEAST_SENSITIVITY = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakResiduals:
-    """Residuals of the trusted streaks on their blocks of pixels.
+    """Residuals of the trusted streaks, on b blocks of pixels.
 
     Attributes:
-        star: (b,) index of the star of each block in the scene.
-        time: (b, LINES) time at which the path crosses each line, in exposures.
-        images: (b, IMAGES, LINES, k) basis images of the streak model.
-        weight: (b, LINES, k) inverse variance of each pixel, 0 for excluded pixels.
-        residual: (b, LINES, k) measured minus modelled counts of each pixel.
+        star: index in the scene of the star of each block of pixels (b,).
+        time: time at which the star crosses each line of pixels (b, LINES) of the b blocks, in exposures from
+            mid-exposure.
+        images: basis images of the streak model on lines of k pixels, (b, IMAGES, LINES, k) for b blocks.
+        weight: inverse variance of each pixel of the b blocks (b, LINES, k), 0 for excluded pixels.
+        residual: measured minus modelled counts of each pixel of the b blocks (b, LINES, k).
     """
 
     star: IntArray
@@ -68,7 +69,7 @@ class StreakResiduals:
 
 
 def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
-    """Return the residuals of the fit on the strips of its trusted streaks."""
+    """Return the residuals of the fit on the pixel strips of its trusted streaks."""
     scene, windows = fit.scene, fit.windows
     images, spots, _ = model_images(camera.pinhole, camera.shutter, scene, windows)
     of_block = windows.long[windows.strips.star]
@@ -88,11 +89,12 @@ def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """RMS displacement (px) that would explain the residuals.
+    """RMS displacement (px) of streaks that would explain the residuals of the fit.
 
     Attributes:
-        shown: significant displacement, after subtraction of two standard deviations of the noise.
-        chance: upper limit of the displacement, one standard deviation above the measured value.
+        shown: significant part of the displacement, after subtraction of two standard deviations of the
+            noise, px.
+        chance: upper limit of the displacement, one standard deviation above the measured value, px.
     """
 
     shown: float
@@ -100,7 +102,7 @@ class Displacement:
 
 
 def end_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
-    """Return the displacement of streak ends that explains the residuals, or None without ends."""
+    """Return the displacement of streak ends that explains the residuals, or None if no end is visible."""
     light = scene.light[left.star, None, None].astype(np.float32)
     change = light * (left.images[:, 3] + left.images[:, 4])
     near = _sensitive(left, change)
@@ -111,7 +113,7 @@ def end_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement 
 
 
 def side_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
-    """Return the displacement across the paths that explains the residuals, or None without streaks."""
+    """Return the displacement across the streaks that explains the residuals, or None without streaks."""
     light = scene.light[left.star, None, None].astype(np.float32)
     change = np.abs(light * left.images[:, 1])
     along = _sensitive(left, change) & ~_sensitive(left, light * (left.images[:, 3] + left.images[:, 4]))
@@ -129,7 +131,8 @@ def _displacement(
 ) -> Displacement | None:
     """Return the displacement that would explain the squared residuals `squares` on the pixels `on`.
 
-    `change` is the change of the counts per px of displacement, and `usual` is the mean square from noise.
+    The array `change` is the change of the counts per px of displacement, and `usual` is the expected
+    weighted square of a residual without displacement.
     """
     count = int(np.count_nonzero(on))
     information = float(np.sum((left.weight * change * change)[on], dtype=np.float64))
@@ -143,13 +146,13 @@ def _displacement(
     )
 
 
-# Instants (exposures) at which a path is compared with the path displaced by a calibration error.
+# Instants (exposures from mid-exposure) at which a path is compared with the path displaced by a lens error.
 _INSTANTS = np.linspace(-0.5, 0.5, 9)
-# Lower limit (px per exposure) of speeds by which the code divides.
+# Lower limit (px per exposure) of a star's speed in denominators.
 _SLOWEST = 1e-3
-# Indices of rate and star position among the parameters of the sensitivities.
+# Indices of rate and star position among the parameters of `geometry.sensitivities`.
 _RATE_AND_POSITION = np.array([0, 1, 2, 6, 7])
-# Probability of correcting a calibration error that does not exist.
+# Probability of correcting a calibration error although the camera has none.
 _BY_CHANCE = 1e-5
 
 
@@ -158,11 +161,12 @@ class CalibrationCorrection:
     """Effect of camera calibration errors on the shared parameters of the fit.
 
     Attributes:
-        step: (k,) correction of the shared parameters. The correction is 0 if the errors are not significant.
-        added: (k, k) covariance that calibration errors add to the covariance for an exact camera.
-        described: (k, k) part of `added` from errors whose size is specified.
-        score: (n, k) gradient of each star after the correction.
-        error: (m,) most likely calibration errors, in standard deviations.
+        step: correction of the k fitted shared parameters (k,). The correction is 0 if the calibration errors
+            are not significant.
+        added: covariance (k, k) that calibration errors add to the covariance for an exactly known camera.
+        described: part of `added` (k, k) from calibration errors whose standard deviation is specified.
+        score: gradient of the log-likelihood of each star after the correction (n, k).
+        error: most likely values of the m calibration errors, in standard deviations (m,).
     """
 
     step: FloatArray
@@ -183,13 +187,16 @@ def correct(
     """Return the joint solution for shared parameters and calibration errors, or None if it is singular.
 
     Args:
-        information: (n, k, k) information of each star after elimination of the star's own parameters.
-        score: (n, k) gradient of each star's log-likelihood.
-        apparent: (n, k, m) apparent change of the shared parameters by each of m calibration errors of one
-            standard deviation. The errors of specified size are the first of the m errors.
+        information: Fisher information of each star on k shared parameters (n, k, k), after elimination of
+            the star's own parameters.
+        score: gradient of each star's log-likelihood by the k shared parameters (n, k).
+        apparent: apparent change (n, k, m) of k shared parameters of each star by each of m calibration
+            errors of one standard deviation. The calibration errors of specified standard deviation are the
+            first of the m errors.
         spread: variance of the scatter of the stars, relative to their noise.
-        described: number of calibration errors whose size is specified.
-        counted: (m,) errors already corrected in the fit. The result is relative to the errors in `counted`.
+        described: number of calibration errors whose standard deviation is specified.
+        counted: calibration errors that the fit has already corrected, in standard deviations (m,). The
+            resulting calibration errors are relative to `counted`.
     """
     m = apparent.shape[2]
     known = information / spread
@@ -217,7 +224,7 @@ def correct(
 
 
 def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:
-    """Return the covariance (k, k) from calibration errors with the information matrix `left` (m, m).
+    """Return the covariance (k, k) due to calibration errors that have the information matrix `left` (m, m).
 
     Each correction is assumed to be uncertain by its own size, because large displacements of streaks are
     underestimated.
@@ -273,7 +280,7 @@ def _error_sizes(camera: FitProblem) -> dict[str, float]:
 def _error_displacements(
     pinhole: Pinhole, errors: dict[str, float], place: FloatArray, velocity: FloatArray
 ) -> FloatArray:
-    """Return displacements (p, 2, m) px by each error, of stars at `place` (p, 2) px with `velocity` px/s."""
+    """Return the displacements (p, 2, m), px, of stars by each of m calibration errors."""
     away = place - np.array(pinhole.centre)
     corner = np.hypot(*pinhole.centre)
     moves = {
@@ -289,8 +296,8 @@ def _error_displacements(
 
 
 def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
-    """Return `camera` with a lens that has the calibration errors `error` (m,), in standard deviations."""
-    # The line time, the last of the errors, is not a property of the lens.
+    """Return `camera` with a lens that has calibration errors `error` (m,), given in standard deviations."""
+    # The line time, which is the last of the calibration errors, is not a property of the lens.
     sizes = zip(_error_sizes(camera).items(), error, strict=False)
     found = {name: sigma * float(by) for (name, sigma), by in sizes}
     scale, x, y, cubic = (
@@ -309,11 +316,11 @@ _SIGNIFICANT = 4.0
 
 @dataclass(frozen=True, slots=True)
 class CommonMotion:
-    """RMS motion common to all streaks beyond the smooth model, or 0 if it is not significant.
+    """RMS vibration common to all streaks, as deviation from the smooth model, or 0 if not significant.
 
     Attributes:
-        across: displacement across the paths, px.
-        along: relative change of brightness along the paths.
+        across: displacement of the streaks across their paths, px.
+        along: relative change of brightness along the streaks.
     """
 
     across: float = 0.0
@@ -325,8 +332,8 @@ def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResid
 
     At each time, vibration displaces all streaks equally across their paths. Along the paths, vibration
     changes the speed of the stars and thereby their intensity. The residuals of all stars are averaged in
-    bins of time. Only products between different stars are summed, so that flux of a star's neighbour has no
-    effect.
+    bins of time. Only products of the residuals of different stars are summed, so that a neighbour of one
+    star has no effect.
     """
     if not len(left.star):
         return CommonMotion()
@@ -351,8 +358,8 @@ def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResid
 def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> float:
     """Return the rms displacement common to all stars, or 0 if it is not significant.
 
-    `score` (m, 2) and `information` (m,) of m lines are summed in cells of star and time bin, whose indices
-    are `cell` (m,).
+    The gradients `score` (m, 2) and `information` (m,) of m lines of pixels are summed over each star and
+    time bin, whose combined indices are `cell` (m,).
     """
     size = (int(cell.max()) // _BINS + 1) * _BINS if len(cell) else 0
     if size < 2 * _BINS:
@@ -377,37 +384,37 @@ def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> f
 _NEAR_REST = 1.5
 # Maximum number of bright streaks that are tested for a reversal of the rotation.
 _MOST_STARS = 10
-# Sampling step (px) of the intensity along a path.
+# Sampling step (px) of the intensity along a star's path in the test for a reversal.
 _STEP = 0.5
-# Margin (px) before the point at which the star is at rest.
+# Margin (px) by which the examined path extends beyond the point at which the star is at rest.
 _BEFORE = 5.0
-# Length of the examined path, relative to the fitted path.
+# Length of the path examined for a reversal, relative to the length of the fitted path.
 _BEYOND = 1.9
-# Half width (px) of the band of pixels around a path that is examined.
+# Half width (px) of the band of pixels around a path that is examined for a reversal.
 _ASIDE = 3
-# Trial ratios of the shorter to the longer of the two durations before and after the reversal.
+# Trial ratios of the shorter to the longer of the durations before and after a reversal of the rotation.
 _SHARES = np.concatenate([np.arange(0.15, 0.96, 0.1), [0.97, 0.98, 0.99]])
 # Trial ratios of the path length of a reversing motion to the fitted path length.
 _LENGTHS = np.concatenate([np.arange(0.95, 1.1, 0.01), np.arange(1.1, 1.71, 0.05)])
-# Relative error of the modelled profile across a path.
+# Relative error of the modelled brightness profile across a star's path.
 _PROFILE_ERROR = 0.05
-# Upper limit of the chi-square improvement by a single star.
+# Upper limit of a single star's contribution to the chi-square improvement by a reversal.
 _MOST_IMPROVEMENT = 100.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PathLight:
-    """Sums over the pixels of a streak that give chi-square for any intensity along its path.
+    """Sums over the pixels of a streak from which chi-square follows for any intensity along its path.
 
-    In the sums, d are the pixel values, w the weights of the pixels, and g is the point-spread profile across
-    the path.
+    In these sums, d is the counts of a pixel, w the weight of the pixel, and g the point-spread profile
+    across the path.
 
     Attributes:
-        places: (k,) distances along the path from the point of rest, px.
-        square: (k,) sums of w g^2 over the pixels nearest to each place.
-        cross: (k,) sums of w g d over the pixels nearest to each place.
+        places: distances along the path (k,) from the point at which the star rests, px.
+        square: sums of w g^2 over the pixels nearest to each of the k `places` (k,).
+        cross: sums of w g d over the pixels nearest to each of the k `places` (k,).
         plain: (k,) sums of w g.
-        moments: sums of w, w d and w d^2 over all pixels.
+        moments: sums of w, w d and w d^2 over all pixels of the streak.
         pixels: number of pixels.
     """
 
@@ -420,14 +427,13 @@ class _PathLight:
 
 
 def reversal_improvement(camera: FitProblem, scene: StreakScene) -> float:
-    """Return the chi-square improvement of bright streaks if the rotation reverses during the exposure.
+    """Return the decrease of the bright streaks' chi-square if the rotation reverses during the exposure.
 
-    The improvement is 0 if no reversing rotation fits better, if the rate is far from zero, or if the motion
-    is from the navigation filter. For a rate that changes linearly, the intensity along a path is
-    proportional to 1/sqrt(s) at a distance of s px from the point of rest. A rotation that reverses covers
-    the first part of the path twice, which doubles the intensity there. If the durations before and after the
-    reversal are equal, the intensity equals that of a motion from rest, and the pixels do not distinguish the
-    two motions.
+    The decrease is 0 if no reversing rotation fits better, if the rate is far from zero, or if the motion is
+    from the navigation filter. For a rate that changes linearly, the intensity along a path is proportional
+    to 1/sqrt(s) at a distance of s px from the point of rest. A rotation that reverses covers the first part
+    of the path twice, which doubles the intensity there. If the durations before and after the reversal are
+    equal, the intensity equals that of a motion from rest, and the pixels do not distinguish the two motions.
     """
     motion, change = scene.motion, scene.motion.relative_acceleration
     if abs(change) < _NEAR_REST or motion.higher_terms.any():
@@ -451,7 +457,7 @@ def reversal_improvement(camera: FitProblem, scene: StreakScene) -> float:
 def _path_light(
     camera: FitProblem, onward: CameraMotion, rest: FloatArray, length: float, width: float
 ) -> _PathLight:
-    """Return sums along the path of a star that rests at the pixel `rest` (2,) and then moves `onward`."""
+    """Return the sums along the path of a star that is first at rest at the pixel `rest` (2,)."""
     frame, pinhole = camera.frame, camera.pinhole
     places = np.arange(-_BEFORE, _BEYOND * length + _BEFORE, _STEP)
     path = positions(pinhole, onward, np.repeat(rest[None], len(places), axis=0), places / length)
@@ -465,7 +471,7 @@ def _path_light(
     apart = np.sum((points[:, None] - path) ** 2, axis=2)
     nearest = np.argmin(apart, axis=1)
     apart = apart[np.arange(len(index)), nearest]
-    # Pixels that are nearest to the first or the last place may lie beyond the path.
+    # Pixels that are nearest to the first or the last sampled point may lie beyond the path.
     kept = (apart < _ASIDE**2) & (nearest > 0) & (nearest < len(places) - 1)
     index, apart, nearest = index[kept], apart[kept], nearest[kept]
     data = frame.signal[index].astype(float)
@@ -481,14 +487,14 @@ def _path_light(
 
 
 def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, width: float) -> FloatArray:
-    """Return chi-square (s, l) of reversing motions for ratios `shares` (s,) and `lengths` (l,) px.
+    """Return the chi-square (s, l) of a streak for reversing motions.
 
-    `shares` are ratios of the durations before and after the reversal. The flux of the star and the sky level
-    are fitted.
+    The array `shares` (s,) holds ratios of the durations before and after the reversal, and `lengths` (l,)
+    the path lengths, px. The flux of the star and the sky level are fitted to the pixels.
     """
     edges = np.append(one.places, one.places[-1] + _STEP) - 0.5 * _STEP
-    # `before` is the flux before each edge of the cells along the path.
-    # A negative ratio stands for a motion that starts after the point of rest.
+    # The variable `before` is the flux up to each boundary between the samples along the path.
+    # A negative ratio of durations describes a motion that starts after the point of rest.
     share, root = shares[:, None, None], np.sqrt(np.clip(edges / lengths[:, None], 0.0, 1.0))
     before = np.maximum(root, -share) + np.minimum(root, np.maximum(share, 0.0)) + np.minimum(share, 0.0)
     light = np.diff(before / (1.0 + share), axis=-1)
@@ -502,19 +508,19 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 
 # Maximum number of conjugate-gradient iterations for the covariance.
 _CONJUGATE = 12
-# Number of stars up to which no consistency test is possible, and the variance factor for such a fit.
+# Number of stars up to which no consistency test is possible, and factor on the variance of such a fit.
 _UNCHECKED = (2, 4.0)
-# Relative difference between fitted and configured point-spread variance that counts as zero.
+# Relative difference between fitted and configured point-spread variance that is neglected.
 _SAME_SPREAD = 0.05
-# Uncertainty of the ends, relative to the root of the difference between fitted and configured variance.
+# Uncertainty of streak ends, relative to the root of the difference of fitted and configured variance.
 _END_SHARE = 0.6
 # Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
 _END_FLOOR = 0.12
 # Uncertainty of the streak ends, relative to the displacement that explains their residuals.
 _END_SHOWN = 1.5
-# Uncertainty of the streak ends, relative to the upper limit of the displacement from their residuals.
+# Uncertainty of streak ends, relative to the upper limit of the displacement from their residuals.
 _END_CHANCE = 0.5
-# Uncertainty of the streak ends (px) per motion common to all streaks (px across, or relative brightness).
+# Uncertainty of streak ends (px) per motion common to all streaks (px across, or relative brightness).
 _END_COMMON = 25.0
 # Maximum number of iterations of the lens correction.
 _MOST_LENSES = 3
@@ -522,7 +528,7 @@ _MOST_LENSES = 3
 _SMALL_ERROR = 0.2
 # Relative uncertainty of the rotation due to lens errors above which a lens correction is always tried.
 _WORTHWHILE = 0.002
-# Ratio of the covariance to the noise covariance above which model errors are the cause (three sigma).
+# Ratio of covariance to noise covariance above which model errors must be the cause (three sigma).
 _BEYOND_NOISE = 9.0
 
 
@@ -531,12 +537,12 @@ class RotationUncertainty:
     """The rotation over the exposure and its uncertainty.
 
     Attributes:
-        rotation: (3,) rotation vector, corrected for significant calibration errors, rad.
+        rotation: rotation vector over the exposure (3,), corrected for significant calibration errors, rad.
         covariance: (3, 3) rad^2.
-        model_error: uncertainty from model errors, relative to the rotation. The uncertainty of an
-            unspecified shutter is included only in the covariance.
-        common_motion: motion common to all streaks, such as vibration.
-        aside: displacement across the streaks that would explain the residuals, px.
+        model_error: uncertainty from model errors, relative to the rotation. If the type of shutter is
+            unspecified, its uncertainty is included only in the covariance.
+        common_motion: deviation from the smooth motion that is common to all streaks, such as vibration.
+        aside: displacement of streaks across their paths that would explain the residuals, px.
     """
 
     rotation: FloatArray
@@ -547,10 +553,10 @@ class RotationUncertainty:
 
 
 def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: StreakFit) -> RotationUncertainty:
-    """Return the rotation of the fit `whole` with its uncertainty.
+    """Return the rotation over the exposure of the fit `whole`, with its uncertainty.
 
-    The stars of the fit are given in `result`. If faint stars are hidden in the streaks, the rotation is
-    taken from a fit of the brightest streaks with all their hidden stars.
+    The argument `result` holds the stars of the fit. If faint stars are hidden in the streaks, the rotation
+    is taken from a fit of the brightest streaks with all their hidden stars.
     """
     camera, whole, lens = _corrected_lens(camera, whole, result.exposure)
     brightest = brightest_fit(camera, whole)
@@ -594,16 +600,18 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LensEffect:
-    """Effect of calibration errors on the rotation, as in `CalibrationCorrection`.
+    """Effect of calibration errors on the rotation over the exposure, as in `CalibrationCorrection`.
 
     Attributes:
-        step: (3,) correction of the rotation, rad.
-        added: (3, 3) covariance that calibration errors add, rad^2.
-        described: (3, 3) part of `added` from errors whose size is specified, rad^2.
+        step: correction of the rotation vector over the exposure (3,), rad.
+        added: covariance of the rotation vector that calibration errors add (3, 3), rad^2.
+        described: part of `added` (3, 3) from calibration errors whose standard deviation is specified,
+            rad^2.
         spread: variance of the scatter of the stars, relative to their noise.
-        error: (m,) calibration errors relative to `counted`, in standard deviations.
-        counted: (m,) errors already corrected in the fit; None without any.
-        seen: whether the calibration errors are significant.
+        error: remaining m calibration errors relative to `counted`, in standard deviations (m,).
+        counted: calibration errors that the fit has already corrected, in standard deviations (m,); None
+            without any.
+        seen: whether the stars show the calibration errors significantly.
     """
 
     step: FloatArray
@@ -618,11 +626,11 @@ class _LensEffect:
 def _corrected_lens(
     camera: FitProblem, whole: StreakFit, exposure: float
 ) -> tuple[FitProblem, StreakFit, _LensEffect]:
-    """Return camera and fit after correction of the most likely lens errors, and the remaining effect.
+    """Return camera and fit after correction of the most likely lens errors, and the effect of other errors.
 
-    Large displacements of streaks are underestimated. The fit is repeated with the corrected lens until the
-    correction is small. The lens is corrected if the stars show an error, or if the lens contributes most of
-    the uncertainty.
+    Lens errors that displace streaks far are underestimated. The fit is repeated with the corrected lens
+    until the correction is small. The lens is corrected if the stars show a lens error, or if the lens
+    contributes most of the uncertainty.
     """
     first = lens = _lens_effect(camera, whole, exposure, None)
     if not lens.seen and np.trace(lens.described) < _WORTHWHILE**2 * np.sum(whole.scene.motion.rotation**2):
@@ -644,7 +652,7 @@ def _corrected_lens(
 def _lens_effect(
     camera: FitProblem, last: StreakFit, exposure: float, counted: FloatArray | None
 ) -> _LensEffect:
-    """Return the effect on the rotation of calibration errors beyond the errors `counted` (m,)."""
+    """Return the effect on the rotation of the calibration errors that remain beyond `counted` (m,)."""
     nothing = np.zeros((3, 3))
     equations = star_equations(last.evaluation, last.free)
     if equations is None:
@@ -661,7 +669,7 @@ def _lens_effect(
     shared = np.zeros((len(trusted), len(equations.kept), apparent.shape[2]))
     shared[:, :3] = apparent
     corrected, before = None, 1.0
-    # Scatter of the stars that calibration errors explain does not count as noise.
+    # The scatter of the stars that calibration errors explain is not counted as noise.
     for _ in range(2):
         corrected = correct(equations.information, equations.score, shared, before, described, counted)
         if corrected is None:
@@ -683,11 +691,11 @@ def _scatter(equations: StarEquations, scene: StreakScene) -> float:
 
 
 def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, misfit: float) -> float:
-    """Return the uncertainty (px) of streak ends from a point-spread width that differs from `sigma` (px).
+    """Return the uncertainty (px) of streak ends if the true point-spread width differs from `sigma` (px).
 
-    If the residuals at the ends are not significant, the point spread has the modelled shape and the same
-    width along and across the streaks. Significant residuals indicate another shape, or a vibration too fast
-    to be resolved, which shifts the apparent ends.
+    If the residuals at the streak ends are not significant, the point spread has the modelled shape and the
+    same width along and across the streaks. Significant residuals at the streak ends indicate another shape
+    of the point spread, or a vibration too fast to be resolved, which shifts the apparent ends.
     """
     described = sigma**2 + PIXEL_VARIANCE
     beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described
