@@ -1,18 +1,19 @@
-"""Properties of a frame that are needed for frames of points and frames of streaks.
+"""Background, noise, bright regions, hot pixels and saturation of a frame of point stars or streaks.
 
-Background. The level and noise of the background are clipped moments of a sub-sample of each block of pixels.
-Streaks, slow gradients of stray light and hot pixels hardly change the estimated background. The thesis uses
-the mean of the image as threshold, but noise lifts half of all pixels above the mean (errata, chapter 3). The
-sum over 3 x 3 pixels is close to the matched filter of a star that is one pixel wide.
+Background. The level and noise of the background are clipped moments of some of the pixels in each block of
+the frame. Streaks, slow gradients of stray light and hot pixels therefore hardly change the estimated
+background. The thesis uses the mean of the image as threshold, but noise lifts half of all pixels above the
+mean (errata, chapter 3). The sum over 3 x 3 pixels is nearly the matched filter of a star image one pixel
+wide.
 
-Hot pixels are bright pixels with dark neighbours, which no optics can produce. If a star's image has a
+A hot pixel is a bright pixel with dark neighbours, which no optics can produce. If a star's image has a
 standard deviation of more than 0.5 px, the four neighbours of its brightest pixel have at least 15 % of the
-intensity of that pixel. Methods that need an image without gaps replace hot pixels, but only if the detection
-is certain. A fit to pixels excludes hot pixels, which does little harm if a pixel of a star is excluded by
-mistake.
+intensity of that pixel. Methods that need an image without gaps replace hot pixels, but only those that are
+detected with certainty. A fit to pixels excludes hot pixels, which does little harm if a pixel of a star is
+excluded by mistake.
 
-A frame without a scene is dead (all pixels are equal) or overexposed. The step between counts is 257 if 8-bit
-counts were stored as 16 bits, and 16 if 12-bit counts were.
+A frame that shows no scene is dead (all pixels are equal) or overexposed. Counts are multiples of 257 if
+8-bit counts were stored as 16 bits, and of 16 if 12-bit counts were.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 
 _CLIP, _CLIPPED_SIGMA = 3.0, 0.98658
-"""Clipping limit in standard deviations, and the standard deviation of a normal variable after clipping."""
+"""Clipping limit (standard deviations), and standard deviation of a unit normal variable after clipping."""
 MAD_TO_SIGMA = 1.4826
 """Ratio of the standard deviation of a normal variable to its median absolute deviation."""
 _ROUNDING_VARIANCE = 1.0 / 12.0
@@ -51,7 +52,7 @@ class Background:
         return float(np.median(self.noise))
 
     def map(self, grid: FloatArray) -> Image:
-        """Return the block values `grid` interpolated bilinearly to every pixel, as float32 of `shape`."""
+        """Return the block values `grid`, interpolated bilinearly to all pixels of a frame, as float32."""
         down, across = (
             interpolation_weights(pixels, blocks).astype(np.float32)
             for pixels, blocks in zip(self.shape, grid.shape, strict=True)
@@ -62,9 +63,9 @@ class Background:
 def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Background:
     """Return background level and noise of `pixels` (rows, columns) in blocks of `block` x `block` pixels.
 
-    Every `stride`-th pixel of every `stride`-th row is used. With the defaults, 256 samples per block give
-    the level with an error of 6 % of the noise, and the noise with an error of 5 %. A block that is filled by
-    a bright object gets the median noise of the surrounding 3 x 3 blocks.
+    For speed, only every `stride`-th pixel of every `stride`-th row is used. With the defaults, 256 samples
+    per block give the level with an error of 6 % of the noise, and the noise with an error of 5 %. A block
+    that is filled by a bright object gets the median noise of the surrounding 3 x 3 blocks.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
@@ -76,7 +77,7 @@ def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Back
     values = sample.reshape(down, across, -1).astype(np.float64)
     median = np.median(values, axis=-1, keepdims=True)
     spread = MAD_TO_SIGMA * np.median(np.abs(values - median), axis=-1, keepdims=True)
-    # Coarse quantisation can make the median deviation zero. A limit of 1.5 counts keeps adjacent counts.
+    # Quantisation can make the median deviation zero. A clipping limit of 1.5 counts keeps adjacent counts.
     kept = np.abs(values - median) <= _CLIP * np.maximum(spread, 0.5)
     count = kept.sum(axis=-1)
     level = np.where(kept, values, 0.0).sum(axis=-1) / count
@@ -86,10 +87,10 @@ def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Back
 
 
 def place_among_blocks(pixel: FloatArray, pixels: int, blocks: int) -> tuple[IntArray, FloatArray]:
-    """Return the last block centre (n,) before `pixel` (n,), and the fraction (n,) towards the next centre.
+    """Return the index (n,) of the last block centre before `pixel` (n,), and the fraction towards the next.
 
-    A side of `pixels` is divided into `blocks` of equal length. Positions beyond the outermost block centres
-    are moved to these centres.
+    A side of the frame of length `pixels` is divided into `blocks` of equal length. Pixels beyond the
+    outermost block centres are treated like these centres.
     """
     width = pixels // blocks
     place = np.clip((pixel - 0.5 * (width - 1)) / width, 0.0, blocks - 1.0)
@@ -98,7 +99,7 @@ def place_among_blocks(pixel: FloatArray, pixels: int, blocks: int) -> tuple[Int
 
 
 def interpolation_weights(pixels: int, blocks: int) -> FloatArray:
-    """Return the weights (pixels, blocks) of linear interpolation between block centres."""
+    """Return weights (pixels, blocks) that interpolate linearly between block centres along one side."""
     first, share = place_among_blocks(np.arange(pixels, dtype=float), pixels, blocks)
     weights = np.zeros((pixels, blocks))
     weights[np.arange(pixels), first] += 1.0 - share
@@ -111,11 +112,11 @@ _STRETCH = 32_768
 
 
 def box_sum(image: Image) -> Image:
-    """Return the sums over 3 x 3 pixels around each pixel (rows, columns), with zeros along the border."""
+    """Return the sums over the 3 x 3 pixels around each pixel (rows, columns), with zeros at the border."""
     columns, flat = image.shape[1], np.ascontiguousarray(image).reshape(-1)
     total = np.empty(image.shape, dtype=image.dtype)
     sums = total.reshape(-1)
-    # The flat array joins successive rows, which affects only the pixels at the border.
+    # In the flat array, successive rows join, which falsifies only the sums at the border.
     for start in range(columns + 1, flat.size - columns - 1, _STRETCH):
         stop = min(start + _STRETCH, flat.size - columns - 1)
         down = flat[start - columns - 1 : stop - columns + 1] + flat[start - 1 : stop + 1]
@@ -129,15 +130,15 @@ def box_sum(image: Image) -> Image:
 
 
 def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Image) -> Image:
-    """Return flat 3 x 3 `sums` of a frame of `shape` after subtraction of counts from some of its pixels.
+    """Return the 3 x 3 `sums` of a frame of `shape`, flat, after counts are subtracted from some pixels.
 
-    `pixels` (m,) are the flat indices of the changed pixels, each given once, and `taken` (m,) are the counts
-    to subtract.
+    The indices `pixels` (m,) are those of the changed pixels, each given once, and `taken` (m,) are the
+    counts to subtract.
     """
     out, (rows, columns) = sums.copy(), shape
     for down in (-columns, 0, columns):
         for beside in (-1, 0, 1):
-            # Sums that cross the edge of the frame belong to pixels at the border, which are set to zero.
+            # Sums that would cross the edge of the frame belong to border pixels, which are set to zero.
             out[np.clip(pixels + (down + beside), 0, out.size - 1)] -= taken
     framed = out.reshape(rows, columns)
     framed[[0, -1]] = 0
@@ -152,10 +153,10 @@ class Moments:
     Attributes:
         flux: light (n,), counts.
         centre: centroid of each region (n, 2), x and y, px.
-        length: length of the uniform line with the second moments of each region (n,), px. The length is
-            about 0 for a round region.
-        thickness: rms width of each region across its line (n,), px.
-        direction: angle from the pixel rows to the line of each region (n,), rad.
+        length: length of the uniform line that has the same second moments as each region (n,), px. The
+            length is about 0 for a round region.
+        thickness: rms width of each region across its long axis (n,), px.
+        direction: angle from the pixel rows to the long axis of each region (n,), rad.
     """
 
     flux: FloatArray
@@ -166,25 +167,25 @@ class Moments:
 
 
 def positions(mask: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the true pixels of a mask, faster than `nonzero` for few true pixels."""
+    """Return rows and columns of the true pixels of a mask, faster than `nonzero` if few pixels are true."""
     row, column = np.divmod(np.flatnonzero(mask), mask.shape[1])
     return row, column
 
 
 def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
-    """Return the region number (m,) of each flat index in `pixel` (m,), ascending, and the region count.
+    """Return the region (m,) of each of the ascending flat indices `pixel` (m,), and the number of regions.
 
     Regions are 8-connected and numbered in the order of their first pixels. The algorithm connects runs of
-    pixels along rows, because there are far fewer runs than pixels. Each run is linked to an earlier run of
-    its region, and the links are shortened until all runs of a region share one root (Shiloach and Vishkin
-    1982). An implementation with scipy.sparse would need 12 MiB more memory.
+    adjacent pixels in a row, because there are far fewer runs than pixels. Each run of pixels is linked to an
+    earlier run of its region, and the links are shortened until all runs of a region share one root (Shiloach
+    and Vishkin 1982). An implementation with scipy.sparse would need 12 MiB more memory.
     """
-    # An empty column is added, so that no run continues in the next row.
+    # An empty column is added, so that no run of pixels continues in the next row.
     pixel, columns = pixel + pixel // columns, columns + 1
     first = np.flatnonzero(np.diff(pixel, prepend=-2) > 1)
     length = np.diff(first, append=len(pixel))
     start, stop = pixel[first], pixel[first] + length
-    # A run touches each run of the next row between one column before and one column after it.
+    # A run of pixels touches the runs of the next row from one column before to one column after the run.
     low = np.searchsorted(stop, start + columns)
     count = np.searchsorted(start, stop + columns, side="right") - low
     one = np.repeat(np.arange(len(first)), count)
@@ -205,7 +206,7 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
 
 
 def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int) -> Moments:
-    """Return the moments of `count` regions from region number, position and counts of pixels (m,).
+    """Return the moments of `count` regions from the region, position and counts of their m pixels (m,).
 
     The moments of a region with zero flux are zero.
     """
@@ -217,7 +218,7 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
     yy = np.bincount(owner, light * dy * dy, count) / whole
     xy = np.bincount(owner, light * dx * dy, count) / whole
     # The point spread increases both principal moments by the same amount.
-    # For a line of length L, the difference of the principal moments is L^2/12 for any point spread.
+    # For a uniform line of length L and any point spread, the difference of the principal moments is L^2/12.
     spread = np.hypot(xx - yy, 2.0 * xy)
     return Moments(
         flux,
@@ -231,7 +232,7 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
 def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> FloatArray:
     """Return the ends (2, 2), px, of the uniform line with a given `centre` (2,) and `covariance` (2, 2).
 
-    Both ends are equal to the centre if the line is not longer than `least_length` px. The second moments
+    Both ends equal the centre if the line is not longer than `least_length` px. The second moments
     `covariance` are in px^2.
     """
     (across, along), axes = np.linalg.eigh(covariance)
@@ -247,20 +248,20 @@ A neighbour of a hot pixel must be below two limits: a fraction of the hot pixel
 the noise, and a maximum fraction of the hot pixel.
 """
 _PAIR, _PAIR_NOISE = 20.0, 1.0
-"""Limits for two adjacent hot pixels, in standard deviations.
+"""Limits (standard deviations) for the recognition of two adjacent hot pixels.
 
-The first limit is the minimum brightness of both pixels. The second limit is the number of standard
-deviations by which noise may raise the third brightest pixel.
+The first of these limits is the minimum brightness of both pixels. The second of these limits is the number
+of standard deviations by which noise may raise the third brightest pixel.
 """
 _REPAIR_SIGMAS, _HOT_SIGMAS = 10.0, 8.0
-"""Minimum brightness (standard deviations) of a hot pixel that is replaced, and of one that is excluded."""
+"""Minimum brightness (standard deviations) of hot pixels that are replaced, and of those excluded."""
 _AROUND = tuple((dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0))
 
 
 def repair_hot_pixels(signal: Image, noise: Image) -> int:
     """Replace hot pixels of `signal` (rows, columns) by their neighbours' median, and return their number.
 
-    Only pixels well above the `noise` (rows, columns) are tested.
+    Only pixels well above the standard deviation `noise` (rows, columns) of the noise are tested.
     """
     row, column = positions(signal > _REPAIR_SIGMAS * noise)
     row, column, around = _hot(signal, row, column, noise[row, column])
@@ -271,7 +272,7 @@ def repair_hot_pixels(signal: Image, noise: Image) -> int:
 def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]:
     """Return rows and columns of the hot pixels of `signal` that are well above the noise.
 
-    `variance` (rows, columns) is the noise variance of each pixel.
+    The array `variance` (rows, columns) is the noise variance of each pixel.
     """
     row, column = positions(signal > np.float32(_HOT_SIGMAS * np.sqrt(variance.min())))
     noise = np.sqrt(variance[row, column])
@@ -283,7 +284,8 @@ def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]
 def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
     """Return whether each of n windows of nine pixels contains only one or two hot pixels and noise.
 
-    `light` (9, n) holds the pixels of each window, and `noise` (n,) is the noise of a pixel.
+    The counts above the background `light` (9, n) are those of the pixels of each window, and `noise` (n,) is
+    the noise of a pixel.
     """
     third, second, highest = np.partition(light, (6, 7, 8), axis=0)[6:]
     alone = second < np.minimum(_SHARPNESS * highest + _NOISE * noise, _MOST * highest)
@@ -299,21 +301,22 @@ def _hot(
     row, column, noise = row[inside], column[inside], noise[inside]
     around = np.stack([signal[row + dr, column + dc] for dr, dc in _AROUND])
     own = signal[row, column]
-    # Two adjacent hot pixels are both tested, but a pixel with two brighter neighbours is not hot.
+    # Of two adjacent hot pixels, both are tested, but a pixel with two brighter neighbours is not hot.
     hot = are_hot(np.concatenate([around, own[None]]), noise) & (np.count_nonzero(around > own, axis=0) <= 1)
     return row[hot], column[hot], around[:, hot]
 
 
 _DEAD_FRACTION = 1e-4
-"""Largest fraction of differing pixels (hot pixels) in a dead frame."""
+"""Largest fraction of the pixels in a dead frame, such as hot pixels, that differ from the common value."""
 _PLATEAU = 6
 """Minimum number of saturated pixels in a frame of streaks from which saturation is recognised."""
 _LEAST_PLATEAU, _PILED_UP, _PLATEAU_REACH = 4, 2.0, 0.02
 """Limits for saturation in a frame of points.
 
-The first limit is the minimum number of pixels with the highest count. The second limit is the minimum ratio
-of the pixels with the highest count to the pixels with slightly smaller counts. The third limit is the width
-of the range just below the highest count, as a fraction of the range of all counts.
+The first limit for saturation is the minimum number of pixels with the highest count. The second limit for
+saturation is the minimum ratio of the number of pixels with the highest count to that with slightly smaller
+counts. The third limit for saturation is the width of the range just below the highest count, as a fraction
+of the range of all counts.
 """
 
 
@@ -341,16 +344,16 @@ def frame_state(pixels: Image, saturation: float, saturated_fraction: float) -> 
 
 
 def saturation_level(pixels: Image, given: float | None) -> float:
-    """Return the saturation count: `given`, otherwise the maximum of the integer type or infinity."""
+    """Return the saturation count: `given`, or the maximum of the integer type, or infinity for floats."""
     if given is not None:
         return given
     return float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind in "ui" else np.inf
 
 
 def saturation_count(pixels: Image) -> float:
-    """Return the saturation count: the highest count if several pixels have it, else the type's maximum.
+    """Return the saturation count: the highest count if several pixels have it, or else the type's maximum.
 
-    Use this function for frames of streaks, in which bright stars cover many pixels.
+    This function is for frames of streaks, in which bright stars cover many pixels.
     """
     highest = pixels.max()
     # A frame with only one value is dead, unless the value is the maximum of its type.
@@ -360,11 +363,11 @@ def saturation_count(pixels: Image) -> float:
 
 
 def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None) -> float:
-    """Return the saturation count: `given`, the highest of `counts` (m,) if many share it, or the maximum.
+    """Return the saturation count: `given`, or the highest of `counts` (m,) if frequent, or the maximum.
 
-    Use this function for frames of points from any camera. In a dim frame, the highest counts are noise, and
-    the higher a count, the fewer pixels have it. In a saturated frame, more pixels have the highest count
-    than the counts just below.
+    This function is for frames of point stars from any camera. In a dim frame, the highest counts are due to
+    noise, and the higher a count, the fewer pixels have it. In a saturated frame, more pixels have the
+    highest count than the counts just below.
     """
     top = saturation_level(pixels, given)
     highest = counts.max(initial=-np.inf)
@@ -378,16 +381,19 @@ def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None)
 
 
 def at_least(pixels: Image, level: float) -> BoolArray:
-    """Return which `pixels` reach `level` counts. Integers are compared in their own type."""
+    """Return which `pixels` reach a `level`, counts.
+
+    Integer pixels are compared with the level in their own type.
+    """
     if not np.issubdtype(pixels.dtype, np.integer) or not 0.0 <= level <= np.iinfo(pixels.dtype).max:
         return np.asarray(pixels >= level)
     return np.asarray(pixels >= pixels.dtype.type(np.ceil(level)))
 
 
 _STRIDE = 16
-"""Distance (px) between the sampled pixels from which the step between counts is estimated."""
+"""Distance (px) between the pixels that are sampled to estimate the step between counts."""
 _MOST_BETWEEN = 0.01
-"""Largest fraction of pixels with counts between the steps, which a repair of hot pixels can cause."""
+"""Largest fraction of pixels with counts between the steps, as a repair of hot pixels can leave."""
 
 
 def in_steps(pixels: Image) -> tuple[Image, int, int]:

@@ -1,12 +1,12 @@
-"""Attitude and rate from one frame: the decision tree of the vision worker and of `flight solve`.
+"""Attitude and rate from one frame, by the decision tree of the vision worker and of `flight solve`.
 
 1. In flight, the motion over the exposure is estimated for every frame, because each frame reports a rate.
    For any other image, the motion is only estimated if a fast survey of the bright areas shows streaks. If
-   the streaks do not give an attitude (a fence or a striped wall looks like streaks too), the points of the
-   image are identified.
+   the streaks give no attitude, as those of a fence or a striped wall, the points of the image are
+   identified.
 
-2. Stars at rest are searched near their predicted positions if there is a prior attitude. Without a prior
-attitude, or if the stars are not found near their predictions, the whole frame is searched.
+2. Stars that are points are searched near their predicted positions if there is a prior attitude. Without a
+   prior attitude, or if the stars are not found near their predictions, the whole frame is searched.
 
 3. The positions of streaked stars at mid-exposure are identified like points. The streaks are fitted a second
    time with a corrected focal length or with the directions of the identified stars.
@@ -49,14 +49,14 @@ from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
 _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
-# Relative error of the focal length above which the motion is fitted again.
+# Relative error of the assumed focal length above which the motion is fitted a second time.
 _SCALE_TOLERANCE = 0.01
-# Motion (px) over the exposure below which a star is measured as a point.
+# Motion (px) of a star over the exposure below which it is measured as a point.
 _POINT_PX = 1.0
 # Predicted streak length (px) below which stars are measured as points if no motion can be fitted.
-# In a crowded sky, merged regions can look like streaks.
+# In a crowded sky, merged star images can look like streaks.
 _SHORT_PX = 4.0
-# Largest uncertainty (px) of a predicted trail that is included in the model of a star's image.
+# Largest uncertainty (px) of the predicted motion of a star that is included in the model of its image.
 _KNOWN_PX = 0.3
 
 
@@ -66,7 +66,7 @@ class TrackerSettings:
 
     Attributes:
         solve: settings of star detection, identification and attitude.
-        scale: lowest and highest factor on the focal length, (1, 1) for a calibrated lens.
+        scale: lowest and highest factor by which the focal length may be wrong, (1, 1) for a calibrated lens.
         index: file of the sky index; None: the default index.
     """
 
@@ -76,7 +76,7 @@ class TrackerSettings:
 
 
 class StreakEstimator(Protocol):
-    """Interface of an alternative estimator of streaks, which must support pickling."""
+    """Interface of an alternative estimator of the motion from streaks, which must support pickling."""
 
     def motion(
         self,
@@ -87,7 +87,10 @@ class StreakEstimator(Protocol):
         prior_sigma: float,
         previous_checksum: int | None,
     ) -> FrameMotion:
-        """Return the motion over the exposure (s). The arguments are those of `estimate_motion`."""
+        """Return the motion over the `exposure`, s.
+
+        The arguments are those of `streaks.estimate.estimate_motion`.
+        """
 
     def solve(
         self,
@@ -98,7 +101,7 @@ class StreakEstimator(Protocol):
         settings: SolveSettings,
         prior: AttitudePrior | None,
     ) -> tuple[FrameSolution, FrameMotion]:
-        """Return the attitude at mid-exposure from the streaks of motion `found`, and a refined motion."""
+        """Return the attitude at mid-exposure from the motion `found`, and a refined motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,11 +114,11 @@ class FrameJob:
         exposure: exposure time, s.
         estimator: settings of the maximum-likelihood estimator, or an alternative estimator of streaks.
         tracker: settings of the star identification. If `tracker` is None, stars are not identified.
-        rate_prior, attitude_prior: predicted rate and attitude; None: unknown.
+        rate_prior, attitude_prior: predicted rate and attitude of the camera; None: unknown.
         previous_checksum: checksum of the previous frame. Identical checksums indicate a frozen camera.
-        motion_first: whether the motion is always estimated, and not only if a survey shows streaks.
+        motion_first: whether the motion is always estimated, instead of only if a survey shows streaks.
         objects: settings of the measurement of objects. If `objects` is None, objects are not measured.
-        kept: folder in which the frame is stored; None: it is not kept.
+        kept: folder in which the frame is kept on disk; None: it is not kept.
     """
 
     pixels: Image
@@ -138,7 +141,7 @@ class FrameFound:
     Attributes:
         motion: motion of the camera over the exposure.
         solution: attitude at mid-exposure, or None if stars were not identified.
-        objects: points that may be objects other than stars, or None if they were not measured or the
+        objects: points that may be space objects instead of stars, or None if they were not measured or the
             attitude is unknown.
     """
 
@@ -211,7 +214,8 @@ def solve_frame(
     Args:
         pixels: counts of the image (rows, columns).
         camera: assumed camera, of the size of the image.
-        scale: lowest and highest factor on the tangents of field angles, (1, 1) for a calibrated camera.
+        scale: lowest and highest factor by which the tangents of field angles may be wrong, (1, 1) for a
+            calibrated camera.
         exposure: exposure time, s.
         sky: the guide stars.
         settings: settings of star detection, identification and attitude.
@@ -220,7 +224,7 @@ def solve_frame(
             frame does not show.
     """
     tracker = TrackerSettings(settings, scale)
-    # Only the positions of the stars are needed, so that a poorly determined rate is accepted.
+    # Only the positions of the stars are needed, so that a poorly determined rate is accepted as well.
     estimator = replace(settings.likelihood, worst_uncertainty=math.inf, worst_shaking=math.inf)
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
@@ -234,7 +238,7 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     """Return attitude and rate from a frame by the decision tree in the module docstring."""
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
-    # A fit of a few short streaks is uncertain, but all stars have predicted positions.
+    # The fit of a few short streaks is uncertain, but the positions of all stars can be predicted.
     trails, prior = _short_trails(job), job.attitude_prior
     if prior is not None and (rests or (trails is not None and _predicted_within(job, _SHORT_PX))):
         near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, trails)
@@ -251,7 +255,7 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
 
 
 def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: FrameMotion) -> FrameFound:
-    """Return the attitude from a frame of streaks, by the method of the estimator."""
+    """Return the attitude from a frame of streaks by the method of the job's streak estimator."""
     if isinstance(motion, MotionResult):
         return _from_streaks(job, tracker, sky, motion)
     assert not isinstance(job.estimator, LikelihoodSettings)  # it makes a MotionResult
@@ -282,17 +286,17 @@ def _from_points(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, seen: S
 
 
 def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: MotionResult) -> FrameFound:
-    """Return attitude and motion from a frame of streaks, after a second fit if possible."""
+    """Return attitude and motion from a frame of streaks, and fit the motion a second time if possible."""
     settings, prior = tracker.solve, job.attitude_prior
     solution = solve_motion(motion, job.camera, tracker.scale, sky, settings, prior)
     if solution.status is not SolveStatus.SOLVED:
         return FrameFound(motion, solution)
     if abs(solution.camera.focal_length / job.camera.focal_length - 1.0) > _SCALE_TOLERANCE:
         again = _motion(replace(job, camera=solution.camera))
-        assert isinstance(again, MotionResult)  # The same estimator returned `motion`.
+        assert isinstance(again, MotionResult)  # The estimator that returned `motion` was used.
         return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
     if not job.motion_first:
-        # For a single image, the second fit would add half the computing time for a small gain.
+        # For a single image, a second fit would add half the computing time for a small gain.
         return FrameFound(motion, solution)
     from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue  # noqa: PLC0415
 
@@ -320,7 +324,7 @@ def _no_motion(job: FrameJob) -> MotionResult:
 
 
 def _shows_no_motion(job: FrameJob, motion: FrameMotion) -> bool:
-    """Return whether the stars are at rest, or move too little according to the priors to form streaks."""
+    """Return whether the stars are at rest, or are predicted to move too little for streaks."""
     failed = motion.status is StreakStatus.FAILED and job.rate_prior is not None
     return motion.status in _AT_REST or (failed and _predicted_within(job, _SHORT_PX))
 
@@ -338,7 +342,10 @@ def _short_trails(job: FrameJob) -> ShortTrails | None:
 
 
 def _predicted_within(job: FrameJob, length: float) -> bool:
-    """Return whether the priors predict streaks shorter than `length` px. An unknown rate counts as zero."""
+    """Return whether the priors predict streaks shorter than `length`, px.
+
+    Without a predicted rate, the rate is taken as zero.
+    """
     if job.attitude_prior is None:
         return False
     if job.rate_prior is None:

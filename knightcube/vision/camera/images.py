@@ -42,7 +42,7 @@ SIGNATURE = b"SIMPLE  ="
 BLOCK = 2880
 CARD = 80
 KINDS = {8: ">u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
-"""NumPy types of FITS pixels by the value of BITPIX."""
+"""NumPy types of the pixels of a FITS file by the value of its BITPIX keyword."""
 UNSIGNED = {"i2": (32768.0, np.uint16), "i4": (2147483648.0, np.uint32)}
 """BZERO of unsigned integers that are stored as signed ones (FITS Standard 4.0, section 4.4.2.5)."""
 
@@ -50,9 +50,9 @@ UNSIGNED = {"i2": (32768.0, np.uint16), "i4": (2147483648.0, np.uint32)}
 def primary_image(content: bytes, name: str) -> Image:
     """Return the image (rows, columns) in the bytes of a FITS file; row 0 is the first row of the file.
 
-    Integer pixels without BZERO and BSCALE keep their type. Signed pixels with the BZERO of unsigned integers
-    become unsigned. Pixels with any other BZERO or BSCALE become float64. Raises UsageError, with the file's
-    `name`, if the image is not supported.
+    Integer pixels without BZERO and BSCALE keep their type. Signed pixels with the BZERO value of unsigned
+    integers become unsigned. Pixels with any other BZERO or BSCALE value become float64. Raises UsageError,
+    with the file's `name`, if the image is not supported.
     """
     header, start = _header(content, name)
     bits = _whole(header, "BITPIX", name)
@@ -83,7 +83,7 @@ def _scaled(stored: npt.NDArray[np.generic], zero: float, scale: float) -> Image
         return native
     offset, unsigned = UNSIGNED.get(native.dtype.str[1:], (0.0, None))
     if unsigned is not None and (zero, scale) == (offset, 1.0):
-        # Adding the BZERO of unsigned integers flips only the highest bit.
+        # Adding the BZERO value of unsigned integers flips only the highest bit of a pixel.
         return np.asarray(native.view(unsigned) ^ unsigned(offset))
     return np.asarray(zero + scale * native.astype(np.float64))
 
@@ -127,13 +127,13 @@ EXTRA = "pip install 'knightcube-flight[images]'"
 PHOTOMETRIC_INTERPRETATION, WHITE_IS_ZERO = 262, 0
 """The TIFF tag PhotometricInterpretation and its value WhiteIsZero (TIFF 6.0, section 8)."""
 GREY_MODES = {"L": np.uint8, "1": np.uint8, "I;16": np.uint16, "I;16L": np.uint16, "I;16B": np.uint16}
-"""NumPy types of grey images by Pillow's mode."""
+"""NumPy types of grey images by the name of their Pillow mode."""
 COLOUR_MODES = ("LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
 
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in the luminance (ITU-R BT.601)."""
 _NATIVE_SWAPPED = "B" if sys.byteorder == "little" else "L"
-# Pillow keeps the high byte of 16-bit colour. If the byte order is swapped, Pillow keeps the low byte.
+# Pillow keeps only the high byte of 16-bit colour values, or the low byte if the byte order is swapped.
 _OTHER_BYTES = {
     f"{colour};16{order}": f"{colour};16{other}"
     for colour in ("RGB", "RGBA", "RGBX")
@@ -162,8 +162,8 @@ def read_image(path: Path) -> Image:
 def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
     """Return the image (rows, columns) of a file of raw pixels, of 8 bits or of 16 bits little-endian.
 
-    The pixels are stored row by row at the end of the file. Any header before the pixels is skipped.
-    Raises UsageError if the file is missing or too short.
+    In the file, the pixels are stored row by row at the end. Any header before the pixels is skipped. Raises
+    UsageError if the file is missing or too short.
     """
     kind = np.dtype("<u2") if bits == 16 else np.dtype("u1")
     try:
@@ -245,18 +245,18 @@ def _check_kept(path: Path, picture: Picture) -> None:
 
 
 def _raw_mode(args: object) -> str:
-    """Return the raw mode of a Pillow tile, which is the first argument of the tile's decoder."""
+    """Return the raw mode of a Pillow image tile, which is the first argument of the tile's decoder."""
     return str(args[0]) if isinstance(args, tuple) and args else str(args)
 
 
 def _is_deep(picture: Picture) -> bool:
-    """Return whether an image has 16-bit colours, which Pillow reduces to their high bytes."""
+    """Return whether an image has 16-bit colour values, of which Pillow keeps only the high bytes."""
     modes = {_raw_mode(tile[3]) for tile in getattr(picture, "tile", ())}
     return len(modes) == 1 and modes <= _OTHER_BYTES.keys()
 
 
 def _low_bytes(args: Any) -> Any:
-    """Return the decoder's arguments with the byte order swapped, so that Pillow keeps the low bytes."""
+    """Return the arguments of a Pillow decoder with swapped byte order, which makes it keep the low bytes."""
     other = _OTHER_BYTES[_raw_mode(args)]
     return (other, *args[1:]) if isinstance(args, tuple) else other
 
@@ -273,13 +273,13 @@ def _luminance(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.uint16]:
 def _grey(path: Path, picture: Picture) -> Image:
     mode = picture.mode
     if mode in COLOUR_MODES:
-        # Pillow converts some colour modes to grey only through RGB. Transparency is dropped.
+        # Pillow converts some colour modes to grey only through RGB, which drops transparency.
         return np.asarray(picture.convert("RGB").convert("L"))
     if mode in GREY_MODES:
         grey = picture.convert("L") if mode == "1" else picture
         return np.asarray(grey).astype(GREY_MODES[mode])
     if mode == "I":
-        # Mode I has 32-bit integers, but their values often fit into 16 bits.
+        # Pixels of Pillow mode I are 32-bit integers, but their values often fit into 16 bits.
         pixels = np.asarray(picture)
         if pixels.min() >= 0 and pixels.max() <= np.iinfo(np.uint16).max:
             return pixels.astype(np.uint16)
@@ -292,7 +292,7 @@ KEPT_FRAMES_FOLDER = "frames"
 
 @dataclass(frozen=True, slots=True)
 class KeptFrames:
-    """Where the vision worker keeps frames on disk.
+    """Folder and limits of the frames that the vision worker keeps on disk.
 
     Attributes:
         folder: folder of the kept frames.
@@ -308,8 +308,8 @@ class KeptFrames:
 def keep_frame(kept: KeptFrames, pixels: Image, facts: dict[str, Any]) -> None:
     """Write a frame (rows, columns) with its metadata (`facts`) to disk.
 
-    If the number of kept frames then exceeds the maximum, the oldest frames are deleted. If the disk fails,
-    the frame is lost and no exception is raised.
+    If the number of kept frames then exceeds the maximum, the oldest frames are deleted. If the frame cannot
+    be written, it is lost and no exception is raised.
     """
     with suppress(OSError):
         kept.folder.mkdir(exist_ok=True)
@@ -321,7 +321,7 @@ def keep_frame(kept: KeptFrames, pixels: Image, facts: dict[str, Any]) -> None:
 
 
 def portable_grey_map(pixels: Image, facts: dict[str, Any]) -> bytes:
-    """Return the bytes of a PGM file of 8-bit or 16-bit counts, with the metadata `facts` as a comment."""
+    """Return the bytes of a PGM file with 8-bit or 16-bit counts and the metadata `facts` as a comment."""
     deep = pixels.dtype.itemsize > 1
     rows, columns = pixels.shape
     text = json.dumps(facts)
@@ -330,7 +330,10 @@ def portable_grey_map(pixels: Image, facts: dict[str, Any]) -> bytes:
 
 
 def facts_of(data: bytes) -> dict[str, Any]:
-    """Return the metadata in the bytes of a kept frame. Raises ValueError if `data` is not a kept frame."""
+    """Return the metadata that the bytes of a kept frame contain.
+
+    Raises ValueError if `data` is not a kept frame.
+    """
     head, _, rest = data.partition(b"\n# ")
     if head != b"P5":
         raise ValueError("no kept frame")

@@ -1,15 +1,15 @@
-"""Camera models: the pinhole, the lens with radial distortion, the mounted camera, and their uncertainty.
+"""Camera models: pinhole, lens with radial distortion, mounted camera, and the uncertainties of a camera.
 
-Camera frame: boresight +z, x along columns to the right, y along rows down; pixel (0, 0) is the centre of
-the top-left pixel. The pinhole camera follows Sease, eq. (2.1) to (2.4), except that stars
-behind the camera are dropped and pixel coordinates start at 0.
+In the camera frame, the boresight is +z, x points right along the rows and y down along the columns; pixel
+(0, 0) is the centre of the top-left pixel. The pinhole camera follows Sease, eq. (2.1) to (2.4), except that
+stars behind the camera are dropped and pixel coordinates start at 0.
 
 The lens maps a direction with tangents u = (x/z, y/z) to the pixel f u (1 + k1 |u|^2 + k2 |u|^4) + centre
-(Brown 1966, radial terms). Beyond the tangent at which the distorted radius stops growing, the distortion
-polynomial folds back on itself. A `Lens` images no direction beyond this fold, and raises LensError if the
-fold lies within the detector.
+(Brown 1966, radial terms). Beyond the field angle at which the distorted radius stops growing, the distortion
+polynomial folds back on itself. A `Lens` images no direction beyond the fold of its distortion, and raises
+LensError if the fold lies within the detector.
 
-`Exposures` gives the exposure at which streaks are long enough for an accurate rate.
+The class `Exposures` gives the exposure at which streaks are long enough for an accurate rate.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Pinhole:
 
     @property
     def ideal(self) -> Pinhole:
-        """The same pinhole camera, which already has no distortion."""
+        """The pinhole camera itself, because it has no distortion."""
         return self
 
     def rescaled(self, factor: float) -> Pinhole:
@@ -69,7 +69,7 @@ class Pinhole:
         return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Return which pixels (n, 2) lie on the detector, widened by `margin` px; False for NaN."""
+        """Return which pixel positions (n, 2) lie on the detector, widened by `margin` px; False for NaN."""
         x, y = points[..., 0], points[..., 1]
         inside_x = (x >= -0.5 - margin) & (x <= self.columns - 0.5 + margin)
         inside_y = (y >= -0.5 - margin) & (y <= self.rows - 0.5 + margin)
@@ -82,13 +82,13 @@ class Pinhole:
 
 
 _MOST_STEPS, _LAST_STEP = 60, 1e-8
-"""Maximum number of Newton steps, and the step (in tangent) below which the iteration ends."""
+"""Maximum number of Newton steps that invert the distortion, and step (tangent) that ends the iteration."""
 _NO_FOLD = 1e-12
-"""Minimum denominator in the formula of the distortion's fold; folds at tangents above 1e6 are ignored."""
+"""Minimum denominator in the formula for the distortion's fold; folds at tangents above 1e6 are ignored."""
 
 
 class LensError(FlightError):
-    """Raised for a lens whose size is not positive or whose distortion cannot be inverted."""
+    """Error raised for a lens whose size is not positive or whose distortion cannot be inverted."""
 
 
 class CameraModel(Protocol):
@@ -128,7 +128,7 @@ class CameraModel(Protocol):
         """Return unit vectors (n, 3) in the camera frame of pixels (n, 2)."""
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Return which pixels (n, 2) lie on the detector, widened by `margin` px."""
+        """Return which pixel positions (n, 2) lie on the detector, widened by `margin` px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,8 @@ class Lens:
         focal_length: focal length on the axis, px.
         centre: pixel (x, y) of the optical axis.
         k1, k2: radial distortion coefficients of the second and the fourth power of the undistorted tangent.
-        reach: largest undistorted tangent that is imaged; infinite if the distortion never folds back.
+        reach: largest undistorted tangent of the field angle that is imaged; infinite if the distortion never
+            folds back.
 
     Raises:
         LensError: if the distortion cannot be inverted over the whole detector.
@@ -220,7 +221,7 @@ class Lens:
         return np.asarray(v / np.sqrt(1.0 + square))
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Return which pixels (n, 2) lie on the detector, widened by `margin` px; False for NaN."""
+        """Return which pixel positions (n, 2) lie on the detector, widened by `margin` px; False for NaN."""
         return Pinhole(self.columns, self.rows, self.focal_length).contains(points, margin)
 
     @property
@@ -233,22 +234,22 @@ class Lens:
         return np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
 
     def _limit(self) -> float:
-        """Return the distorted tangent that corresponds to the undistorted tangent `reach`."""
+        """Return the distorted tangent of the field angle whose undistorted tangent is `reach`."""
         square = self.reach**2
         return self.reach * (1.0 + square * (self.k1 + square * self.k2)) if square < np.inf else np.inf
 
     def _undistorted(self, stretched: FloatArray) -> FloatArray:
-        """Return the undistorted tangents of distorted tangents (...), or NaN beyond the distortion's fold.
+        """Return undistorted tangents of the field angles of distorted tangents (...), NaN beyond the fold.
 
         Newton's method starts at the distorted tangent, or at the inflection point of the distortion curve if
-        that is nearer to the axis. From this start Newton's method passes the root at most once and then
+        that is nearer to the axis. From there, Newton's method passes the root at most once and then
         converges from one side.
         """
         k1, k2 = self.k1, self.k2
         if k1 == k2 == 0.0:
             return stretched
         seen = stretched < self._limit()
-        # NaN is replaced by 0, because a NaN would keep the iteration from converging.
+        # A NaN is replaced by 0, because it would keep the iteration from converging.
         target = np.where(seen, stretched, 0.0)
         inflection = np.sqrt(-0.3 * k1 / k2) if k1 * k2 < 0.0 else np.inf
         radius = np.minimum(target, inflection)
@@ -265,7 +266,7 @@ class Lens:
 
 
 def _reach(k1: float, k2: float) -> float:
-    """Return the smallest tangent r at which the distorted radius stops growing.
+    """Return the smallest tangent r of the field angle at which the distorted radius stops growing.
 
     The tangent r is the smallest positive root of 1 + 3 k1 r^2 + 5 k2 r^4 = 0, or infinite if none exists.
     """
@@ -317,7 +318,7 @@ class MountedCamera:
 
 
 UNSTATED = 30e-6
-"""Standard deviation (s) of an unknown line time of a rolling shutter (30 ms for 1,000 rows is common)."""
+"""Standard deviation (s) of an unknown line time of a rolling shutter; rows of one image often span 30 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,8 +332,8 @@ class CameraKnowledge:
         centre: standard deviation of the optical axis along x and along y, px.
         distortion: standard deviation of the distortion at an image corner, relative to the corner's distance
             from the image centre.
-        line_time: standard deviation of the delay between the exposures of successive rows, s. None means 0
-            if the camera's delay is stated, otherwise `UNSTATED`.
+        line_time: standard deviation of the delay between the exposures of successive rows, s. A `line_time`
+            of None means 0 if the camera's line time is stated, otherwise `UNSTATED`.
     """
 
     focal_length: float = 0.0
@@ -348,7 +349,7 @@ EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)
 _STREAK = 20.0
 """Desired streak length (px): rates are inaccurate below 5 px, and faint stars are lost above 100 px."""
 _POINT = 1.0
-"""Motion (px) during the usual exposure below which a star counts as a point."""
+"""Motion (px) of a star during the usual exposure below which it counts as a point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,7 +359,7 @@ class Exposures:
     Attributes:
         usual: exposure used while stars appear as points, s.
         least, most: shortest and longest exposure used while stars appear as streaks, s.
-        scale: image scale, px/rad.
+        scale: image scale at the boresight, px/rad.
     """
 
     usual: float

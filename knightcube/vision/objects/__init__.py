@@ -1,6 +1,6 @@
 """Detection of resident space objects in images of stars (Sease, chapter 4).
 
-`detect` finds objects among the streaks of an image by their motion, and tests with `star_light` whether
-stars explain the pixels. `streak_ends` measures the two ends of streaks. `measure` gives the directions of
-possible objects in images whose stars are streaks or points.
+`detect` finds objects among the streaks of an image by their motion, and `star_light` tests whether stars
+alone explain the pixels. `streak_ends` segments a frame into bright regions and measures the two ends of
+streaks. `measure` gives the directions of possible objects in images whose stars are streaks or points.
 """

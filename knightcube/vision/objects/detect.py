@@ -3,23 +3,23 @@
     found = detect_objects(image, camera, rate, exposure)
 
 In camera axes, all stars rotate about the same axis by the same angle. Three indicators show that a streak is
-not a star: the bisector of its chord misses the common centre of rotation, the streak subtends a different
-angle at this centre, or its residual in the Optimal Linear Attitude Estimator (OLAE) is large (Sease, eq.
-(4.11) to (4.15), with corrections). If the rotation axis is nearly normal to the boresight, the centre
-recedes to infinity, and the chord's slope and length are used instead of centre and angle. In a wide field,
-the pinhole projection changes slopes and lengths by far more than their errors. Each indicator is therefore
-compared with that of a star at the same position, in units of the expected error of an endpoint. The rule of
-Sease, a threshold of 2.5 standard deviations over the streaks (text at Table 4.4), is used together with a
-minimum threshold for each indicator, which was measured in images without objects.
+not that of a star: the perpendicular bisector of its chord misses the common centre of rotation, the streak
+subtends a different angle at this centre, or its residual in the Optimal Linear Attitude Estimator (OLAE) is
+large (Sease, eq. (4.11) to (4.15), with corrections). If the rotation axis is nearly normal to the boresight,
+the centre recedes to infinity, and the chord's slope and length are used instead of centre and angle. In a
+wide field, the pinhole projection changes slopes and lengths by far more than their errors. Each indicator is
+therefore compared with the indicator of a star at the same position, in units of the expected error of an
+endpoint. An indicator must exceed 2.5 standard deviations over the streaks of the image (Sease, text at Table
+4.4), and also a minimum threshold, which was measured in images without objects.
 
-A streak with a large indicator may also be two stars whose streaks overlap, or a segment of a faint star's
-streak ("overlapping streak" in Sease, Table 4.4). `Judge` therefore tests whether stars explain the pixels
-(`star_light`). Regions with more than two corners, which Sease discards, may be stars or an object that
-crosses a star. Bright points in an image whose stars are streaks are objects that the camera tracks (Sease,
-Figure 4.5). Saturated regions, regions with large indicators, and regions that merge objects and stars are
-searched after their stars are removed. The search needs only the rotation of the camera during the exposure.
-The maximum-likelihood estimate of the rotation from the streaks is more accurate than an estimate from the
-corners, and succeeds in more images.
+A streak with a large indicator may also be the overlapping streaks of two stars, or a segment of a faint
+star's streak ("overlapping streak" in Sease, Table 4.4). The class `Judge` therefore tests whether stars
+alone explain the pixels (`star_light`). Regions with more than two corners (peaks of the corner detector),
+which Sease discards, may be stars or an object that crosses a star. Bright points in an image whose stars are
+streaks are objects that the camera tracks (Sease, Figure 4.5). Saturated regions, regions with large
+indicators, and regions in which objects and stars merge are searched again after their stars are removed. The
+search needs only the rotation of the camera during the exposure. The maximum-likelihood estimate of the
+rotation from the streaks is more accurate than an estimate from the streak ends, and succeeds in more images.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ from knightcube.vision.objects.streak_ends import (
 )
 
 INDICATORS = ("centre", "displacement", "residual")
-"""Names of the three indicators that a streak is not a star."""
+"""Names of the three indicators that show that a streak is not a star."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +67,12 @@ class Indicators:
 
     Attributes:
         endpoints: ends of the streaks (n, 2, 2), px, in the order in which a star would have passed them.
-        deviations: differences of the indicators from those of a star at the same position (n, 3), in
+        deviations: differences of the three indicators from those of a star at the same position (n, 3), in
             standard deviations.
-        fired: which indicators exceed their thresholds (n, 3).
+        fired: which of the three indicators of each streak exceed their thresholds (n, 3).
         centre: centre of rotation in the image by least squares (2,), px; meaningless if `degenerate`.
-        degenerate: whether slope and length of the chords are used instead of centre and angle.
+        degenerate: whether slope and length of the chords are used instead of the centre of rotation and the
+            angle.
     """
 
     endpoints: FloatArray
@@ -82,7 +83,7 @@ class Indicators:
 
 
 def centre_residuals(endpoints: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return the distances (n,), px, of a centre (2,) from the bisectors of chords (n, 2, 2), px.
+    """Return distances (n,), px, of a rotation centre (2,) from the bisectors of chords (n, 2, 2), px.
 
     Source: Sease, eq. (4.11) to (4.13).
     """
@@ -92,13 +93,13 @@ def centre_residuals(endpoints: FloatArray, centre: FloatArray) -> FloatArray:
 
 
 def slopes(endpoints: FloatArray) -> FloatArray:
-    """Return the directions (n,), rad, of chords (n, 2, 2), px, in the image."""
+    """Return the angles (n,), rad, between the image's x axis and the chords (n, 2, 2), px, of streaks."""
     chord = endpoints[:, 1] - endpoints[:, 0]
     return np.asarray(np.arctan2(chord[:, 1], chord[:, 0]))
 
 
 def angular_displacements(endpoints: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return the angles (n,), rad, that streaks (n, 2, 2) subtend at a centre (2,) (Sease, eq. (4.14))."""
+    """Return angles (n,), rad, that streaks (n, 2, 2) subtend at a centre (2,) (Sease, eq. (4.14))."""
     first, second = endpoints[:, 0] - centre, endpoints[:, 1] - centre
     cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     # The arc tangent is used, because the arc cosine is inaccurate for small angles.
@@ -106,15 +107,15 @@ def angular_displacements(endpoints: FloatArray, centre: FloatArray) -> FloatArr
 
 
 def lengths(endpoints: FloatArray) -> FloatArray:
-    """Return the lengths (n,), px, of chords (n, 2, 2), px (Sease, eq. (4.15))."""
+    """Return the lengths (n,), px, of the chords (n, 2, 2), px, of streaks (Sease, eq. (4.15))."""
     return np.asarray(np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=-1))
 
 
 def olae_residuals(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     """Return the norms (n,) of the OLAE residuals of streaks (Sease, eq. (4.7)).
 
-    The streaks are given by the unit vectors to their first and last ends (n, 2, 3), and `rotation` (3,),
-    rad, is the camera's rotation vector.
+    The arguments are the unit vectors to the first and last end of each streak (n, 2, 3), and the camera's
+    rotation vector `rotation` (3,), rad.
     """
     angle = float(np.linalg.norm(rotation))
     scale = np.tan(0.5 * angle) / angle if angle > 0.0 else 0.5
@@ -123,10 +124,10 @@ def olae_residuals(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the first and last directions (n, 2, 3) of stars with the same chord midpoints as `vectors`.
+    """Return the start and end directions (n, 2, 3) of stars whose chords have the midpoints of `vectors`.
 
-    A star moves on a circle about the rotation axis. The midpoint of the star's chord is nearer to the axis
-    than the star, by a factor of the cosine of half the rotation angle.
+    A star moves on a circle about the rotation axis. The midpoint of the star's chord is nearer to the
+    rotation axis than the star, by a factor of the cosine of half the rotation angle.
     """
     angle = float(np.linalg.norm(rotation))
     middle = vectors.mean(axis=1)
@@ -139,8 +140,8 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     return np.stack([middle @ half.T for half in halves], axis=1)
 
 
-# Distance of the rotation centre from the boresight, in focal lengths, beyond which the centre is not used.
-# The rotation axis gives this distance, because errors make a least-squares centre appear too near.
+# Distance of the rotation centre from the boresight, in focal lengths, above which the centre is not used.
+# This distance is computed from the rotation axis, because errors move a least-squares centre nearer.
 _FARTHEST_CENTRE = 3.0
 
 
@@ -159,8 +160,9 @@ def evaluate(
         sigma: expected standard deviation of the endpoints of each streak (n,), px.
         rotation: rotation of the camera during the exposure (3,), rad, camera axes.
         pinhole: camera that took the image.
-        bounds: minimum thresholds of the three indicators, in expected standard deviations.
-        strict: threshold of the indicators in robust standard deviations over the streaks of the image.
+        bounds: minimum threshold of each of the three indicators, in expected standard deviations.
+        strict: additional threshold of the indicators, in robust standard deviations over the streaks of the
+            image.
     """
     vectors = pinhole.unit_vectors(endpoints)
     stars = star_ends(vectors, rotation)
@@ -175,7 +177,7 @@ def evaluate(
     normal_to_boresight = float(np.hypot(rotation[0], rotation[1])) > _FARTHEST_CENTRE * abs(rotation[2])
     degenerate = normal_to_boresight or not np.all(np.isfinite(centre))
     length = lengths(endpoints)
-    # The differences from a star are displacements (px) of one end across and along the streak.
+    # Each difference from a star is expressed as a displacement (px) of one end across or along the streak.
     if degenerate:
         across = np.sin(slopes(endpoints) - slopes(expected)) * length
         along = length - lengths(expected)
@@ -188,7 +190,7 @@ def evaluate(
     fired = np.zeros((0, 3), dtype=np.bool_)
     if len(deviations):
         # The median absolute deviation is used, because an object itself increases the standard deviation.
-        # The largest of ten values can never exceed 2.85 standard deviations of the ten values.
+        # For example, the largest of ten values never exceeds 2.85 standard deviations of the ten values.
         spread = MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0)
         fired = np.abs(deviations) > np.maximum(bounds, strict * spread)
     return Indicators(endpoints, deviations, fired, centre, degenerate)
@@ -207,9 +209,9 @@ def short_regions(
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return bright regions that are shorter than the streak of a star at the same position.
 
-    The result is the ends of the regions (n, 2, 2), px, their standard deviations (n,), px, and the labels of
-    the regions (n,). The ends are those of the uniform line with the same moments as the region's bright
-    part. Both ends of a point are equal.
+    The three returned arrays are the ends of the regions (n, 2, 2), px, the standard deviations of the ends
+    (n,), px, and the labels of the regions (n,). The ends of a region are those of the uniform line with the
+    same moments as the region's bright part. For a point, both ends are equal.
     """
     regions = segmented.regions
     noise = segmented.background.typical_noise
@@ -236,7 +238,7 @@ def short_regions(
     ends = np.array(lines).reshape(-1, 2, 2)
     sigma = np.hypot(1.0, expected_sigma(short, segmented.background, settings))
     expected = pinhole.project(star_ends(pinhole.unit_vectors(ends), rotation))
-    # Near the axis of rotation, stars are also points, so regions there are excluded.
+    # Near the axis of rotation, stars are also points, so that regions near the axis are excluded.
     streaked: BoolArray = np.linalg.norm(expected[:, 1] - expected[:, 0], axis=-1) >= settings.least_length
     return ends[streaked], sigma[streaked], short.label[streaked]
 
@@ -245,7 +247,7 @@ class Verdict(Enum):
     """Classification of a streak or region.
 
     STAR means that the indicators agree with a star, STARS that stars explain the pixels, OBJECT that an
-    object is present, and UNCLEAR that neither stars nor an object explain the pixels.
+    object is present, and UNCLEAR that neither stars nor an object explains the pixels.
     """
 
     STAR = "star"
@@ -259,15 +261,16 @@ class SpaceObject:
     """A streak or point that does not move as the stars do.
 
     Attributes:
-        endpoints: ends of the object's streak (2, 2), px, in the order for which the motion relative to the
-            stars is slower.
-        fired: names of the indicators that exceed their thresholds; empty if only the pixels show the object.
+        endpoints: ends of the object's streak (2, 2), px, in the order in time for which the motion relative
+            to the stars is slower.
+        fired: names of the indicators that exceed their thresholds; empty if the object was found by its
+            pixels only.
         flux: flux of the object, counts.
-        improvement: decrease of chi-square if the object is added to the stars.
+        improvement: decrease of chi-square when the object is added to a model of stars.
         relative_rate: angular rate of the object relative to the stars, rad/s.
         direction: direction of the motion relative to the stars, a unit vector (x, y) in the image.
-        other_relative_rate: angular rate relative to the stars for the reverse order of the ends, rad/s; one
-            image does not show the order.
+        other_relative_rate: angular rate of the object relative to the stars if the ends were passed in
+            reverse order, rad/s; one image does not show the order.
     """
 
     endpoints: FloatArray
@@ -284,9 +287,9 @@ class ObjectReport:
     """The examined streaks of an image and the objects among them.
 
     Attributes:
-        indicators: indicators of the streaks with two ends, followed by those of the short regions.
-        verdicts: classification of each streak with two ends, followed by those of the short regions.
-        crowded: classification of each region with more than two corners.
+        indicators: indicators of the streaks with two ends, followed by the indicators of the short regions.
+        verdicts: classification of each streak with two ends, followed by that of each short region.
+        crowded: classification of each region in which the corner detector found more than two corners.
         objects: the objects found, the brightest first.
         rotation: rotation of the camera that the search assumed (3,), rad, camera axes.
     """
@@ -298,24 +301,24 @@ class ObjectReport:
     rotation: FloatArray
 
 
-# Distance (px) below which two corners count as the same corner, found twice.
+# Distance (px) between two corners of a region below which they count as the same corner.
 _LEAST_CROSSING_PX = 10.0
-# Distance (px) of fitted ends from the predicted ends of a star below which they count as a star.
+# Distance (px) of a fitted streak's ends from the predicted ends of a star below which it counts as a star.
 _FITTED_PX = 1.0
-# Minimum distance (px) of a region from the border of the image for its ends to be inside the image.
+# Minimum distance (px) from the image border at which the ends of a region count as inside the image.
 _BORDER_PX = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Judge:
-    """Distinguishes objects from stars by their pixels.
+    """Classifies streaks and regions of a frame as stars or objects by their pixels.
 
     Attributes:
         segmented: segmented frame.
         rotation: rotation of the camera during the exposure (3,), rad, camera axes.
         pinhole: camera that took the frame.
         exposure: exposure time, s.
-        settings: settings of the segmentation and of the ends of streaks.
+        settings: settings of the segmentation of the frame and of the measurement of streak ends.
         objects: thresholds of the search for objects.
     """
 
@@ -329,7 +332,7 @@ class Judge:
     def streak(self, ends: FloatArray, fired: tuple[str, ...]) -> tuple[Verdict, SpaceObject | None]:
         """Classify a streak or point; `fired` names the indicators that exceed their thresholds.
 
-        The second value of the result is the object, or None if the streak is not an object.
+        The second returned value is the object, or None if the streak is not an object.
         """
         if not fired:
             return Verdict.STAR, None
@@ -351,7 +354,7 @@ class Judge:
         lines = extend(pairs, chord_outward(pairs), self.settings.endpoint_bias) if len(pairs) else pairs
         try:
             light = self._light(corners)
-            # Adding a line cannot reduce chi-square to much less than the number of pixels.
+            # An additional line cannot reduce chi-square to much less than the number of pixels.
             hopeless = light.chi_square - light.pixels < self.objects.improvement
             tried = [] if hopeless else [(ends, light.explain(ends)) for ends in lines]
         except FlightError:
@@ -367,8 +370,8 @@ class Judge:
     def merged(self, settled: IntArray, strange: IntArray) -> list[SpaceObject]:
         """Return the objects in regions in which objects and stars may be merged.
 
-        The stars of each region are removed, and the brightest remainder is tested. Regions with a label in
-        `settled` are not examined. Regions with a label in `strange` are examined first.
+        The light of the stars in each region is subtracted, and the brightest remainder is tested. Regions
+        whose label is in `settled` are not examined. Regions whose label is in `strange` are examined first.
         """
         regions = self.segmented.regions
         noise = self.segmented.background.typical_noise
@@ -401,7 +404,7 @@ class Judge:
     def _remaining_object(self, ends: FloatArray | None, stars: Sequence[FloatArray]) -> SpaceObject | None:
         """Return the object between `ends` (2, 2), px, or None if stars explain the pixels.
 
-        `stars` holds the paths of known stars nearby.
+        The argument `stars` holds the paths (m, 2), px, of known stars nearby.
         """
         if ends is None or self._moves_like_a_star(ends, _FITTED_PX):
             return None
@@ -438,7 +441,7 @@ class Judge:
         return Verdict.STARS if light.chi_square <= self.objects.worst_fit * light.pixels else Verdict.UNCLEAR
 
     def _moves_like_a_star(self, ends: FloatArray, within: float = 2.0) -> bool:
-        """Return whether ends (2, 2), px, lie within `within` px of the predicted ends of a star."""
+        """Return whether streak ends (2, 2), px, lie within `within` px of the predicted ends of a star."""
         star = self.pinhole.project(star_ends(self.pinhole.unit_vectors(ends[None]), self.rotation))[0]
         missed = min(np.abs(star - ends).max(), np.abs(star[::-1] - ends).max())
         return bool(missed < within)
@@ -446,7 +449,7 @@ class Judge:
     def _candidate(
         self, ends: FloatArray, fired: tuple[str, ...], light: StarLight, found: Explanation
     ) -> SpaceObject:
-        """Return the object between `ends`, ordered so that its motion relative to the stars is slower."""
+        """Return the object between `ends`, in the order that makes its motion relative to stars slower."""
         rate, direction = self._among_stars(ends)
         other, other_direction = self._among_stars(ends[::-1])
         if other < rate:
@@ -457,8 +460,9 @@ class Judge:
     def _among_stars(self, ends: FloatArray) -> tuple[float, FloatArray]:
         """Return the rate, rad/s, and the image direction (2,) of a motion relative to the stars.
 
-        The motion leads from the first of the `ends` to the second. Both ends are rotated to mid-exposure as
-        if they were stars; the remaining difference is the motion relative to the stars.
+        The object moves from the first of the `ends` (2, 2), px, to the second. Both ends are rotated to
+        mid-exposure as if they belonged to stars; the remaining difference is the motion relative to the
+        stars.
         """
         middle = at_mid_exposure(self.pinhole.unit_vectors(ends), self.rotation)
         angle = np.arctan2(np.linalg.norm(np.cross(middle[0], middle[1])), middle[0] @ middle[1])
@@ -466,7 +470,7 @@ class Judge:
         return float(angle) / self.exposure, np.asarray(step / max(float(np.linalg.norm(step)), 1e-9))
 
 
-# Indicator of a streak, in standard deviations, above which its region is searched for merged objects.
+# Indicator of a streak (standard deviations) above which its region is searched for merged objects.
 _STRANGE = 5.0
 
 
@@ -481,7 +485,7 @@ def detect(
     """Search an image (rows, columns) for objects and return a report, or None if it has too few streaks.
 
     The camera rotates by `rotation` (3,), rad, during the `exposure`, s. If the sign of the rotation is
-    unknown, all directions of motion may be reversed together.
+    unknown, the directions of motion of all objects may be reversed together.
     """
     segmented = segment_frame(pixels, replace(settings, most_streaks=objects.most_streaks))
     streaks = measure_streaks(segmented, settings)
@@ -503,9 +507,9 @@ def detect(
 
 
 def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Streaks) -> ObjectReport:
-    """Classify all streaks and crowded regions of an image, and return the report.
+    """Return the report on an image after classification of all streaks and crowded regions.
 
-    `labels` (n,) holds the region labels of the streaks in `indicators`.
+    The labels `labels` (n,) are those of the regions of the streaks in `indicators`.
     """
     found: list[SpaceObject] = []
     settled: list[int] = []
@@ -536,7 +540,7 @@ class DetectedObjects:
     Attributes:
         objects: the n objects, the brightest first.
         directions: unit vectors to the objects at mid-exposure (n, 3), camera axes.
-        covariance: covariances of the directions (n, 3, 3), rad^2, zero along each direction.
+        covariance: covariances of the directions (n, 3, 3), rad^2, with no variance along each direction.
         reason: why the image could not be searched; empty if it was searched.
     """
 
@@ -564,15 +568,16 @@ def detect_objects(
         camera: camera model of the image, a `Pinhole` or `Lens` of `knightcube.vision.camera.lens`. The
             search neglects the distortion of a lens.
         rate: angular velocity of the camera relative to inertial space (3,), camera axes, rad/s, for instance
-            from the streaks of the image. If the sign of the rate is unknown, all motions of objects may be
-            reversed together.
+            from the streaks of the image. If the sign of the rate is unknown, the motions of all objects may
+            be reversed together.
         exposure: exposure time, s.
         settings: thresholds, gain and saturation, or None for the defaults.
 
     Raises:
         ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
 
-    Source: Sease 2013, chapter 4, as corrected in the errata. The tests of the pixels are not from Sease.
+    Source: Sease 2013, chapter 4, as corrected in the errata. The test whether stars explain the pixels is
+    not from Sease.
     """
     settings = ObjectSettings() if settings is None else settings
     check_image(image, camera)
@@ -582,7 +587,7 @@ def detect_objects(
     objects = () if report is None else report.objects
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
-    # A pixel subtends the largest angle on the boresight; this angle is used for all directions.
+    # A pixel subtends the largest angle on the boresight, and this angle is used for all directions.
     sigma = settings.streak_sigma / camera.focal_length
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     reason = f"fewer than {ends.least_streaks} significant streaks" if report is None else ""

@@ -1,16 +1,16 @@
 """Directions of possible objects in an image whose attitude is determined from the stars.
 
 If the stars are streaks, `detect` finds objects by their motion and their pixels. If the stars are points, an
-object is also a point or a short streak. In this case, a possible object is an area of light that is
-significantly brighter than the noise and not at the position of a catalogue star, or light beside a star that
-the star does not explain. One image does not show which of the possible objects move relative to the stars;
-tracks over several images show this.
+object is also a point or a short streak. If the stars are points, a possible object is an area of light that
+is significantly brighter than the noise and not at the position of a catalogue star, or light beside a star
+that the star does not explain. A single image does not show which possible objects move relative to the
+stars; only tracks over several images show this.
 
 The pixels of each object are fitted together with the known stars nearby. An object is modelled as a short
 trail of constant brightness, blurred by the camera's point spread function (PSF). A Gauss-Newton iteration
 fits the position, extent and brightness of the object, the sky level and the brightness of each star,
 weighted by the noise of the modelled light. Saturated pixels are excluded, because they would displace a
-centroid by 0.03 px. The covariance of the fit is increased if the residuals exceed the noise.
+centroid by 0.03 px. The covariance of a fit is increased if the residuals exceed the noise.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from knightcube.vision.startracker.solve import FrameSolution
 from knightcube.vision.streaks.streak_result import MotionResult
 
 _REACH = 5.0
-"""Margin of a patch beyond the ends of the object, in standard deviations of the PSF."""
+"""Margin of the fitted patch of pixels beyond the ends of an object, in standard deviations of the PSF."""
 _STEP_PX = 0.7
 """Distance (px) between the points that model a trail."""
 _ROUNDS, _CONVERGED = 12, 1e-4
-"""Maximum number of Gauss-Newton steps, and the step (px) below which the iteration ends."""
+"""Maximum number of Gauss-Newton steps of the fit, and step (px) below which the iteration ends."""
 _EXTENT = 2.0
-"""Prior standard deviation (px) of an object's half extent, about its initial guess."""
+"""Prior standard deviation (px) of the difference between an object's half extent and its initial guess."""
 STAR_SIGMA = 0.3
 """Relative error of a star's catalogue brightness, due to the different passband of the camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trails:
-    """Straight trails of n stars in an image.
+    """The n straight trails of stars in an image.
 
     Attributes:
-        middle: middles of the trails (n, 2), px.
-        half: vectors from the middle of each trail to its end (n, 2), px.
+        middle: midpoints of the trails (n, 2), px.
+        half: vectors from the midpoint of each trail to its end (n, 2), px.
         flux: flux of each star (n,), counts.
     """
 
@@ -64,10 +64,10 @@ class ObjectPatch:
 
     Attributes:
         light: counts above the sky level (rows, columns).
-        corner: position (x, y) of the first pixel of the patch in the image (2,), px.
+        corner: position (x, y) in the image of the first pixel of the rectangle (2,), px.
         noise: standard deviation of a background pixel, counts.
         gain: electrons per count.
-        usable: which pixels are not saturated (rows, columns).
+        usable: mask of the pixels that are not saturated (rows, columns).
         psf: standard deviation of the PSF, px.
         ceiling: counts above the sky level at which pixels saturate.
     """
@@ -81,7 +81,7 @@ class ObjectPatch:
     ceiling: float
 
     def image(self, middle: FloatArray, half: FloatArray) -> FloatArray:
-        """Return the image (rows, columns) of a trail of one count with a middle and half extent (2,), px."""
+        """Return the image (rows, columns) of a trail of one count with midpoint and half extent (2,), px."""
         rows, columns = self.light.shape
         return spread_over(_trail(middle - self.corner, half)[0], columns, rows, self.psf)
 
@@ -91,7 +91,7 @@ class FittedObject:
     """Position and flux of an object, fitted to its pixels.
 
     Attributes:
-        middle, covariance: middle of the object's trail (2,), px, and its covariance (2, 2), px^2.
+        middle, covariance: midpoint of the object's trail (2,), px, and its covariance (2, 2), px^2.
         flux, flux_sigma: flux of the object and its standard deviation, counts.
         misfit: chi-square of the fit per degree of freedom.
     """
@@ -118,19 +118,19 @@ def _patch_reach(half: FloatArray, psf: float) -> float:
 def _fit_object(
     patch: ObjectPatch, middle: FloatArray, half: FloatArray, flux: float, stars: Trails
 ) -> FittedObject | None:
-    """Return the object fitted to a patch together with known stars, or None if the fit fails.
+    """Return the object fitted to a patch of pixels together with known stars, or None if the fit fails.
 
-    `middle` (2,), px, `half` (2,), px, and `flux`, counts, are the initial guess.
+    The initial guess is given by midpoint `middle` (2,), px, half extent `half` (2,), px, and `flux`, counts.
     """
     images = [patch.image(star, extent) for star, extent in zip(stars.middle, stars.half, strict=True)]
     given = np.maximum(stars.flux, 1e-9)
-    # Each prior is the index of an unknown, its prior value and its standard deviation.
+    # Each prior is a tuple: index of an unknown of the fit, prior value and standard deviation.
     prior = [(2 + k, float(half[k]), _EXTENT) for k in range(2)]
     prior += [(6 + k, float(light), STAR_SIGMA * float(light)) for k, light in enumerate(given)]
     unknowns = np.concatenate([middle, half, [flux, 0.0], given])
     rows, columns = patch.light.shape
     for _ in range(_ROUNDS):
-        # `light` is the modelled image, and `by_unknown` (k, pixels) its derivatives by the unknowns.
+        # The array `light` is the modelled image, and `by_unknown` (k, pixels) its derivatives by k unknowns.
         path, share = _trail(unknowns[:2] - patch.corner, unknowns[2:4])
         both = np.stack([np.ones(len(share)), share])
         shape, *slopes = spread_with_slopes(path, both, columns, rows, patch.psf)
@@ -166,15 +166,15 @@ def _fit_object(
 
 
 _BRIGHTEST = 1.0 + 3.0 * STAR_SIGMA
-"""Largest ratio of the flux attributed to a star to the flux predicted from the catalogue."""
+"""Largest ratio of the fitted flux of a star to the flux predicted from the catalogue."""
 _LEAST_SHARE = 0.15
-"""Minimum flux of an object relative to stars beside it; modelled star images have errors of about 10 %."""
+"""Minimum flux of an object relative to adjacent stars, whose modelled images have errors of about 10 %."""
 _APART = 1.0
 """Minimum distance (px) of an object from the nearest star; a closer object may be a pair of stars."""
 _STEP_TO_SIGMA = 1.4826 / np.sqrt(2.0)
 """Ratio of the noise of a pixel to the median absolute difference between neighbouring pixels."""
 _MISFIT = 3.0
-"""Largest chi-square per degree of freedom of the fit of an object beside a star."""
+"""Largest chi-square per degree of freedom for the fit of an object beside a star."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,8 +182,8 @@ class CatalogueTrails:
     """Trails of n catalogue stars in an image.
 
     Attributes:
-        middle: middles of the trails (n, 2), px.
-        half: vectors from the middle of each trail to its end (n, 2), px.
+        middle: midpoints of the trails (n, 2), px.
+        half: vectors from the midpoint of each trail to its end (n, 2), px.
         magnitude: V magnitudes of the stars (n,).
     """
 
@@ -214,10 +214,10 @@ def _stars_in(sky: SkyMap, epoch: float, shape: tuple[int, ...], rotation: Float
 
 
 class FramePatches:
-    """Fits of possible objects at any position of an image, together with the catalogue stars nearby.
+    """Fits possible objects at given positions of an image, together with the catalogue stars nearby.
 
     Args:
-        seen: survey of the image.
+        seen: survey of the image, with its sky background and bright areas.
         stars: trails of the catalogue stars.
         zero: magnitude of a star with a flux of one count.
         psf: standard deviation of the PSF, px.
@@ -225,7 +225,7 @@ class FramePatches:
 
     def __init__(self, seen: Survey, stars: CatalogueTrails, zero: float, psf: float) -> None:
         self._light, self._sky = seen.pixels, seen.sky
-        # Differences of neighbouring pixels exclude the light of faint stars, which is in the survey's noise.
+        # Differences between neighbouring pixels give the noise without the light of faint stars.
         steps = np.abs(np.diff(seen.pixels[::4].astype(np.float64), axis=1))
         self._noise = max(float(np.median(steps)) * _STEP_TO_SIGMA, 1e-3)
         self._gain, self._ceiling, self._psf = seen.settings.gain or 1.0, seen.areas.ceiling, psf
@@ -234,13 +234,13 @@ class FramePatches:
     def measured(self, point: FloatArray, half: FloatArray, flux: float) -> FittedObject | None:
         """Return the object fitted near `point` (2,), px, or None if the fit fails.
 
-        `half` (2,), px, and `flux`, counts, are the initial guess of half extent and flux.
+        The initial guess is given by half extent `half` (2,), px, and `flux`, counts.
         """
         patch = self._patch(point, _patch_reach(half, self._psf))
         return None if patch is None else _fit_object(patch, point, half, flux, self._near(point, patch))
 
     def beside(self, point: FloatArray, length: float, significance: float) -> FittedObject | None:
-        """Return an object whose light is merged with that of known stars, or None if no object is found.
+        """Return an object whose light is merged with that of known stars, or None if there is none.
 
         The fit of the object starts at the brightest pixel after the stars are subtracted.
 
@@ -274,14 +274,14 @@ class FramePatches:
         return found if distinct else None
 
     def _near(self, point: FloatArray, patch: ObjectPatch) -> Trails:
-        """Return the stars in or near a patch whose flux exceeds three standard deviations of the noise."""
+        """Return the stars in or near a patch of pixels whose flux exceeds three sigma of the noise."""
         trails, reach = self._trails, 0.5 * max(patch.light.shape) + 3.0 * self._psf
         near = np.all(np.abs(trails.middle - point) - np.abs(trails.half) < reach, axis=1)
         near &= trails.flux > 3.0 * patch.noise
         return Trails(trails.middle[near], trails.half[near], trails.flux[near])
 
     def _patch(self, point: FloatArray, reach: float) -> ObjectPatch | None:
-        """Return the patch within `reach` px of a point (2,) along each axis, or None at the image border."""
+        """Return the patch of pixels within `reach` px of a point (2,), or None at the image border."""
         rows, columns = self._light.shape
         x, y = np.rint(point).astype(int)
         size = int(np.ceil(reach))
@@ -297,9 +297,9 @@ class FramePatches:
 
 
 _OFF_PLACE, _TOO_BRIGHT = 0.25, 0.2
-"""Deviations of a star from the catalogue (px and magnitudes) beyond which an object is suspected."""
+"""Differences of a star from its catalogue entry (px and magnitudes) above which an object is suspected."""
 _SAME = 1.0
-"""Distance (px) below which two fits count as the same object."""
+"""Distance (px) between two fitted positions below which they count as the same object."""
 
 
 def measure_objects(
@@ -318,8 +318,8 @@ def measure_objects(
         solution: star tracker solution of the image.
         exposure: exposure time, s.
         epoch: Julian year of the positions of the stars.
-        velocity: velocity of the camera (3,), m/s, which corrects directions for aberration, or None for
-            none.
+        velocity: velocity of the camera (3,), m/s, for the correction of aberration, or None for no
+            correction.
         detection: settings of the survey of the image.
         settings: settings of the measurement of objects.
     """
@@ -366,7 +366,7 @@ def _among_streaks(
     exposure: float,
     settings: ObjectMeasurementSettings,
 ) -> list[tuple[FittedObject, float]]:
-    """Return the objects in an image whose stars are streaks, each with the magnitude of one count."""
+    """Return the objects in an image whose stars are streaks, and the magnitude that one count represents."""
     detection, search = seen.settings, settings.search
     if motion.rate is None:
         return []
@@ -374,7 +374,7 @@ def _among_streaks(
     report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, search)
     if report is None or not report.objects:
         return []
-    # The magnitude of one count comes from the identified streaks; it is NaN if no streak is identified.
+    # The magnitude of one count is computed from the identified streaks, and is NaN if there are none.
     zero = float("nan")
     known = (solution.star >= 0) & (motion.flux > 0.0) if len(motion.flux) == len(solution.star) else None
     if known is not None and np.any(known):
@@ -395,7 +395,7 @@ def _among_streaks(
 def _among_points(
     seen: Survey, stars: CatalogueTrails, settings: ObjectMeasurementSettings
 ) -> list[tuple[FittedObject, float]]:
-    """Return the objects in an image whose stars are points, each with the magnitude of one count."""
+    """Return the objects in an image whose stars are points, and the magnitude that one count represents."""
     areas, noise = seen.areas, float(np.median(seen.sky.noise.values))
     ratio = areas.flux / (noise * np.sqrt(np.maximum(areas.pixels, 1)))
     strong = np.flatnonzero(ratio >= settings.significance)
@@ -405,7 +405,7 @@ def _among_points(
     nearest = away.argmin(axis=1)
     distance = away[np.arange(len(strong)), nearest]
     is_star = distance < settings.clearance + 0.5 * areas.length[strong]
-    # The median is used, because the brightest stars are saturated and the faintest may be pairs.
+    # The median over stars is used, because the brightest stars are saturated and the faintest may be pairs.
     own = is_star & (distance < 1.0)
     if not np.any(own):
         return []
@@ -432,12 +432,12 @@ def _among_points(
 
 
 def _centre(areas: Areas, area: int, ratio: float, settings: ObjectMeasurementSettings) -> FittedObject:
-    """Return an object at the centroid of an area of light whose fit failed."""
+    """Return an object at the centroid of an area of light, for an area whose fit failed."""
     sigma = float(np.sqrt(1.0 + areas.length[area] ** 2 / 12.0)) / max(ratio, 1.0)
     error = np.hypot(settings.centre_sigma, sigma)
     return FittedObject(areas.centre[area], error**2 * np.eye(2), float(areas.flux[area]), 0.0, 1.0)
 
 
 def _faintness(flux: FloatArray) -> FloatArray:
-    """Return 2.5 log10 of counts (n,), the difference between a star's magnitude and that of one count."""
+    """Return 2.5 log10 of counts (n,): the magnitudes by which stars are brighter than one count."""
     return np.asarray(2.5 * np.log10(np.maximum(flux, 1e-9)))

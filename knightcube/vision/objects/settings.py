@@ -15,10 +15,10 @@ class EndpointSettings:
     The defaults suit the camera of the demonstration.
 
     Attributes:
-        threshold_sigmas: threshold of the sum of 3 x 3 pixels, in standard deviations of this sum; 0 selects
-            the image mean as threshold, as Sease does.
+        threshold_sigmas: threshold for the sum of 3 x 3 pixels, in standard deviations of this sum; with 0
+            the threshold is the image mean, as in Sease.
         least_area: minimum number of pixels in a region; a noise peak fills nine pixels of the 3 x 3 sum.
-        most_streaks: maximum number of regions that are measured, strongest first.
+        most_streaks: maximum number of bright regions that are measured, strongest first.
         saturation: counts at which a pixel saturates, or None for the maximum of the integer type.
         gain: electrons per count.
         smoothing_sigma: standard deviation of the Gaussian that smooths the image before the corner detector,
@@ -26,19 +26,19 @@ class EndpointSettings:
         derivative_sigma: standard deviation of the Gaussian derivative, px.
         window_sigma: standard deviation of the Gaussian window of the structure tensor, px.
         harris_k: constant k of the Harris response (Sease, eq. (3.8)).
-        peak_relative: minimum cornerness of an endpoint, relative to the largest cornerness of the streak.
-            The Harris response grows with the fourth power of the brightness, so that 0.005 allows a
-            brightness ratio of 3.8 between the two ends.
+        peak_relative: minimum cornerness (Harris response) of an endpoint, relative to the largest cornerness
+            of the streak. The Harris response grows with the fourth power of the brightness, so that 0.005
+            allows a brightness ratio of 3.8 between the two ends.
         intensity_half_width: half-width of the window of the centre of intensity, px (N in Sease, eq.
             (3.15)).
-        centre_of: image whose centre of intensity locates an endpoint, either the cornerness ("response") or,
+        centre_of: image whose centre of intensity locates an endpoint: the Harris response ("response") or,
             as Sease does, the frame ("image").
         endpoint_bias: outward displacement of the endpoints that compensates the bias of the corner detector,
             px; measured for a point spread function (PSF) of 1 px.
-        endpoint_floor: standard deviation of an endpoint of a bright streak, px.
-        endpoint_noise: increase of the standard deviation of an endpoint, px, per ratio of pixel noise to
-            counts per px of streak length.
-        border: distance from the frame's border within which streaks are rejected, px.
+        endpoint_floor: standard deviation of the position of an endpoint of a bright streak, px.
+        endpoint_noise: increase of the standard deviation of an endpoint, px, per ratio of pixel noise to the
+            streak's counts per px of length.
+        border: distance from the border of the frame within which streaks are rejected, px.
         least_length: minimum median length of the streaks in a frame, px.
         least_streaks: minimum number of streaks in a frame.
     """
@@ -68,25 +68,25 @@ class ObjectSettings:
     """Thresholds and limits of the search for objects among streaks.
 
     Attributes:
-        bounds: thresholds of the indicators centre, displacement and residual, in expected standard
-            deviations; measured in images without an object.
-        strict: additional threshold of the indicators, in standard deviations over the streaks of the image;
-            2.5 as in Sease.
+        bounds: thresholds of the three indicators "centre", "displacement" and "residual", in expected
+            standard deviations, as measured in images without an object.
+        strict: additional threshold of the three indicators, in standard deviations over the streaks of the
+            image; 2.5 as in Sease.
         psf_sigma: standard deviation of the camera's point spread function (PSF), px.
         gain: electrons per count.
         saturation: counts at which a pixel saturates, or None for the maximum of the integer type.
         most_streaks: maximum number of regions that are examined as streaks.
         most_points: maximum number of short regions that are examined as points.
         most_merged: maximum number of regions that are searched again after their stars are removed.
-        least_share: minimum flux of an object found beside stars, as a fraction of the flux of the region. An
-            error of 2 % in the rotation leaves this fraction at the end of a bright star's streak.
-        most_corners: number of corners of a region above which the region is not examined.
+        least_share: minimum flux of an object found beside stars, as a fraction of the flux of the region. A
+            rotation error of 2 % leaves this fraction of the flux of a bright star at the end of its streak.
+        most_corners: number of corners (peaks of the Harris response) above which a region is not examined.
         point_significance: minimum flux of a short region, in standard deviations.
-        improvement: minimum decrease of chi-square if an object is added to the stars.
-        crossing_improvement: minimum decrease of chi-square for an object that crosses stars; larger than
-            `improvement`, because many lines are tested.
-        worst_fit: largest chi-square per pixel of an accepted object.
-        streak_sigma: standard deviation per axis of the midpoint between the ends of an object, px.
+        improvement: minimum decrease of chi-square when an object is added to a model of stars.
+        crossing_improvement: minimum decrease of chi-square for an object whose streak crosses stars; larger
+            than `improvement`, because many lines are tested.
+        worst_fit: largest chi-square per pixel along the streak of an accepted object.
+        streak_sigma: standard deviation, per axis, of the midpoint of an object's streak, px.
     """
 
     bounds: tuple[float, float, float] = (8.0, 10.0, 10.0)
@@ -111,14 +111,15 @@ class ObjectMeasurementSettings:
     """Settings of the measurement of possible objects in an image with a known attitude.
 
     Attributes:
-        search: settings of the search for objects among streaks.
+        search: settings of the search for objects in images whose stars are streaks.
         faintest: V magnitude of the faintest object that is reported; the star catalogue must be complete to
             fainter magnitudes.
         significance: minimum flux of an area of light, in standard deviations.
-        clearance: minimum distance of an object from the nearest catalogue star, px, in addition to half the
-            length of the area of light.
+        clearance: minimum distance of an object from the nearest catalogue star, px, to which half the length
+            of the area of light is added.
         floor: minimum standard deviation per axis of a position, px (from the campaign `object-passes`).
-        centre_sigma: minimum standard deviation per axis of a centroid, px, which is used if the fit fails.
+        centre_sigma: minimum standard deviation per axis, px, of the centroid that is used if the fit of an
+            object fails.
         most: maximum number of objects that are reported, the brightest first.
     """
 
@@ -140,7 +141,7 @@ class MeasuredObjects:
         directions: unit vectors to the objects (n, 3), ICRS, corrected for stellar aberration.
         covariance: covariances of the directions due to the errors of the positions (n, 3, 3), rad^2, ICRS.
         magnitudes: V magnitudes of the objects relative to the stars of the image (n,), or NaN if unknown.
-        attitude: covariance of the attitude (3, 3), rad^2, ICRS axes, an error that all objects share.
+        attitude: covariance of the attitude error (3, 3), rad^2, ICRS axes, which all objects share.
     """
 
     points: FloatArray

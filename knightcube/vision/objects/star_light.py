@@ -3,18 +3,18 @@
 The test compares two hypotheses by chi-square: that the light of the region comes from stars only, or from
 stars and one object. Stars and object are modelled as streaks of constant brightness with the camera's point
 spread function (PSF). Stars follow the paths that the camera's rotation determines. The object moves
-uniformly from one end to the other, on a line that is straight either in the image or relative to the stars.
-These two lines differ if the camera rotates about the boresight. The brightnesses come from non-negative
-least squares. Streaks of two stars that overlap or touch, and segments of a faint star's streak, are
-explained by stars. Light that is not on the path of any star, or that ends where a star would continue, is
-not explained by stars.
+uniformly from one end of its streak to the other, on a line that is straight either in the image or relative
+to the stars. The straight line in the image and that relative to the stars differ if the camera rotates about
+the boresight. The brightnesses of stars and object are fitted by non-negative least squares. Two stars whose
+streaks overlap or touch, and a segment of a faint star's streak, are explained by stars. Light that is not on
+the path of any star, or that ends where a star would continue, is not explained by stars.
 
 A star's streak has the same brightness from end to end. Therefore the brightness of a star is at most the
-minimum of the image along the star's path. An erosion of the image by this path gives the minimum for every
-position. Objects that cross the streaks, and points on the streaks, nearly vanish in the eroded image. Stars
-are removed one by one, the brightest first. The positions and brightnesses of all stars found are fitted
-together, without pixels that are brighter than these stars. The brightest remainder is then fitted as a point
-or a line.
+minimum brightness of the image along the star's path. An erosion of the image with the path as structuring
+element gives this minimum for every position of the star. Objects that cross the streaks of stars, and points
+on these streaks, nearly vanish in the eroded image. Stars are removed one by one, the brightest first. The
+positions and brightnesses of all stars found are fitted together, without pixels that are brighter than these
+stars. The brightest remaining light is then fitted as a point or a line.
 """
 
 from __future__ import annotations
@@ -35,27 +35,28 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import Background, label_pixels, line_of
 from knightcube.vision.objects.streak_ends import Regions, Segmented
 
-# Number of trial star paths along a region, per length of a star path.
-# Maximum length of a chain of successive star streaks in a region, in path lengths.
+# Number of trial star paths along a bright region, per length of a star path.
+# Maximum length of a chain of successive star streaks in a bright region, in path lengths.
 _PATHS_PER_LENGTH, _LONGEST_CHAIN = 8, 5.0
 # Spacing (px) of the Gaussians whose sum models a streak.
-# This sum has a ripple of 0.2 % for a PSF of 0.6 px.
+# The sum of Gaussians has a ripple of 0.2 % for a PSF of 0.6 px.
 _STEP_PX = 1.0
-# Distance from all paths beyond which pixels are ignored, in standard deviations of the PSF.
+# Distance from all star and object paths beyond which pixels are ignored, in standard deviations of the PSF.
 _REACH = 3.0
 # Distance at which the Gaussian PSF is truncated, in standard deviations.
 _FARTHEST = 5.0
-# Relative error of the modelled shape of a bright streak, due to errors of its ends, PSF and uniformity.
+# Relative error of the modelled image of a bright streak, due to errors of its ends, PSF and uniformity.
 SHAPE_ERROR = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Quality of the hypothesis that the pixels show stars and one object.
+    """Quality of the hypothesis that the pixels of a region show stars and one object.
 
     Attributes:
         chi_square: chi-square of the best sum of star streaks and the object's streak.
-        misfit, misfit_of_stars: chi-square per pixel along the object's streak, with and without the object.
+        misfit, misfit_of_stars: chi-square per pixel along the object's streak, for stars with the object and
+            for stars only.
         flux: flux of the object, counts.
     """
 
@@ -66,24 +67,25 @@ class Explanation:
 
 
 class StarLight:
-    """The pixels around one region, and the star streaks that best explain them.
+    """The pixels around one bright region, and the star streaks that best explain these pixels.
 
-    The pixels lie near all trial star paths and near all lines between the corners. A trial star path begins
-    or ends at a corner, or passes the midpoint of the corners.
+    The pixels used are those near any trial star path or near any line between two corners of the region. The
+    corners of a region are the peaks of the corner detector. A trial star path begins or ends at a corner of
+    the region, or passes the midpoint of all its corners.
 
     Args:
-        segmented: segmented frame.
+        segmented: frame with its bright regions.
         corners: corners of the region (k, 2), px, with k of 2 or more.
         rotation: rotation of the camera during the exposure (3,), rad, camera axes.
         pinhole: camera that took the frame.
         psf_sigma: standard deviation of the PSF, px.
         gain: electrons per count.
         saturation: counts at which a pixel saturates; pixels within 5 % of this value have no weight.
-        known: paths (m, 2), px, of other stars that illuminate the pixels.
+        known: paths (m, 2), px, of known stars whose light also falls on the pixels.
 
     Attributes:
         chi_square: chi-square of the best sum of star streaks.
-        pixels: number of pixels near the paths and lines.
+        pixels: number of pixels near the trial star paths and the lines between corners.
 
     Raises:
         FlightError: if the least-squares solution of the brightnesses does not converge.
@@ -117,7 +119,8 @@ class StarLight:
     def explain(self, ends: FloatArray) -> Explanation:
         """Return how well stars and an object between `ends` (2, 2), px, explain the pixels.
 
-        Of the straight path and the path relative to the stars, the path with the smaller chi-square is used.
+        The object's path is straight in the image or relative to the stars, whichever gives the smaller
+        chi-square.
         """
         found = []
         for path in (straight_path(ends), _path_among_stars(ends, self._rotation, self._pinhole)):
@@ -135,7 +138,7 @@ class StarLight:
         return min(found, key=lambda one: one.chi_square)
 
     def _weighted_image(self, path: FloatArray) -> FloatArray:
-        """Return the image (p,) of a streak of one count along `path` (m, 2), px, times the pixel weights."""
+        """Return the weighted image of a streak of one count along `path` (m, 2), px, on p pixels, (p,)."""
         (left, top), (right, bottom) = self._near.min(axis=0), self._near.max(axis=0)
         light = spread_over(path - (left, top), right - left + 1, bottom - top + 1, self._psf_sigma)
         return np.asarray(light[self._near[:, 1] - top, self._near[:, 0] - left] * self._weight)
@@ -145,7 +148,7 @@ def _pixel_weights(signal: FloatArray, background: Background, gain: float, satu
     """Return the reciprocal standard deviations of pixels with `signal` counts above `background`.
 
     The standard deviation includes the noise of the background, photon noise (`gain` in electrons per count)
-    and the uncertain shape of bright streaks. Pixels above 95 % of `saturation` counts have the weight 0.
+    and the uncertain shape of bright streaks. Pixels above 95 % of the `saturation` counts have the weight 0.
     """
     light = np.maximum(signal, 0.0)
     clipped = signal + background.typical_level >= 0.95 * saturation
@@ -154,7 +157,7 @@ def _pixel_weights(signal: FloatArray, background: Background, gain: float, satu
 
 
 def _brightnesses(images: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
-    """Return the non-negative least-squares coefficients (k,) of `images` (p, k), and chi-square.
+    """Return non-negative least-squares coefficients (k,) of the k `images` (p, k), and the chi-square.
 
     Raises FlightError if the solver does not converge.
     """
@@ -186,7 +189,7 @@ def straight_path(ends: FloatArray) -> FloatArray:
 def _path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
     """Return points (m, 2), px, of a uniform motion relative to the stars between two ends (2, 2), px.
 
-    Of the two possible orders of the ends in time, the order with the slower motion is used.
+    The ends are passed in the order in time that gives the slower motion relative to the stars.
     """
     vectors = pinhole.unit_vectors(ends)
     both = [at_mid_exposure(pair, rotation) for pair in (vectors, vectors[::-1])]
@@ -199,17 +202,17 @@ def _path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) 
 
 
 def at_mid_exposure(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the directions (2, 3) of two stars at mid-exposure, from `vectors` (2, 3) at other times.
+    """Return the mid-exposure directions (2, 3) of two stars from their directions `vectors` at other times.
 
-    The first vector is the first star's direction at the start of the exposure, and the second vector is the
-    second star's direction at the end of the exposure.
+    The rows of `vectors` (2, 3) are the first star's direction at the start of the exposure, and the second
+    star's direction at the end of the exposure.
     """
     turns = attitude_matrix(from_rotation_vector(np.array([[0.5], [-0.5]]) * rotation))
     return np.asarray(np.einsum("mij,mj->mi", turns, vectors))
 
 
 def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> list[FloatArray]:
-    """Return trial star paths: paths that begin or end at each corner, and paths along the whole region."""
+    """Return trial star paths: those that begin or end at each corner, and those along the whole region."""
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     extent = float(np.linalg.norm(np.ptp(corners, axis=0)))
     one = star_path(pinhole.unit_vectors(middle[None])[0], rotation, 0.5, pinhole)
@@ -266,10 +269,10 @@ def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> Floa
 def spread_with_slopes(
     path: FloatArray, shares: FloatArray, columns: int, rows: int, sigma: float
 ) -> list[FloatArray]:
-    """Return the image of `spread_over`, and its derivatives, 1/px, by displacements of the path.
+    """Return the image of a streak from `spread_over`, and its derivatives, 1/px, by shifts of the path.
 
-    Each row of `shares` (k, m) defines one displacement by the fraction with which each point of the path
-    moves. For each displacement, the derivatives in x and in y are returned.
+    Each of the k displacements moves each of the m points of the path by the given fraction `shares` (k, m)
+    of a displacement. For each displacement, the derivatives in x and in y are returned.
     """
     x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
     dx, dy = _within_pixels(columns, path[:, 0], sigma, True), _within_pixels(rows, path[:, 1], sigma, True)
@@ -280,9 +283,10 @@ def spread_with_slopes(
 
 
 def _within_pixels(count: int, centres: FloatArray, sigma: float, slope: bool = False) -> FloatArray:
-    """Return the integrals of normal densities centred on `centres` (m,), px, over each pixel, as (m, count).
+    """Return integrals of normal densities centred on `centres` (m,), px, over `count` pixels, as (m, count).
 
-    If `slope` is true, return the derivatives of these integrals with respect to the centres, 1/px.
+    If `slope` is true, the derivatives of these integrals with respect to the centres, 1/px, are returned
+    instead.
     """
     reach = int(np.ceil(_FARTHEST * sigma))
     first = np.rint(centres).astype(np.int64) - reach
@@ -298,18 +302,18 @@ def _within_pixels(count: int, centres: FloatArray, sigma: float, slope: bool = 
     return placed[:, width : width + count]
 
 
-# Margin (px) around a region, which is wider than the PSF.
+# Margin (px) of a patch of pixels around a region, which is wider than the PSF.
 _ROOM = 8
 _MOST_STARS = 12
-# Thresholds of a star and of the remainder without stars, in standard deviations of the smoothed image.
+# Thresholds of a star and of the light without stars, in standard deviations of the smoothed image.
 _STAR_SIGMAS, _LEFT_SIGMAS = 4.0, 6.0
-# Excess of a pixel over the modelled stars, in standard deviations, above which the fit ignores the pixel.
+# Excess of a pixel over the modelled stars (standard deviations) above which the fit ignores the pixel.
 _NOT_THEIRS = 4.0
-# Largest step (px) of a fit, step (px) below which the fit has converged, and maximum number of steps.
+# Largest step (px) of a fit, step (px) at which the fit has converged, and maximum number of steps.
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
-# Minimum length (px) of a line; a shorter remainder counts as a point.
+# Minimum length (px) of an object's line of light; a shorter remainder of light counts as a point.
 _LEAST_LINE_PX = 4.0
-# Widest gap (px) in a line.
+# Widest gap (px) that a removed star may leave in an object's line of light.
 _WIDEST_GAP_PX = 12
 
 
@@ -321,9 +325,9 @@ class Patch:
         signal: counts above the background (rows, columns), including the light of other regions.
         weight: reciprocal standard deviations of the pixels (rows, columns), 1/counts; 0 if saturated.
         noise: standard deviation of a background pixel, counts.
-        corner: position (x, y) of the first pixel of the patch in the frame (2,), px.
+        corner: position (x, y) in the frame of the first pixel of the rectangle (2,), px.
         mask: which pixels belong to the region (rows, columns).
-        beyond: assumed counts beyond the patch, as ((above, below), (left, right)); infinite outside the
+        beyond: counts assumed beyond the rectangle, as ((above, below), (left, right)); infinite outside the
             frame, because streaks may continue there.
         psf_sigma: standard deviation of the PSF, px.
     """
@@ -337,7 +341,7 @@ class Patch:
     psf_sigma: float
 
     def image_and_slopes(self, path: FloatArray, shares: FloatArray) -> list[FloatArray]:
-        """Return the results of `spread_with_slopes` in the patch for `path` (m, 2), px, in the frame."""
+        """Return image and derivatives of a streak along `path` (m, 2), px, in the frame, on the patch."""
         rows, columns = self.signal.shape
         return spread_with_slopes(path - self.corner, shares, columns, rows, self.psf_sigma)
 
@@ -354,7 +358,10 @@ class Patch:
 def cut_patch(
     segmented: Segmented, regions: Regions, index: int, psf_sigma: float, gain: float, saturation: float
 ) -> Patch:
-    """Return the patch around region `index`. Pixels above 95 % of `saturation` counts have the weight 0."""
+    """Return the patch of the frame around region `index`.
+
+    Pixels above 95 % of the `saturation` counts have the weight 0.
+    """
     rows, columns = segmented.signal.shape
     top, bottom, left, right = (int(edge) for edge in regions.boxes[index])
     top, left = max(top - _ROOM, 0), max(left - _ROOM, 0)
@@ -371,13 +378,13 @@ def cut_patch(
 
 
 def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[list[FloatArray], FloatArray]:
-    """Return the paths (m, 2), px, of stars in a patch, and the counts (rows, columns) without the stars."""
+    """Return the paths (m, 2), px, of stars in a patch, and the counts (rows, columns) without them."""
     middles: list[FloatArray] = []
     left = patch.signal
     rows, columns = patch.signal.shape
     centre = patch.corner + 0.5 * np.array([columns - 1, rows - 1])
     path = _path_of(centre, rotation, pinhole)
-    # The offsets are points of a star's path relative to its middle, and include both ends.
+    # The offsets are points of a star's path relative to the midpoint of the path, and include both ends.
     every = max(1, round(2.0 * patch.psf_sigma))
     offsets = path[np.unique(np.append(np.arange(0, len(path), every), len(path) - 1))] - centre
     while len(middles) < _MOST_STARS:
@@ -395,7 +402,7 @@ def _path_of(middle: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> Floa
 
 
 def _eroded(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Return the largest possible brightness, in the smoothed image, of a star centred on each pixel."""
+    """Return the largest possible brightness of a star centred on each pixel of the smoothed image."""
     seen = patch.smoothed(left)
     rows, columns = seen.shape
     reach = int(np.ceil(np.abs(offsets).max())) + 1
@@ -403,7 +410,7 @@ def _eroded(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray:
     least = np.full(seen.shape, np.inf)
     for number, (x, y) in enumerate(np.rint(offsets).astype(int)):
         part = wide[reach + y : reach + y + rows, reach + x : reach + x + columns]
-        # At the end of a streak, the smoothed brightness is half of the brightness along it.
+        # At the end of a streak, the smoothed brightness is half of that along the streak.
         np.minimum(least, 2.0 * part if number in (0, len(offsets) - 1) else part, out=least)
     return least
 
@@ -411,7 +418,7 @@ def _eroded(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray:
 def _fit_together(
     patch: Patch, middles: list[FloatArray], rotation: FloatArray, pinhole: Pinhole
 ) -> tuple[list[FloatArray], FloatArray]:
-    """Return the path middles (2,), px, of stars fitted together, and the counts without these stars."""
+    """Return the path midpoints (2,), px, of stars fitted together, and the counts without these stars."""
 
     def images(middle: FloatArray) -> list[FloatArray]:
         path = _path_of(middle, rotation, pinhole)
@@ -438,14 +445,13 @@ def _fit_together(
 
 
 def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2), px, of the brightest significant remainder in a region, or None.
+    """Return the ends (2, 2), px, of the brightest significant light left in a region, or None.
 
-    For a point, the two ends are equal. Residuals within the shape error of a bright star are not
-    significant.
+    For a point, the two ends are equal. Residuals below the model error of a bright star are not significant.
 
     Args:
-        patch: rectangle of the frame around the region.
-        left: counts of the patch without its stars (rows, columns).
+        patch: rectangle of the frame around the examined region.
+        left: counts of this rectangle after its stars are subtracted (rows, columns).
     """
     lit = np.maximum(patch.signal, 0.0)
     error = np.hypot(patch.smoothed_noise, SHAPE_ERROR * patch.smoothed(lit))
@@ -468,9 +474,10 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
 
 
 def _continued(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2), px, of a line extended across gaps, or None if the line does not continue.
+    """Return the ends (2, 2), px, of a line of light extended across gaps, or None if it does not continue.
 
-    A star that crosses the line leaves a gap, because the star is removed together with the line's light.
+    A star that crosses the object's line leaves a gap, because the star is subtracted together with the
+    line's light.
     """
 
     def last_before_gap(lit: BoolArray) -> int:
@@ -498,7 +505,7 @@ def _continued(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray |
 
 
 def _fit_line(patch: Patch, left: FloatArray, ends: FloatArray) -> FloatArray:
-    """Return the ends (2, 2), px, of a line fitted to the remainder `left` by Gauss-Newton from a guess."""
+    """Return the ends (2, 2), px, of a line fitted by Gauss-Newton to the light `left` by the stars."""
     is_point = bool(np.all(ends[0] == ends[1]))
     for _ in range(_FITS):
         path = straight_path(ends)

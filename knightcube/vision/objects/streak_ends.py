@@ -2,13 +2,13 @@
 
 A pixel is bright if the sum of the 3 x 3 pixels around it, without background, exceeds a given number of
 standard deviations of the sum. This sum is nearly the matched filter of a star image one pixel wide. The
-Harris response of the structure tensor is computed for each connected region of bright pixels. A streak has
-exactly two peaks of the Harris response, and each peak is located by its centre of intensity. The equations
-are those of Sease, with the corrections of the errata to eq. (3.5), (3.15), (3.17) and (3.18). Images have
-the shape (rows, columns), and points are (x, y) in px.
+Harris response of the structure tensor (cornerness) is computed for each connected region of bright pixels. A
+streak has exactly two peaks of the Harris response, and each peak is located by its centre of intensity. The
+equations are those of Sease, with the corrections of the errata to eq. (3.5), (3.15), (3.17) and (3.18).
+Images have the shape (rows, columns), and points are (x, y) in px.
 
-The Gaussian kernels displace the peaks along the streak by a constant that depends on the point spread
-function. The function `extend` compensates this displacement.
+The Gaussian kernels displace the peaks of the Harris response along the streak by a constant that depends on
+the point spread function. The function `extend` compensates this displacement of the measured streak ends.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from knightcube.vision.frame import (
 )
 from knightcube.vision.objects.settings import EndpointSettings
 
-# Margin (px) around the bounding box of a region, which covers the window and the derivative kernel.
+# Margin (px) around a region's bounding box, wide enough for the tensor window and the derivative kernel.
 _PADDING = 8
 # Minimum length of a region that may be a streak, as a fraction of `EndpointSettings.least_length`.
 _LENGTH_MARGIN = 0.75
-# Fraction of a streak's counts per px of length that lies in its brightest row, for a PSF of 1 px.
+# Fraction of a streak's counts per px of length that lies in its central row, for a PSF of 1 px.
 _PEAK_FRACTION = 0.28
 
 
@@ -47,8 +47,8 @@ class Regions:
 
     Attributes:
         labels: label of the region at each pixel (rows, columns), int32; 0 outside all regions.
-        label: label of each region in `labels` (n,).
-        boxes: bounding boxes (n, 4) as first row, last row + 1, first column, last column + 1.
+        label: label of each region (n,), as used in `labels`.
+        boxes: bounding boxes of the regions (n, 4): first row, last row + 1, first column, last column + 1.
         area: number of pixels in each region (n,).
         flux: counts above the background in each region (n,).
         length: length of the uniform line with the same second moments as each region (n,), px.
@@ -77,7 +77,7 @@ class Segmented:
         signal: counts above the background with hot pixels repaired (rows, columns), float32.
         background: background level and noise of the frame.
         regions: all regions above the threshold.
-        candidates: regions that may be streaks, strongest first.
+        candidates: those regions that may be streaks, strongest first.
         hot_pixels: number of repaired pixels.
     """
 
@@ -97,8 +97,9 @@ class Streaks:
             `extend`.
         sigma: expected standard deviation of the endpoints of each streak (n,), px.
         flux: flux of each streak (n,), counts.
-        candidate: index of each streak among the candidate regions (n,).
-        crowded: index and corners (k, 2), px, of each candidate region with more than two corners.
+        candidate: index of each streak's region among the candidate regions (n,).
+        crowded: index and corners (k, 2), px, of each candidate region with more than two corners (peaks of
+            the cornerness).
     """
 
     endpoints: FloatArray
@@ -136,15 +137,16 @@ def segment_frame(pixels: Image, settings: EndpointSettings) -> Segmented:
 
 
 def threshold_local(signal: Image, noise: Image, sigmas: float) -> BoolArray:
-    """Return where the 3 x 3 sum of `signal` exceeds `sigmas` times the noise of that sum.
+    """Return the pixels at which the 3 x 3 sum of `signal` exceeds `sigmas` times the noise of this sum.
 
-    The background is subtracted from `signal`; `noise` is the standard deviation of each pixel in counts.
+    The argument `signal` is the frame without background; The argument `noise` is the standard deviation of
+    each pixel, counts.
     """
     return np.asarray(box_sum(signal) > (3.0 * sigmas) * noise)
 
 
 def threshold_mean(pixels: Image) -> BoolArray:
-    """Return where `pixels` exceed the mean of the image, the threshold of Sease for noiseless frames."""
+    """Return which `pixels` exceed the mean of the image, the threshold of Sease for noiseless frames."""
     return np.asarray(pixels > pixels.mean())
 
 
@@ -168,7 +170,7 @@ def find_regions(mask: BoolArray, signal: Image, least_area: int) -> Regions:
 
 
 def near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolArray:
-    """Return which regions (n,) lie within `border` px of the frame's border, which may cut off ends."""
+    """Return which regions (n,) lie within `border` px of the frame's border, which may truncate streaks."""
     top, bottom, left, right = regions.boxes.T
     return np.asarray(
         (top < border) | (left < border) | (bottom > shape[0] - border) | (right > shape[1] - border)
@@ -191,8 +193,8 @@ def measure_streaks(
 ) -> Streaks:
     """Return the streaks, which are the candidate regions whose cornerness has exactly two peaks.
 
-    `cornerness` replaces the Harris corner detector: a function of an image and the settings that returns the
-    response at each pixel.
+    The argument `cornerness` is a function of an image and the settings that returns the response at each
+    pixel, in place of the Harris corner detector.
     """
     respond = harris_cornerness if cornerness is None else cornerness
     sigma = expected_sigma(segmented.candidates, segmented.background, settings)
@@ -217,9 +219,9 @@ def measure_streaks(
 
 
 def cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Return image and mask of a candidate region with a margin, and the (x, y) of the first pixel, px.
+    """Return image and mask of a candidate region with a margin, and the frame position of their first pixel.
 
-    Pixels of other regions are zero in the image.
+    In the image, the pixels of other regions are zero.
     """
     rows, columns = segmented.signal.shape
     top, bottom, left, right = segmented.candidates.boxes[index]
@@ -232,7 +234,7 @@ def cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, Fl
 
 
 class StructureTensor(NamedTuple):
-    """The three distinct elements of the structure tensor at every pixel, each (rows, columns)."""
+    """The three distinct elements of the symmetric structure tensor at every pixel, each (rows, columns)."""
 
     xx: FloatArray
     xy: FloatArray
@@ -253,8 +255,8 @@ def tensor_of(image: FloatArray, settings: EndpointSettings) -> StructureTensor:
 def structure_tensor(image: Image, derivative_sigma: float, window_sigma: float) -> StructureTensor:
     """Return the structure tensor: gradient products summed under a Gaussian window of `window_sigma` px.
 
-    Source: Sease, eq. (3.5), with a window that the printed equation lacks. Without the window, the tensor
-    has rank 1 and one eigenvalue is zero.
+    Source: Sease, eq. (3.5), with the Gaussian window that the printed equation lacks. Without this window,
+    the structure tensor has rank 1 and one eigenvalue is zero.
     """
     gx, gy = gradient(image, derivative_sigma)
     window = gaussian_kernel(window_sigma, kernel_radius(window_sigma))
@@ -313,7 +315,7 @@ def _separable(image: Image, down: FloatArray, across: FloatArray) -> FloatArray
 
 
 def local_maxima(response: FloatArray, mask: BoolArray, relative: float) -> IntArray:
-    """Return the pixels (x, y) in `mask` whose response exceeds that of all eight neighbours (n, 2).
+    """Return the pixels (x, y) in `mask` whose response exceeds that of all eight neighbours, (n, 2).
 
     Pixels at the border of the image, and pixels below `relative` times the largest response in the mask, are
     excluded.
@@ -334,9 +336,9 @@ def local_maxima(response: FloatArray, mask: BoolArray, relative: float) -> IntA
 def centre_of_intensity(image: FloatArray, pixel: IntArray, half_width: int) -> FloatArray:
     """Return the intensity-weighted centre (x, y) px of the (2 half_width + 1)^2 pixels around `pixel`.
 
-    Source: Sease, eq. (3.15) and (3.16), with the coordinate as a factor in the sums, which the printed
-    equation lacks. Negative pixels have no weight. A window that would extend beyond the border is narrowed
-    on both sides, so that it stays centred on `pixel` (x, y).
+    Source: Sease, eq. (3.15) and (3.16), with the factor of the coordinate in the sums that the printed
+    equation lacks. Pixels with negative intensity have no weight. A window that would extend beyond the image
+    border is narrowed on both sides, so that it stays centred on `pixel` (x, y).
     """
     x, y = int(pixel[0]), int(pixel[1])
     rows, columns = image.shape
@@ -354,21 +356,22 @@ def find_corners(
 ) -> FloatArray:
     """Return the corners (x, y) of a region (n, 2), px, which are the peaks of its cornerness (`response`).
 
-    Each corner is placed at the centre of intensity of the image `intensity`, which is the cornerness or, as
-    in Sease, the frame. With the frame, the corners lie up to 2 px inside the streak. A streak has two
-    corners; other numbers of corners indicate noise, crossing streaks or another object.
+    The position of a corner is the centre of intensity of the image `intensity` around the peak, where
+    `intensity` is the cornerness or, as in Sease, the frame. If the frame is used, the corners lie up to 2 px
+    inside the streak. A streak has two corners; other numbers of corners indicate noise, crossing streaks or
+    another object.
     """
     peaks = local_maxima(response, mask, relative)
     return np.array([centre_of_intensity(intensity, peak, half_width) for peak in peaks]).reshape(-1, 2)
 
 
 def extend(endpoints: FloatArray, outward: FloatArray, bias: float) -> FloatArray:
-    """Return `endpoints` (..., 2), px, moved by `bias` px along the directions `outward` (..., 2)."""
+    """Return streak ends (..., 2), px, moved by `bias` px along the unit vectors `outward` (..., 2)."""
     return np.asarray(endpoints + bias * outward / np.linalg.norm(outward, axis=-1, keepdims=True))
 
 
 def chord_outward(endpoints: FloatArray) -> FloatArray:
-    """Return the outward directions along the chord at both ends of each streak (n, 2, 2)."""
+    """Return unit vectors outwards along the chord at both ends of each streak (n, 2, 2)."""
     chord = endpoints[:, 1] - endpoints[:, 0]
     return np.stack([-chord, chord], axis=1)
 
@@ -376,9 +379,9 @@ def chord_outward(endpoints: FloatArray) -> FloatArray:
 def centre_of_rotation(endpoints: FloatArray) -> FloatArray:
     """Return the centre of rotation (2,), px: the point nearest to the perpendicular bisectors of streaks.
 
-    The streaks are given by their ends (n, 2, 2), px. As the rotation axis becomes normal to the boresight,
-    the centre recedes to infinity; for parallel chords it is NaN. Source: Sease, eq. (3.17) and (3.18) as
-    corrected in the errata.
+    Each streak is given by its two ends (n, 2, 2), px. The nearer the rotation axis is to the normal of the
+    boresight, the farther away is the centre; for parallel chords it is NaN. Source: Sease, eq. (3.17) and
+    (3.18) as corrected in the errata.
     """
     chord = endpoints[:, 1] - endpoints[:, 0]
     chord = chord / np.linalg.norm(chord, axis=-1, keepdims=True)

@@ -11,15 +11,14 @@ are updated.
 Near a pixel, the path is approximated by an arc on which the star has the speed v, and s and n are
 coordinates along and across the arc. A star of unit flux gives each pixel the counts
 
-    m = (1/v) g(n) [Phi((s - s0)/w) - Phi((s - s1)/w)] / sqrt(1 - k n), for the cumulative normal distribution
-    Phi,
+    m = (1/v) g(n) [Phi((s - s0)/w) - Phi((s - s1)/w)] / sqrt(1 - k n),
 
-where g is a Gaussian of standard deviation w, k the curvature of the arc, and s0 and s1 the path coordinates
-at the start and end of the exposure. With a rolling shutter, s0 and s1 depend on the pixel's row. The
-integration over the square pixel is included in the width w by w^2 = sigma^2 + 1/12, where sigma is the width
-of the point spread. The fourth cumulant of a uniform distribution over the pixel, -1/120 along each axis,
-corrects the profile across the path. If a parameter displaces the path at time t by c(t), the modelled counts
-m of a pixel change by
+where g is a Gaussian of standard deviation w, Phi the cumulative normal distribution, k the curvature of the
+arc, and s0 and s1 the coordinates along the arc at the start and end of the exposure. With a rolling shutter,
+s0 and s1 depend on the pixel's row. The integration over the square pixel is included in the width w by w^2 =
+sigma^2 + 1/12, where sigma is the width of the point spread. The fourth cumulant of a uniform distribution
+over the pixel, -1/120 along each axis, corrects the profile across the path. If a parameter displaces the
+path at time t by c(t), the modelled counts m of a pixel change by
 
     dm = c_n n/w^2 m + c_s(t1) e1 - c_s(t0) e0 - (dc_s/ds) m,
 
