@@ -3,8 +3,8 @@
 The solar strings determine which camera is read first. The solar strings also give the Sun direction if no
 camera finds the Sun. The nadir direction is fitted to the limbs in all images at once. If no image shows a
 limb, the Earth may fill one camera while the others are dark. The brightness of all images gives a coarse
-nadir direction if no image shows a limb. The estimators are imported when they are used, because the control
-process does not need them.
+nadir direction if no image shows a limb. The modules of the estimators are imported at their first use,
+because the control process does not need them.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from knightcube.vision.horizon.settings import HorizonKnowledge, LogarithmicResp
 from knightcube.vision.solar_cells import SolarStringModel
 
 SUNLIT_COUNTS = 30.0
-"""Pixel count that is exceeded by the sunlit Earth, but not by its stray light."""
+"""Count of a pixel that the sunlit Earth exceeds, but not the Earth's stray light."""
 LIT_SIGMA = 0.3
 """Largest standard deviation (rad) of an attitude that is used to predict the Sun direction."""
 EARTHLIGHT_SIGMA = 0.1
 """Largest standard deviation (rad) of an attitude that predicts which solar strings the Earth illuminates."""
 JUDGING_SIGMA = 0.005
-"""Largest standard deviation (rad) of an attitude that is used to check the content of the images."""
+"""Largest standard deviation (rad) of an attitude with which the content of the images is compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,9 +38,9 @@ class HorizonCameraJob:
         frames: images (rows, columns) by the index of their camera.
         cameras: all cameras.
         knowledge: prior knowledge, with directions and attitude in body axes.
-        strings: model of the solar strings and their currents (n,), A. Without a recent reading, `strings` is
-            None.
-        response: response of the cameras to intensity; None: linear.
+        strings: model of the solar strings and the currents (n,), A, of the strings. Without a recent reading
+            of the currents, `strings` is None.
+        response: response of the cameras' detectors to light intensity; None: linear.
     """
 
     frames: Mapping[int, Image]
@@ -73,9 +73,9 @@ class HorizonCameraResult:
     """The result of a job.
 
     Attributes:
-        sun, nadir: measured directions; None if there is none.
-        false: reasons why images contradict an accurate attitude, by camera index. Without an accurate
-            attitude, `false` is None.
+        sun, nadir: measured directions of Sun and nadir, body axes; None if there is none.
+        false: for each image whose content contradicts an accurately known attitude, the reason, by camera
+            index. If the attitude is not accurately known, images are not checked and `false` is None.
     """
 
     sun: MeasuredDirection | None
@@ -130,9 +130,9 @@ def _nadir(
 
 
 def _false_images(job: HorizonCameraJob) -> dict[int, str] | None:
-    """Return why images contradict an accurate attitude, by camera index.
+    """Return the reasons why the content of images contradicts an accurately known attitude, by camera index.
 
-    The result is None without an accurate attitude.
+    The result is None if the attitude is not accurately known.
     """
     from knightcube.vision.horizon.illumination import image_brightness, why_false  # noqa: PLC0415
     from knightcube.vision.horizon.limb import MEAN_RADIUS  # noqa: PLC0415 - see the top

@@ -9,7 +9,7 @@ frames.
 The data may not determine all parameters. In a narrow field, a shift of the optical axis looks like a
 rotation of the camera, and a single frame hardly separates the two. Each parameter therefore has a prior
 around an ideal lens with the initial focal length, the optical axis in the image centre and no distortion.
-Parameters whose standard deviation exceeds half of the prior standard deviation are listed in `undetermined`.
+Parameters whose standard deviation exceeds half of that of the prior are listed in `undetermined`.
 """
 
 from __future__ import annotations
@@ -36,40 +36,43 @@ from knightcube.vision.startracker.solve import FrameSolution, SolveSettings
 
 PARAMETERS = ("focal_length", "centre_x", "centre_y", "k1", "k2")
 MIN_STARS = 24
-"""Minimum number of accepted matches: three per parameter of the lens and of one attitude."""
+"""Minimum number of accepted matches of stars: three per parameter of the lens and of one attitude."""
 _ROBUST_STEPS = 20
 _MAX_STEPS = 50
 _MAX_SELECTIONS = 10
 _CONVERGED = 1e-6
 """Predicted decrease of chi-square at which the fit is converged."""
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
-"""Relative rounding error of a length in a frame."""
+"""Rounding error of a position, relative to the size of a frame."""
 _CUT = 5.0
-"""Residual, in standard deviations, above which a match is rejected."""
+"""Residual, in standard deviations, above which the match of a star is rejected."""
 _CAUCHY = 2.385
 """Tuning constant of the Cauchy weights, for 95 % efficiency without outliers."""
 _MEDIAN_LENGTH = np.sqrt(2.0 * np.log(2.0))
 """Median length of a residual of unit variance per axis (Rayleigh distribution)."""
 _DETERMINED = 0.5
-"""Ratio of posterior to prior standard deviation below which a parameter counts as determined."""
+"""Ratio of posterior to prior standard deviation below which a lens parameter counts as determined."""
 _MAX_EXCESS = 3.0
-"""Excess of chi-square, in its standard deviations, above which position errors count as too small."""
+"""Excess of chi-square, in its standard deviations, above which star position errors count as too small."""
 _MIN_SPREAD = 1e-12
-"""Minimum eigenvalue of a frame's attitude information, relative to its trace."""
+"""Minimum eigenvalue of the information matrix of a frame's attitude, relative to its trace."""
 _MIN_INDEPENDENCE = 1e-10
-"""Minimum eigenvalue of the lens information, normalised to a unit diagonal."""
+"""Minimum eigenvalue of the information matrix of the lens, normalised to a unit diagonal."""
 _MIN_COSINE = 0.05
 """Minimum cosine of the angle between a star in the image and the optical axis."""
 _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
-"""Prior standard deviations that fix omitted terms (px for the centre), in the order of omission."""
+"""Prior standard deviations that fix omitted lens terms (px for the centre), in the order of omission."""
 _ROUNDS = 3
-"""Number of passes over the images. A better lens lets more stars in the corners match."""
+"""Number of passes over the images, in each of which the stars are identified with the latest lens.
+
+With a better lens model, more stars in the image corners match.
+"""
 _MIN_SIGMA_PX = 0.02
 """Minimum standard deviation (px) of a star position, for errors that the covariance does not include."""
 _SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
-"""Settings that do not accept mirrored images, because a lens does not mirror."""
+"""Settings of the star tracker that do not accept mirrored images, because a lens does not mirror."""
 _MIN_USED = 0.5
-"""Minimum fraction of accepted matches of a frame that belongs to the common lens."""
+"""Minimum fraction of accepted matches of a frame at which the frame belongs to the common lens."""
 
 
 class CalibrationError(FlightError):
@@ -78,7 +81,7 @@ class CalibrationError(FlightError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedFrame:
-    """Stars identified in one frame, a few of them possibly wrong.
+    """The n stars identified in one frame, a few of them possibly wrong.
 
     Attributes:
         points: measured star positions (n, 2), px.
@@ -101,12 +104,13 @@ class LensFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitStep:
-    """Result of one Gauss-Newton step.
+    """Result of one Gauss-Newton step of the calibration.
 
     Attributes:
         fit: lens parameters and attitudes after the step.
         decrease: decrease of chi-square that the linear model predicts.
-        information: information matrix (5, 5) of the lens parameters from the stars, with unknown attitudes.
+        information: information matrix (5, 5) of the lens parameters from the stars, after elimination of the
+            attitudes.
     """
 
     fit: LensFit
@@ -145,9 +149,9 @@ def step(
     Args:
         frames: the frames.
         fit: lens parameters and attitudes before the step.
-        weights: factors (n,) on the squared residuals of each frame.
-        prior: prior information (5,) on each parameter, as inverse variances.
-        expected: prior means (5,) of the parameters.
+        weights: weights (n,) of the squared residuals of the stars, for each frame.
+        prior: prior information (5,) on each lens parameter, as inverse variances.
+        expected: prior means (5,) of the lens parameters.
 
     Raises CalibrationError if a frame does not determine its attitude, or if the data do not determine the
     lens.
@@ -163,7 +167,7 @@ def step(
         free, coupling = inverse @ (turn.T @ misfit), inverse @ (turn.T @ lens)
         turns.append((free, coupling))
         decrease += float(free @ (turn.T @ misfit))
-        beyond = lens - turn @ coupling  # lens effect that no rotation can compensate
+        beyond = lens - turn @ coupling  # effect of the lens parameters that no rotation can compensate
         information += beyond.T @ beyond
         gradient += beyond.T @ misfit
     gradient += prior * (expected - fit.parameters)
@@ -186,10 +190,10 @@ def step(
 def _linearised(
     frame: MatchedFrame, fit: LensFit, number: int, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the weighted derivatives by lens (2n, 5) and rotation (2n, 3), and the residuals (2n,).
+    """Return weighted derivatives by lens parameters (2n, 5) and rotation (2n, 3), and residuals (2n,).
 
-    A direction with the tangents u is imaged at f u s(|u|^2). A small rotation moves a direction v by v x
-    rotation.
+    A direction with the tangents u is imaged at f u s(|u|^2) from the optical axis, with the distortion s. A
+    small rotation moves a direction v by v x rotation.
     """
     misfit = residuals(frame, fit, number)
     usable = (weight > 0.0) & np.isfinite(misfit[:, 0])
@@ -221,14 +225,15 @@ def _linearised(
 
 @dataclass(frozen=True, slots=True)
 class LensPrior:
-    """Prior standard deviations around the assumed lens. Infinity stands for no prior.
+    """Prior standard deviations around the assumed lens. An infinite standard deviation means no prior.
 
     Attributes:
-        focal_length: relative error of the focal length. The default allows any lens with a roughly known
-            field of view.
-        centre: error of the optical axis in the image, per axis, px. The default allows a sensor that was
-            positioned by hand.
-        k1, k2: errors of the radial distortion coefficients. The defaults allow any lens except a fisheye.
+        focal_length: relative error of the focal length. The default `focal_length` allows any lens with a
+            roughly known field of view.
+        centre: error of the optical axis in the image, per axis, px. The default `centre` allows a sensor
+            that was positioned by hand.
+        k1, k2: errors of the radial distortion coefficients. The default `k1` and `k2` allow any lens except
+            a fisheye.
     """
 
     focal_length: float = 0.1
@@ -258,9 +263,9 @@ class Calibration:
             freedom.
         undetermined: names of the PARAMETERS that are determined by the prior instead of the stars.
         attitudes: attitudes (m, 4) of the frames, from reference axes to camera axes.
-        used: masks (n,) of the accepted matches of each frame.
+        used: for each frame, mask (n,) of the accepted matches of stars.
         chi_square: chi-square of the residuals and the prior.
-        degrees: number of degrees of freedom.
+        degrees: number of degrees of freedom of `chi_square`.
         rms_before: rms residual of the accepted matches with the assumed lens, px.
         rms_after: rms residual of the accepted matches with the calibrated lens, px.
     """
@@ -277,7 +282,7 @@ class Calibration:
 
     @property
     def sigma(self) -> dict[str, float]:
-        """The standard deviation of each parameter, in px for the first three."""
+        """The standard deviations of the five lens parameters, in px for the first three."""
         return dict(zip(PARAMETERS, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
@@ -287,7 +292,7 @@ class Calibration:
 
     @property
     def rejected_count(self) -> int:
-        """The number of rejected matches."""
+        """The number of rejected matches of stars."""
         return sum(map(len, self.used)) - self.stars
 
 
@@ -343,7 +348,7 @@ def _attitude(frame: MatchedFrame, lens: Lens, number: int) -> FloatArray:
             quaternion = solve(in_camera, frame.directions, sigma / np.sqrt(weight)).quaternion
             fit = LensFit(parameters_of(lens), quaternion[None])
             (weight,) = _cauchy_weights(_lengths([frame], fit))
-            # Weights stay positive, so that a match rejected by a poor initial attitude can recover.
+            # Weights stay positive, so that matches rejected with a poor initial attitude can recover.
             weight = np.maximum(weight, 1e-6)
     except AttitudeError as error:
         raise CalibrationError(f"frame {number}: {error}") from error
@@ -356,9 +361,9 @@ def _lengths(frames: Sequence[MatchedFrame], fit: LensFit) -> list[FloatArray]:
 
 
 def _spread(lengths: Sequence[FloatArray]) -> float:
-    """Return the residuals' standard deviation per axis, from their median. It is at least one.
+    """Return the standard deviation per axis of the residuals, estimated from their median.
 
-    Raises CalibrationError if the median star is behind the camera.
+    It is at least one. Raises CalibrationError if the median star is behind the camera.
     """
     median = float(np.median(np.concatenate(lengths)))
     if not median < np.inf:
@@ -384,7 +389,7 @@ def _converged(
     expected: FloatArray,
 ) -> FitStep:
     """Return the last step of the converged fit to the accepted matches `used`."""
-    least = 0.0  # chi-square of rounding errors, which limits the fit for tiny sigmas
+    least = 0.0  # chi-square from rounding errors, below which the fit cannot converge
     for frame, chosen in zip(frames, used, strict=True):
         length = fit.parameters[0] + np.linalg.norm(frame.points[chosen], axis=1)
         least += 2.0 * float(np.sum((_ROUNDING * length / frame.sigma[chosen]) ** 2))
@@ -453,7 +458,7 @@ class OmittedTerm:
     Attributes:
         values: last fitted values: one for k1 and k2, or x and y for the centre.
         sigmas: standard deviations of the fitted values.
-        assumed: values that the calibrated lens has instead.
+        assumed: values of this term in the calibrated lens, instead of the fitted values.
     """
 
     values: tuple[float, ...]
@@ -466,10 +471,11 @@ class DeterminedLens:
     """A calibration that includes only the lens terms determined by the stars.
 
     Attributes:
-        calibration: calibration in which omitted terms have their assumed values and almost no uncertainty.
-        omitted: omitted terms by their names "k1", "k2" and "centre".
-        accuracy: accuracy of the lens by the keys of `camera.accuracy` in a configuration, without keys that
-            the stars do not determine.
+        calibration: calibration in which the omitted terms have their assumed values and almost no
+            uncertainty.
+        omitted: omitted lens terms by their names "k1", "k2" and "centre".
+        accuracy: standard deviations of the lens by the keys of `camera.accuracy` in a configuration, without
+            keys that the stars do not determine.
     """
 
     calibration: Calibration
@@ -480,9 +486,9 @@ class DeterminedLens:
 def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -> DeterminedLens:
     """Return the lens of the frames with only the determined terms, starting from the camera `initial`.
 
-    Terms are omitted one at a time, starting with k2, if they are undetermined or if a distortion coefficient
-    is smaller than its standard deviation. The remaining terms are fitted again after each omission. Raises
-    CalibrationError.
+    Lens terms are omitted one at a time, starting with k2, if they are undetermined or if a distortion
+    coefficient is smaller than its standard deviation. The remaining terms are fitted again after each
+    omission. Raises CalibrationError.
     """
     prior = LensPrior()
     whole = found = calibrate(frames, initial, prior)
@@ -504,7 +510,7 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
 
 
 def _next_omitted(found: Calibration, omitted: dict[str, OmittedTerm]) -> str | None:
-    """Return the next term to omit, or None if the stars determine all fitted terms."""
+    """Return the next lens term to omit, or None if the stars determine all fitted terms."""
     fitted = [term for term in _HELD if term not in omitted]
     for term in fitted:
         if any(name.startswith(term) for name in found.undetermined):
@@ -518,12 +524,13 @@ def _next_omitted(found: Calibration, omitted: dict[str, OmittedTerm]) -> str | 
 def lens_accuracy(
     whole: Calibration, found: Calibration, omitted: dict[str, OmittedTerm]
 ) -> dict[str, float]:
-    """Return the accuracy of a lens by the keys of `camera.accuracy`.
+    """Return the standard deviations of a lens by the keys of `camera.accuracy` in a configuration.
 
     The accuracies of focal length and centre are taken from the fit `found` without the omitted terms. The
     change of the focal length relative to the fit `whole` with all terms is added to the error of the focal
-    length. The accuracy of the distortion is the relative displacement of an image corner. The distortion
-    accuracy includes the uncertainty with all terms and the difference between the two fits.
+    length. The accuracy of the distortion is given as the relative displacement of an image corner. The
+    accuracy of the distortion includes the uncertainty with all terms and the difference between the fits
+    with and without the omitted terms.
     """
     lens, sigma = found.lens, found.sigma
     changed = whole.lens.focal_length - lens.focal_length
@@ -545,9 +552,9 @@ def calibrate_one_lens(
 ) -> tuple[DeterminedLens, dict[int, str]]:
     """Return the common lens of the frames, and the reasons for excluding frames, by frame index.
 
-    A frame with another focus or zoom, or with a wrong solution, is excluded. The criteria are a focal length
-    that differs from the median by more than 5 standard deviations and 1 %, or a fit that rejects more than
-    half of the frame's matches.
+    A frame with another focus or zoom, or with a wrong solution, is excluded. A frame is excluded if its
+    focal length differs from the median by more than 5 standard deviations and 1 %, or if a fit rejects more
+    than half of its matches.
 
     Args:
         frames: the frames.
@@ -587,7 +594,10 @@ class CalibrationImage:
 
     @property
     def reason(self) -> str:
-        """The reason why the image is not used. The reason is empty for an image that is used."""
+        """The reason why the image is not used for the calibration.
+
+        The reason is empty for an image that is used.
+        """
         return self.excluded or ("" if self.solution.fix is not None else self.solution.reason)
 
 
@@ -621,9 +631,9 @@ def calibrate_lens(
 ) -> LensCalibration:
     """Return the lens of a camera from images of the night sky: focal length, axis and radial distortion.
 
-    All images must be taken by one camera at one focus setting. Images that do not fit are excluded. Ten
-    images with stars in the corners give a better calibration than a hundred without. Lens terms that the
-    stars do not determine are omitted.
+    All images must be taken by one camera at one focus setting. Images that do not fit the common lens are
+    excluded. Ten images with stars in the corners give a better calibration than a hundred without. Lens
+    terms that the stars do not determine are omitted.
 
     Args:
         images: arrays (rows, columns) of counts, all of one shape.

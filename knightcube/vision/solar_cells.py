@@ -2,19 +2,19 @@
 
 A solar string is a series connection of solar cells on one face of the body, so that all its cells carry the
 same current. The current of a string is proportional to the cosine of the angle between the Sun and the
-string's normal, and zero if the Sun is behind the string. The Earth also illuminates the strings, at most a
-third as strongly as the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of the light from
-the half sky around nadir e. Earth light correlates the errors of the strings. The correlation pattern is
-known if nadir is known, otherwise the mean pattern over all nadir directions is used. The covariance of the
-Sun direction includes the correlation by Earth light.
+string's normal, and zero if the Sun is behind the string. The Earth also illuminates the solar strings, at
+most a third as strongly as the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of the light
+from the half of the sky that is centred on nadir e. Light from the Earth correlates the errors of the
+strings. This correlation can be computed if nadir is known; otherwise the mean correlation over all nadir
+directions is used. The covariance of the Sun direction includes this correlation by light from the Earth.
 
 The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if any
 one string fails in any way. The magnetic field does not determine the rotation about the field direction. All
 rotations about the field direction are therefore tried, and each predicts the illumination of the strings by
-Sun and Earth. A rotation is possible if all strings except at most one agree with it, and if the exception is
-the same string in each reading. Between readings, the gyro propagates the rotations. The covariance covers
-all possible rotations (solution separation as in receivers of satellite navigation, Brown 1992, Navigation
-39).
+Sun and Earth. A rotation is possible if all strings except at most one agree with it, and if this exception
+is the same string in each reading. Between readings, the possible rotations are propagated with the gyro. The
+covariance of the attitude covers all possible rotations (solution separation as in receivers of satellite
+navigation, Brown 1992, Navigation 39).
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from knightcube.errors import UsageError
 
 _MOST_STEPS = 15
 _SOFT = 0.05
-"""Range of the cosine of incidence in which a string's current rises smoothly from zero.
+"""Range of the cosine of the incidence angle in which a string's current rises smoothly from zero.
 
-A slope at zero is needed if the Sun is normal to a face, because the adjacent faces then have zero current.
+This smooth rise gives a slope if the Sun is normal to a face, where adjacent faces have zero current.
 """
 _RARE = 3.09
-"""Number of standard deviations that one reading in a thousand exceeds."""
+"""Number of standard deviations that one normal reading in a thousand exceeds."""
 
 
 class CoarseSunStatus(Enum):
@@ -47,9 +47,9 @@ class CoarseSunStatus(Enum):
     DARK = "dark"
     """No string has a significant current, because of an eclipse or failed strings."""
     UNCERTAIN = "uncertain"
-    """No Sun direction explains the currents for any amount of Earth light.
+    """No Sun direction explains the currents, whatever the amount of light from the Earth.
 
-    A dead string often looks like a string on a dark face.
+    A dead string often cannot be distinguished from a string on a dark face.
     """
 
 
@@ -62,8 +62,8 @@ class SolarStringModel:
         peaks: currents (n,) in full sunlight at normal incidence, A.
         sigma: standard deviation of a reading relative to its peak, from calibration errors and departures
             from the cosine law.
-        albedo: brightness of an Earth that fills half the sky, relative to the Sun, as a mean over day and
-            night.
+        albedo: brightness of an Earth that would fill half the sky, relative to the Sun, as a mean over day
+            and night.
         albedo_sigma: standard deviation of the albedo, from clouds and the elevation of the Sun.
         dark: fraction of the peak current below which a string counts as dark.
 
@@ -113,7 +113,7 @@ class CoarseSun:
 
     @property
     def sigma(self) -> float:
-        """The standard deviation per axis, rad. The deviation is infinite without a direction."""
+        """The standard deviation per axis, rad. Without a direction, the standard deviation is infinite."""
         covariance = self.tangent_covariance
         return float("inf") if covariance is None else float(np.sqrt(0.5 * np.trace(covariance)))
 
@@ -153,7 +153,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
         weighted = slopes.T @ information
         inverse = np.linalg.inv(weighted @ slopes + 1e-6 * np.eye(2))
         step = inverse @ (weighted @ (readings - modelled))
-        # The step is limited to half a radian, because the linear model is poor far from the solution.
+        # Each step is limited to half a radian, because the linear model is poor far from the solution.
         step *= min(1.0, 0.5 / max(float(np.hypot(*step)), 1e-12))
         direction = direction + step @ basis
         direction = direction / np.linalg.norm(direction)
@@ -161,7 +161,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
             break
     left = readings - _sunlight(normals @ direction)[0]
     square, freedom = float(left @ information @ left), len(shares) - 2
-    # The limit is the chi-square that one reading in a thousand exceeds (Wilson and Hilferty 1931).
+    # This limit is the chi-square that one reading in a thousand exceeds (Wilson and Hilferty 1931).
     ninth = 2.0 / (9.0 * freedom)
     if square > float(freedom * (1.0 - ninth + _RARE * np.sqrt(ninth)) ** 3):
         reason = f"no Sun direction explains the currents: chi-square {square:.0f} of {freedom}"
@@ -170,7 +170,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
 
 
 def _sunlight(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return string currents relative to the peak current, and their derivatives, at cosines of incidence.
+    """Return relative string currents, and their derivatives, at the cosines of the incidence angles.
 
     `cosines` (...) are the cosines of the angles between the Sun and the normals of the strings. The current
     is 0 if the Sun is behind the string.
@@ -180,13 +180,13 @@ def _sunlight(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _earthlight(strings: SolarStringModel, nadir: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """Return the mean fraction (n,) of Earth light in the readings, and the readings' covariance (n, n)."""
+    """Return the mean relative current (n,) from Earth light, and the covariance (n, n) of the readings."""
     normals, square = strings.normals, strings.albedo_sigma**2
     own = strings.sigma**2 * np.eye(len(normals))
     if nadir is not None:
         pattern = 0.5 * (1.0 + normals @ nadir)
         return strings.albedo * pattern, own + square * np.outer(pattern, pattern)
-    # Averaged over directions e, (1 + n.e)/2 is 1/2, and the product for normals n and m is 1/4 + n.m/12.
+    # Averaged over directions e of nadir, (1 + n.e)/2 is 1/2, and its product for n and m is 1/4 + n.m/12.
     even = np.full(len(normals), 0.5)
     second = 0.25 + normals @ normals.T / 12.0
     covariance = (strings.albedo**2 + square) * second - strings.albedo**2 * np.outer(even, even)
@@ -194,17 +194,17 @@ def _earthlight(strings: SolarStringModel, nadir: FloatArray | None) -> tuple[Fl
 
 
 _TURNS = 180
-"""Number of rotations about the field direction that are tried, two degrees apart."""
+"""Number of trial rotations about the direction of the magnetic field, two degrees apart."""
 _IMPROBABLE = 1e-4
-"""Probability of the measured currents below which a rotation is rejected."""
+"""Probability of the measured currents below which a trial rotation is rejected."""
 _MEMORY = 120.0
-"""Time (s) for which a rotation stays rejected, limited by the drift of the gyro."""
+"""Time (s) for which a rejected trial rotation stays rejected, limited by the drift of the gyro."""
 _MOST_VIOLATION = 3.0
-"""Upper limit of the accumulated violation, as a multiple of the bound."""
+"""Upper limit of a trial rotation's accumulated excess chi-square, as a multiple of the rejection limit."""
 _CERTAIN = 5.0
-"""Distance from the result to the farthest possible rotation, in standard deviations of the result."""
+"""Distance from the attitude to the farthest possible rotation, in standard deviations of the attitude."""
 _COMMON = 0.02
-"""Relative error that is common to all strings, such as the distance of the Sun and the temperature."""
+"""Relative error common to all strings, for instance from the distance of the Sun and the temperature."""
 _STEP = 2.0 * math.pi / _TURNS
 _ANGLES = _STEP * np.arange(_TURNS)
 
@@ -216,7 +216,7 @@ class KnownDirections:
     Attributes:
         field: magnetic field vector (3,), T.
         sun, nadir: unit vectors (3,) to the Sun and to nadir.
-        light: brightness of an Earth that fills half the sky, relative to the Sun.
+        light: brightness of an Earth that would fill half the sky, relative to the Sun.
         light_sigma: standard deviation of `light`.
     """
 
@@ -248,7 +248,8 @@ class FieldAndStrings:
     """Attitude estimator that keeps track of the possible rotations about the magnetic field.
 
     Attributes:
-        wrong: fault that the last reading shows. The text is empty if all strings agree.
+        wrong: description of a fault that the last reading shows. The description `wrong` is empty if all
+            strings agree.
     """
 
     def __init__(self, strings: SolarStringModel) -> None:
@@ -260,7 +261,7 @@ class FieldAndStrings:
         self.wrong = ""
 
     def forget(self) -> None:
-        """Make all rotations possible again, after the body has rotated without gyro data."""
+        """Make all rotations about the field possible again, after the body has rotated without gyro data."""
         self._base = None
         self._against[:] = 0.0
 
@@ -295,7 +296,7 @@ class FieldAndStrings:
             return None
         base = self._aligned(axis, sky.field / strength)
         whole, without = self._misfits(attitude_matrix(base), shares, axis, math.hypot(across, blur), sky)
-        # Each rotation accumulates its excess chi-square separately for each string that may have failed.
+        # Excess chi-square is summed separately for each trial rotation and each string that may have failed.
         one, fewer, all_ = self._bounds
         least = without.min(axis=1)
         against = np.maximum(without / fewer, (without - least[:, None]) / one)
@@ -320,7 +321,7 @@ class FieldAndStrings:
         return StringFix(attitude, about**2 * along + across**2 * (np.eye(3) - along), axis, about)
 
     def _aligned(self, axis: FloatArray, known: FloatArray) -> FloatArray:
-        """Return the base attitude (4,) after the shortest rotation of the `known` field onto `axis`."""
+        """Return the base attitude (4,), rotated by the shortest way from the `known` field to `axis`."""
         base = np.array([0.0, 0.0, 0.0, 1.0]) if self._base is None else self._base
         shown = attitude_matrix(base) @ known
         if float(shown @ axis) < -0.99:
@@ -334,9 +335,10 @@ class FieldAndStrings:
     def _misfits(
         self, base: FloatArray, shares: FloatArray, axis: FloatArray, tilt: float, sky: KnownDirections
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the chi-squares of the relative currents `shares` (n,) for t rotations.
+        """Return the chi-squares of the relative currents `shares` (n,) for t trial rotations.
 
-        The first array (t,) uses all strings, and each row of the second array (n, t) omits one string.
+        The first returned array (t,) uses all strings, and each row of the second array (n, t) omits one
+        string.
         """
         strings = self._strings
         sunlight, slopes = _sunlight(_rotated_about(base @ sky.sun, axis) @ strings.normals.T)
@@ -354,7 +356,7 @@ class FieldAndStrings:
 
 
 def _rotated_about(vector: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return a fixed direction (3,) in the axes of a body after each of t rotations about `axis` (t, 3)."""
+    """Return an inertial direction (3,) in body axes after each of t rotations about `axis`, as (t, 3)."""
     along = float(vector @ axis) * axis
     return np.asarray(
         along + np.outer(np.cos(_ANGLES), vector - along) - np.outer(np.sin(_ANGLES), np.cross(axis, vector))

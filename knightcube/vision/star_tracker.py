@@ -2,8 +2,8 @@
 
     solution = StarTracker(fov_deg=11.4).solve(image)
 
-The class combines the steps of `knightcube.vision.startracker` with those for streaked stars, by the decision
-tree of `knightcube.vision.frame_job`.
+The class `StarTracker` combines the steps of `knightcube.vision.startracker` with those for streaked stars,
+by the decision tree of `knightcube.vision.frame_job`.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ class MatchedStars:
     """Catalogue stars that were identified in an image, in the order of their brightness in the image.
 
     Attributes:
-        hip: Hipparcos numbers (m,) of the stars. A group of stars that the image does not resolve has the
-            number of its brightest star.
-        magnitude: Johnson V magnitudes (m,). Unresolved stars have their joint magnitude.
+        hip: Hipparcos numbers (m,) of the stars. For a group of stars that the image does not resolve, `hip`
+            is the number of the brightest star.
+        magnitude: Johnson V magnitudes (m,). For stars that the image does not resolve, `magnitude` is their
+            joint magnitude.
         directions: unit vectors (m, 3) to the stars, ICRS, at the epoch of the image.
         points: measured positions (m, 2), x and y, px. The position of a streaked star is that at
             mid-exposure.
-        residuals: measured minus predicted positions (m, 2), px.
+        residuals: measured minus predicted positions of the stars (m, 2), px.
     """
 
     hip: IntArray
@@ -84,11 +85,12 @@ class StarSolution:
         rate: angular velocity (3,) of the camera relative to inertial space, in camera axes, rad/s. The rate
             is None unless the stars are streaks and the exposure was given.
         rate_covariance: covariance (3, 3) of `rate`, rad^2/s^2, or None.
-        rate_sign_known: whether the sign of `rate` is known. A single image shows the sign only together with
+        rate_sign_known: whether the sign of `rate` is known. The sign of the rate can only be determined with
             a predicted rate.
-        sky_map: conversion between pixels and ICRS directions; None unless solved.
+        sky_map: conversion between pixels of the image and ICRS directions; None unless solved.
         frame: all results of the star tracker, including the points that are not catalogue stars.
-        index: sky index at the epoch of the image. The star indices in `frame.star` refer to this sky index.
+        index: sky index (catalogue of guide stars) at the epoch of the image. The star indices in
+            `frame.star` refer to this sky index.
     """
 
     status: str
@@ -234,7 +236,7 @@ class StarTracker:
         return _solution(frame, sky, settings.velocity, exposure is not None)
 
     def _camera_for(self, shape: tuple[int, ...]) -> tuple[CameraModel, tuple[float, float]]:
-        """Return the camera for an image of `shape`, and limits of the factor on field-angle tangents."""
+        """Return the camera for an image of `shape`, and the limits of the scale of field-angle tangents."""
         camera = self._camera
         if camera is None:
             return camera_of_field(self._fov_deg, self._fov_error_deg, shape)
@@ -249,19 +251,19 @@ class StarTracker:
 
 
 def field_of_view(camera: CameraModel) -> float:
-    """Return the field of view (rad) across the columns of a camera, between outer edges, undistorted."""
+    """Return the undistorted field of view (rad) between the outer edges of the first and last column."""
     return 2.0 * math.atan(0.5 * camera.columns / camera.focal_length)
 
 
 def camera_of_field(
     fov_deg: float | None, error_deg: float | None, shape: tuple[int, ...]
 ) -> tuple[Pinhole, tuple[float, float]]:
-    """Return a pinhole camera for a field of view, and limits of the factor on field-angle tangents.
+    """Return a pinhole camera for a field of view, and the limits of the scale of field-angle tangents.
 
     Args:
         fov_deg: field of view across the columns, deg. If `fov_deg` is None, the range `UNKNOWN_FOV_DEG` is
             used.
-        error_deg: largest error of `fov_deg`, deg; None: 5 % of it.
+        error_deg: largest error of the field of view, deg; None: 5 % of it.
         shape: number of rows and columns of the image.
 
     Raises InputError if the field of view is not between 1 and 120 deg.
@@ -278,7 +280,7 @@ def camera_of_field(
 
 
 def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None:
-    """Raise InputError if the field of view is outside of 1 to 120 deg or the error is negative."""
+    """Raise InputError if the field of view is not from 1 to 120 deg or its error is negative."""
     if fov_deg is not None and not 1.0 <= fov_deg <= 120.0:
         raise InputError("field of view", f"{fov_deg:g}: give 1 to 120 degrees across the columns")
     if error_deg is not None and not 0.0 <= error_deg < 120.0:
@@ -288,7 +290,7 @@ def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None
 def _solution(
     frame: FrameSolution, sky: SkyIndex, velocity: FloatArray | None, exposure_known: bool
 ) -> StarSolution:
-    """Return the public solution from the results of a frame."""
+    """Return the solution for the user from the results of a frame."""
     fix, matched, motion = frame.fix, frame.matched, frame.motion
     pointing = Pointing(math.nan, math.nan, math.nan) if fix is None else Pointing.of(fix.quaternion)
     if fix is None:

@@ -2,12 +2,12 @@
 
     solution = find_sun(image, camera)
 
-Every few rows of the image are read, and bright patches on these rows are candidates. The rim of a candidate
-is traced along spokes, and a circle on the sphere is fitted to the rim points. The centre of the circle is
-the centre of the Sun, even if the disc is saturated, has glare, or is truncated by the edge of the image. An
-initial circle is found by consensus among triples of rim points, and is then refined by geometric least
-squares (Gauss-Newton). Tukey's biweight of each point's distance from the circle (Huber 1981, Robust
-Statistics, chapter 7) excludes a cloud beside the disc or a hot pixel on the rim.
+Only every few rows of the image are read, and bright patches on these rows are candidates for the Sun. The
+rim of a bright patch is traced along spokes from its centre, and a circle on the sphere is fitted to the rim
+points. The centre of this circle is the centre of the Sun, even if the disc is saturated, has glare, or is
+truncated by the edge of the image. An initial circle is found by consensus among triples of rim points, and
+is then refined by geometric least squares (Gauss-Newton). Tukey's biweight of each point's distance from the
+circle (Huber 1981, Robust Statistics, chapter 7) excludes a cloud beside the disc or a hot pixel on the rim.
 
 The function `sun_of_cameras` reads the cameras in an order that depends on the coarse Sun direction from the
 solar strings (Meller et al., chapter 2). If no camera finds the Sun, the coarse direction is returned with
@@ -35,24 +35,24 @@ from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus
 class SunSettings:
     """Settings that distinguish the Sun from other bright objects, and assumed errors of the Sun direction.
 
-    At a given exposure, the bright disc of the Sun with its glare has a fixed radius. The limits should
-    enclose that radius within about a fifth. With wider limits, a cloud may be mistaken for the Sun. The
-    default values fit a logarithmic camera like the Fuga 15d; `LINEAR` fits a linear camera in which white
-    clouds are close to saturation.
+    At a given exposure, the bright disc of the Sun with its glare has a fixed radius. The radius limits
+    should enclose the radius of the disc with its glare within about a fifth. With wider radius limits, a
+    cloud may be mistaken for the Sun. The default values fit a logarithmic camera like the Fuga 15d; `LINEAR`
+    fits a linear camera in which white clouds are close to saturation.
 
     Attributes:
         level: threshold of the Sun's image, counts. For a logarithmic camera, the threshold is well above the
             brightest cloud, so that only the disc remains. For a linear camera, the threshold is slightly
             below saturation.
         stride: distance between the rows that are read first, px.
-        least_radius: radius below which a patch counts as a hot pixel, rad. The Sun itself has a radius of
-            0.0047 rad.
-        greatest_radius: radius above which a patch counts as a cloud or the Earth, rad.
-        tolerance: largest rms distance of the rim from a circle, px.
-        least_agreement: minimum fraction of the rim within the image that must lie on the circle.
-        least_arc: minimum visible arc of the rim, rad.
-        rim_sigma: minimum standard deviation of a rim point, px.
-        floor_sigma: minimum standard deviation of the centre per axis, from the finite pixel size, px.
+        least_radius: radius below which a bright patch counts as a hot pixel, rad. The Sun itself has a
+            radius of 0.0047 rad.
+        greatest_radius: radius above which a bright patch counts as a cloud or the Earth, rad.
+        tolerance: largest rms distance of the rim of the Sun's disc from a circle, px.
+        least_agreement: minimum fraction of the disc's rim within the image that must lie on the circle.
+        least_arc: minimum visible arc of the disc's rim, rad.
+        rim_sigma: minimum standard deviation of a point on the disc's rim, px.
+        floor_sigma: minimum standard deviation of the disc's centre per axis, from the finite pixel size, px.
 
     Raises:
         UsageError: if a value is out of range.
@@ -98,7 +98,7 @@ class SunStatus(Enum):
     NO_SUN = "no-sun"
     """No part of the image is bright enough for the Sun."""
     NOT_THE_SUN = "not-the-sun"
-    """A patch is bright enough, but too small, too large or not round.
+    """A patch of the image is bright enough for the Sun, but too small, too large or not round.
 
     The attribute `reason` says why the patch is not the Sun.
     """
@@ -113,11 +113,11 @@ class SunMeasurement:
         basis: two unit vectors (2, 3) that are normal to the direction and to each other.
         tangent_covariance: covariance (2, 2) of the direction error along `basis`, without the error of the
             lens calibration, rad^2.
-        point: position of the Sun's centre (2,) in the image, px. The position is NaN if the centre is
+        point: position of the Sun's centre (2,) in the image, px. The position is NaN if the Sun's centre is
             outside the range of the lens.
         radius: radius of the bright disc with its glare, rad.
         residual: rms distance of the used rim points from the circle, px.
-        arc: arc of the rim that was used in the fit, rad.
+        arc: arc of the disc's rim that was used in the fit, rad.
         cut: whether the edge of the image truncates the bright disc.
     """
 
@@ -163,15 +163,15 @@ class SunSolution:
 
 
 _MOST_PATCHES = 4
-"""Maximum number of patches that are examined, starting with the largest."""
+"""Maximum number of bright patches that are examined, starting with the largest."""
 _LEAST_PATCH = 3
-"""Minimum number of pixels of a patch on the rows that are read, to exclude hot pixels."""
+"""Minimum number of pixels of a bright patch on the rows that are read, to exclude hot pixels."""
 _SPOKES = 48
-"""Number of spokes along which a rim is traced."""
+"""Number of spokes along which the rim of a bright patch is traced."""
 _STEP = 0.5
-"""Distance (px) between samples along a spoke."""
+"""Distance (px) between samples along a spoke from the centre of a patch to its rim."""
 _ROUNDS = 3
-"""Maximum number of tracings of the rim, each from the centre of the previous circle."""
+"""Maximum number of tracings of a rim, each from the centre of the circle fitted before."""
 _NEAR = 0.5
 """Distance (px) between fitted centre and origin of the spokes at which the tracing stops."""
 
@@ -199,7 +199,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
     reasons = ["a patch larger than the Sun and its glare"] if wide else []
     found: list[SunMeasurement] = []
     for middle, half in patches:
-        # Twice the radius and a margin are searched, because the centre may lie outside the image.
+        # Spokes of twice the radius plus a margin are searched, because the centre may lie outside the image.
         near = min(2.5 * half + 6.0, 2.0 * reach)
         first = max(int(np.floor(middle[1] - near)), 0)
         strip = image[first : min(int(np.ceil(middle[1] + near)), camera.rows - 1) + 1]
@@ -214,7 +214,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
         if reasons:
             return SunSolution(SunStatus.NOT_THE_SUN, reasons[0], None, read)
         return SunSolution(SunStatus.NO_SUN, f"nothing reaches {settings.level:g} counts", None, read)
-    # If several patches are round, the largest counts as the Sun.
+    # If several bright patches are round, the largest counts as the Sun.
     sun = max(found, key=lambda one: one.radius)
     return SunSolution(SunStatus.PARTIAL if sun.cut else SunStatus.FOUND, "", sun, read)
 
@@ -225,7 +225,7 @@ def _bright_patches(
     """Return centre (2,), px, and half extent, px, of the bright patches, the largest first.
 
     Only every `stride`th row is read. Patches narrower than `narrowest` px or wider than `widest` px are
-    excluded. The second value states whether a patch was excluded as too wide.
+    excluded. The second returned value states whether a patch was excluded as too wide.
     """
     stride = settings.stride
     bright = image[stride // 2 :: stride] >= settings.level
@@ -261,8 +261,8 @@ class _Rim:
         axis: unit vector (3,) in camera axes, from which the spokes start.
         basis: two unit vectors (2, 3) that span the tangent plane.
         points: positions (n, 2) in the azimuthal equidistant projection about the axis, rad.
-        cut: number of spokes that leave the image before the rim.
-        endless: number of spokes without a rim within the searched distance.
+        cut: number of spokes that leave the image before they reach the rim.
+        endless: number of spokes that do not reach the rim within the searched distance.
     """
 
     axis: FloatArray
@@ -274,7 +274,7 @@ class _Rim:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Disc:
-    """A bright disc: its rim, the circle through the rim, and px per rad (2, 2) along the rim's basis."""
+    """A bright disc: its rim, the circle fitted to the rim, and px per rad (2, 2) along the rim's basis."""
 
     rim: _Rim
     circle: Circle
@@ -305,7 +305,7 @@ def _disc(
     step = 1e-4
     for _ in range(_ROUNDS):
         rim = _trace(strip, first, camera, axis, settings.level, reach)
-        # The scale of the boresight is used if the surroundings of the axis are outside the lens's range.
+        # The scale at the boresight is used if the surroundings of the axis are outside the lens's range.
         ends = camera.project(np.concatenate([axis + step * rim.basis, axis - step * rim.basis]))
         scale = (ends[:2] - ends[2:]).T / (2.0 * step)
         scale = scale if np.all(np.isfinite(scale)) else camera.focal_length * np.eye(2)
@@ -336,7 +336,7 @@ def _trace(
     rays = np.cos(arcs)[:, None] * axis + np.sin(arcs)[:, None] * (ways @ basis)[:, None, :]
     counts = sample(strip, first_row, camera.project(rays.reshape(-1, 3))).reshape(_SPOKES, -1)
     inner, outer = counts[:, :-1], counts[:, 1:]
-    # Outside the image, the counts are NaN, so that both comparisons are false.
+    # Counts outside the image are NaN, so that both comparisons are false.
     falls = (inner >= level) & (outer < level)
     crosses = falls.any(axis=1)
     at = falls.argmax(axis=1)[crosses]
@@ -378,7 +378,7 @@ def _flaw(disc: _Disc, settings: SunSettings) -> str:
     if used * 2.0 * np.pi / _SPOKES < settings.least_arc:
         return f"too short an arc of a rim, {used * 360 // _SPOKES} deg,"
     residual = circle.residual * disc.pixels_per_radian
-    # If the lens stretches the disc, a round blur in the image is elongated on the sphere.
+    # If the lens stretches the disc, a round blur in the image is elongated in directions on the sphere.
     widest, narrowest = np.linalg.svd(disc.scale, compute_uv=False)
     if residual > settings.tolerance * math.sqrt(float(widest / narrowest)):
         return f"a rim {residual:.2f} px rms off a circle"
@@ -392,7 +392,7 @@ def _measurement(disc: _Disc, camera: CameraModel, settings: SunSettings) -> Sun
     backward = np.linalg.inv(disc.scale)
     floor = settings.floor_sigma**2 * backward @ backward.T
     axis = disc.axis
-    # The basis of the rim is tilted to the fitted centre.
+    # The basis vectors of the rim are rotated so that they are normal to the fitted centre.
     first = disc.rim.basis[0] - (disc.rim.basis[0] @ axis) * axis
     first /= np.linalg.norm(first)
     return SunMeasurement(
@@ -411,13 +411,13 @@ _LEAST_POINTS = 6
 """Minimum number of points for the fit of a circle."""
 _CIRCLE_STEPS = 10
 _LAST_STEP = 1e-2
-"""Step at which the iteration stops, relative to the error of a point."""
+"""Step of the circle fit at which the iteration stops, relative to the error of a point."""
 _MOST_CORRELATED = 0.9
 """Largest assumed correlation between the errors of neighbouring points."""
 _TUKEY = 4.685
 """Cut-off of Tukey's biweight in standard deviations, 95 % efficient for Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
-"""Fraction of the largest consensus that a smaller circle must reach to be preferred.
+"""Fraction of the largest number of agreeing points that a smaller circle must reach to be preferred.
 
 Stray light enlarges discs, so that a smaller circle is more likely the Sun.
 """
@@ -432,8 +432,8 @@ class Circle:
         radius: radius, positive.
         used: mask (n,) of the points that determine the circle.
         residual: rms distance of the used points from the circle.
-        shape: covariance (2, 2) of the centre for unit variance of each point, including the measured
-            correlation of neighbouring points.
+        shape: covariance (2, 2) of the circle's centre for unit variance of each point, including the
+            measured correlation of neighbouring points.
     """
 
     centre: FloatArray
@@ -446,7 +446,7 @@ class Circle:
 def fit_circle(points: FloatArray, scale: float) -> Circle | None:
     """Return the circle through `points` (n, 2), which are in order around it; None if there is none.
 
-    `scale` is the standard deviation of a good point, in the unit of the points.
+    The argument `scale` is the standard deviation of a good point, in the unit of the points.
     """
     solution = _consensus(points, 2.5 * scale) if len(points) >= _LEAST_POINTS else None
     if solution is None:
@@ -471,14 +471,14 @@ def fit_circle(points: FloatArray, scale: float) -> Circle | None:
     square = float(np.mean(left**2))
     if not (solution[2] > 0.0 and 0.0 < square < np.inf):
         return None
-    # Correlated errors of a first-order process increase the variance of a mean by (1 + r)/(1 - r).
+    # Correlation r of neighbouring errors increases the variance of a mean by (1 + r)/(1 - r).
     correlation = min(max(float(np.mean(left * np.roll(left, 1))) / square, 0.0), _MOST_CORRELATED)
     shape = np.linalg.inv(slopes.T @ slopes)[:2, :2] * ((1.0 + correlation) / (1.0 - correlation))
     return Circle(solution[:2], float(solution[2]), used, float(np.sqrt(square)), np.asarray(shape))
 
 
 def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return distances (n,) of points from a circle (x, y, radius), positive outside, and slopes (n, 3)."""
+    """Return distances (n,) of points from a circle (x, y, radius), and their derivatives (n, 3)."""
     offset = points - solution[:2]
     length = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-12)
     slopes = np.concatenate([-offset / length[:, None], np.full((len(points), 1), -1.0)], axis=1)
@@ -488,7 +488,7 @@ def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, Fl
 def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
     """Return the circle (x, y, radius) through three points with the most other points within `gate`.
 
-    The points of a triple are evenly spaced, by an eighth to a third of the rim.
+    The three points are evenly spaced, by an eighth to a third of the rim.
     """
     count = len(points)
     place = np.arange(0, count, 3)
@@ -519,7 +519,7 @@ _SIGMAS = 3.0
 _RING = 12
 """Number of directions that are tested at each angular distance from the coarse Sun direction."""
 _CONTRADICTED = 5.0
-"""Largest distance of the measured from the coarse Sun direction, in standard deviations of the latter."""
+"""Largest distance between measured and coarse Sun direction, in standard deviations of the latter."""
 _CUT = np.radians(0.05)
 """Systematic error per axis (rad) of a disc that the edge of the image truncates."""
 
@@ -546,7 +546,7 @@ def cameras_by_sun(sun: CoarseSun, cameras: Sequence[MountedCamera]) -> list[Cam
 
     Cameras with the coarse Sun direction in their field of view come first, followed by cameras that may have
     the Sun in their field of view. Each group of cameras is sorted by the angle between boresight and coarse
-    Sun direction. If there is no coarse Sun direction, all cameras are possible, in their given order.
+    Sun direction. Without a coarse Sun direction, all cameras are possible, in their given order.
     """
     if sun.direction is None or sun.basis is None or sun.tangent_covariance is None:
         if sun.status is CoarseSunStatus.DARK:
@@ -576,7 +576,7 @@ class SunOfCameras:
             Sun.
         covariance: covariance (3, 3) of the direction error, zero along the direction, rad^2.
         camera: index of the camera that found the Sun, or None if the solar strings gave the direction.
-        each: solutions by camera index, in the order in which the cameras were read.
+        each: result of the search in each image by camera index, in the order in which the cameras were read.
         reason: reason why no camera found the Sun. The reason is empty if a camera found the Sun.
     """
 
@@ -599,7 +599,7 @@ def sun_of_cameras(
     that contradicts the solar strings is rejected.
 
     Args:
-        images: images (rows, columns) of one instant, by camera index.
+        images: images (rows, columns) taken at one instant, by camera index.
         cameras: all cameras of the body.
         strings: coarse Sun direction from the solar strings.
         settings: settings of the search for the Sun.

@@ -1,10 +1,10 @@
 """Sub-pixel edges along scan lines of an image, as pixel positions and as directions.
 
-Columns and rows of the image are normalised, thresholded and filtered as in Meller et al., section 3.1. Each
-change from dark to bright is then located at the maximum slope of the brightness smoothed by a Gaussian. The
-width of the Gaussian is doubled as long as the edge is wider than the Gaussian (Lindeberg 1998, International
-Journal of Computer Vision 30, 117). Therefore a limb of one pixel and a limb of a hundred pixels are both
-located at the steepest point.
+Some columns and rows of the image are normalised, thresholded and filtered as in Meller et al., section 3.1.
+Each change from dark to bright is then located at the point of maximum slope of the brightness, smoothed by a
+Gaussian. The width of this Gaussian is doubled as long as the edge is wider than the Gaussian (Lindeberg
+1998, International Journal of Computer Vision 30, 117). Therefore an edge of one pixel and an edge of a
+hundred pixels are both located at the steepest point.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from knightcube.vision.camera.lens import CameraModel, Lens
 from knightcube.vision.horizon.settings import EdgeSettings, light_of
 
 RUN = 5
-"""Window (px) of the majority filter that removes short fluctuations of a binary line."""
+"""Window (px) of the majority filter that removes short fluctuations of dark and bright pixels."""
 
 
 def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
-    """Return binary lines (n, m) after a majority filter of `run` px, an odd number.
+    """Return scan lines (n, m) of dark and bright pixels after a majority filter of `run` px, an odd number.
 
-    Each line is extended at both ends by repeating its end pixel. Source: Meller et al., section 3.1, step 2.
+    Each scan line is extended at both ends by repeating its end pixel. Source: Meller et al., section 3.1,
+    step 2.
     """
     half = run // 2
     size = binary.shape[1]
@@ -37,27 +38,27 @@ def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
 
 
 _SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-"""Standard deviations (px) of the Gaussians that smooth the brightness."""
+"""Standard deviations (px) of the Gaussians that smooth the brightness along a scan line, for all scales."""
 _REACH = 3.0
-"""Largest distance of the steepest point from a binary line's change, in Gaussian standard deviations."""
+"""Largest distance of an edge from the change of dark to bright pixels, in Gaussian standard deviations."""
 _TAIL = 3.5
-"""Distance at which the Gaussian is truncated, in standard deviations."""
+"""Distance from the centre at which the Gaussian is truncated, in standard deviations."""
 _OUTGROWN = 1.4
 """Ratio of an edge's step heights at two successive scales above which the larger scale is used."""
 _MARGIN = 4.0
 """Distance from the image border (px) within which edges are ignored; some detectors have a black frame."""
 _FLOOR, _SHARE = 0.1, 0.05
-"""Prior error of an edge position: a constant (px), plus a fraction of the Gaussian's standard deviation."""
+"""Prior error of an edge's position: a constant (px), and a fraction of the Gaussian's standard deviation."""
 _SAMPLES = 2048
-"""Number of pixels from which the dark and bright levels are determined."""
+"""Number of pixels from which the brightness levels of dark and bright pixels are determined."""
 _STEP_TO_SIGMA = 1.4826 / 2.0**0.5
 """Ratio of the standard deviation of Gaussian noise to the median absolute difference of two pixels."""
 _STANDS_OUT = 6.0
 """Threshold above which a pixel counts as bright, in standard deviations of the dark pixels."""
 _LEAST_LIT = 16
-"""Minimum number of bright samples, because fewer bright samples may be a hot pixel or a star."""
+"""Minimum number of bright pixels next to an edge, because fewer pixels may be a hot pixel or a star."""
 _PROFILE: IntArray = np.arange(-9, 6)
-"""Positions of the stored profile samples, in px from the edge towards the bright side."""
+"""Positions of the samples of a stored brightness profile, in px from the edge towards the bright side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +76,9 @@ class ScanLines:
 
     Attributes:
         columns, rows: indices of the columns and of the rows.
-        column_bright, row_bright: whether each pixel of a line is bright after the filter (n, m).
-        space: distance between neighbouring lines, px.
+        column_bright, row_bright: whether each pixel of these columns and of these rows is bright after the
+            majority filter (n, m).
+        space: distance between neighbouring columns, and between neighbouring rows, px.
         levels: brightness levels of dark and bright pixels.
     """
 
@@ -113,8 +115,8 @@ class ScanEdges:
     Attributes:
         points: positions of the edges (n, 2), px.
         towards: unit vectors along the scan line towards the bright side (n, 2).
-        scale: standard deviation of the Gaussian that found the edge (n,), px.
-        sigma: standard deviation of the edge position along the scan line before a fit (n,), px.
+        scale: standard deviation of the Gaussian with which each edge was found (n,), px.
+        sigma: standard deviation of each edge position along the scan line before a fit of the limb (n,), px.
         background: brightness of the dark side (n,), which is low at the limb and the terminator, and higher
             at a coast or a cloud.
         profile: brightness along the scan line around the edge, from dark to bright (n, m), or NaN outside
@@ -131,7 +133,7 @@ class ScanEdges:
     @property
     def profile_steps(self) -> FloatArray:
         """The positions of the profile samples (n, m), in px from the edge towards the bright side."""
-        # The profile is centred on the pixel nearest to the edge, not on the edge.
+        # The brightness profile is centred on the pixel nearest to the edge, not on the edge.
         place = np.sum(self.points * self.towards, axis=1)
         return np.asarray((np.rint(place) - place)[:, None] + _PROFILE)
 
@@ -142,7 +144,7 @@ class ScanEdges:
 def find_edges(
     image: Image, settings: EdgeSettings, part: ImagePart | None = None
 ) -> tuple[ScanEdges, ScanLines]:
-    """Return the edges on evenly spaced columns and rows of an image (rows, columns), and the lines searched.
+    """Return edges on evenly spaced columns and rows of an image (rows, columns), and the lines searched.
 
     If `part` is given, only lines that cross this part of the image are searched.
     """
@@ -173,7 +175,7 @@ def find_edges(
 
 
 def _levels(light: list[FloatArray]) -> Levels:
-    """Return the brightness levels of scan lines; the dark and bright level are equal if no pixel is bright.
+    """Return the brightness levels of scan lines; dark and bright level are equal if no pixel is bright.
 
     The bright level is the median of all pixels that exceed the noise of the dark pixels, so that the Sun's
     disc and hot pixels have no effect.
@@ -203,10 +205,10 @@ class _BinaryChanges:
 
     Attributes:
         light: brightness of the pixels of all scan lines (s,).
-        first: index in `light` of the first pixel of each change's scan line (k,).
-        length: length of each change's scan line (k,), px.
-        start: position of each change's bright pixel along the scan line (k,), px.
-        step: direction towards the bright side along the scan line, 1 or -1 (k,).
+        first: index in `light` of the first pixel of the scan line on which each change lies (k,).
+        length: length of the scan line on which each change lies (k,), px.
+        start: position along the scan line of the first bright pixel of each change (k,), px.
+        step: direction along the scan line towards the bright side of each change, 1 or -1 (k,).
     """
 
     light: FloatArray
@@ -216,7 +218,7 @@ class _BinaryChanges:
     step: IntArray
 
     def along(self, which: IntArray, index: IntArray) -> FloatArray:
-        """Return the brightness (k, m) at positions `index` (k, m) along the scan lines of k changes."""
+        """Return the brightness (k, m) at m positions `index` (k, m) along the scan lines of k changes."""
         last = self.length[which, None] - 1
         return np.asarray(self.light[self.first[which, None] + np.minimum(np.maximum(index, 0), last)])
 
@@ -224,13 +226,13 @@ class _BinaryChanges:
 def _line_edges(
     light: list[FloatArray], bright: list[BoolArray], places: tuple[IntArray, IntArray], contrast: float
 ) -> ScanEdges:
-    """Return the edges on columns and rows that are higher than `contrast`.
+    """Return those edges on columns and rows whose step height exceeds `contrast`.
 
     Args:
         light: brightness of the columns and of the rows, each (n, m).
         bright: which pixels of the columns and of the rows are bright, each (n, m).
         places: indices of the columns and of the rows, each (n,).
-        contrast: minimum height of an edge.
+        contrast: minimum step height of an edge.
     """
     parts, read = [], 0
     for direction, binary in enumerate(bright):
@@ -251,7 +253,7 @@ def _line_edges(
     step, other, axis, last = step[kept], other[kept], axis[kept], length[kept] - 1
     count = np.arange(len(kept))
     points, towards = np.empty((len(kept), 2)), np.zeros((len(kept), 2))
-    # On a column (axis 0) the position along the line is y.
+    # On a column (axis 0), the position along the scan line is the image coordinate y.
     points[count, axis], points[count, 1 - axis], towards[count, 1 - axis] = other, place, step
     index = np.rint(place).astype(int)[:, None] + step[:, None] * _PROFILE
     profile = changes.along(kept, index)
@@ -262,11 +264,11 @@ def _line_edges(
 
 
 def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the steepest point near each of k changes between dark and bright.
+    """Return the steepest point of the brightness near each of k changes between dark and bright.
 
-    The result is the distance of each point from the start of the change, px, the standard deviation of the
-    Gaussian that found the point, px, and the step height, each (k,). The step height is the height of a
-    sharp step with the same slope. A point with a step height below `weak` is not an edge.
+    The three returned arrays (k,) are the distance of the point from the start of the change, px, the
+    standard deviation of the Gaussian that found the point, px, and the step height. The step height is that
+    of a sharp step with the same slope. A point with a step height below `weak` is not an edge.
     """
     count = len(changes.start)
     offset, height, scale = np.zeros(count), np.zeros(count), np.ones(count)
@@ -285,7 +287,7 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
         left, peak, right = slopes[k, best - 1], slopes[k, best], slopes[k, best + 1]
         bend = np.minimum(left - 2.0 * peak + right, -1e-300)
         place = best - reach + np.minimum(np.maximum(0.5 * (left - right) / bend, -1.0), 1.0)
-        # A step lower than `weak` is noise and does not end the search for a wide edge.
+        # A step lower than the threshold `weak` is noise and does not end the search for a wide edge.
         before = height[open_]
         gains = (peak > _OUTGROWN * before) | ((before < weak) & (peak > before))
         open_ = open_[gains]
@@ -295,10 +297,11 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
 
 @lru_cache(maxsize=16)
 def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
-    """Return the matrix (w, p) that converts brightness at w offsets into slopes at p offsets around 0.
+    """Return the matrix that gives the smoothed slope at p positions from the brightness at w positions.
 
-    The result is the w offsets (w,), px, the matrix (w, p), and the largest of the p offsets, px. The
-    Gaussian has the standard deviation `size`, px. The slope of a sharp unit step is 1 for every `size`.
+    The three returned values are the offsets of the w positions from the centre (w,), px, the matrix (w, p),
+    and the largest offset of the p positions, px. The smoothing Gaussian has the standard deviation `size`,
+    px. The matrix is scaled so that a sharp unit step has the slope 1 for every `size`.
     """
     half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
     x: FloatArray = np.arange(-half, half + 1, dtype=float)
@@ -322,8 +325,9 @@ class EdgeRays:
 
     Attributes:
         rays: unit vectors to the edges (n, 3), camera axes.
-        brighter: change of the unit vector per pixel along the scan line towards the bright side (n, 3).
-        pixel: angular size of a pixel at the edge (n,), rad.
+        brighter: change of the unit vector to each edge per pixel along the scan line towards the bright side
+            (n, 3).
+        pixel: angular size of a pixel at each edge (n,), rad.
     """
 
     rays: FloatArray
@@ -344,14 +348,14 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """Edges and samples of an image as directions.
+    """Edges and sampled pixels of an image as directions in camera axes.
 
     Attributes:
         space: distance between the scan lines, px.
-        edges: edges as pixel positions.
-        rays: edges as directions.
+        edges: edges of the image as pixel positions.
+        rays: edges of the image as directions.
         across, down: change of an edge's unit vector per pixel to the right and per pixel downwards (n, 3).
-        samples: sampled pixels on the scan lines.
+        samples: directions and brightness of sampled pixels on the scan lines.
     """
 
     space: float
@@ -367,7 +371,7 @@ def observe(
 ) -> Observation:
     """Return edges and sampled pixels as directions, without edges beyond the field of the lens.
 
-    If `samples` is given, it is used instead of samples of the scan lines.
+    If `samples` is given, these samples are used instead of samples of the scan lines.
     """
     count = len(edges)
     right, below = edges.points + np.array([1.0, 0.0]), edges.points + np.array([0.0, 1.0])
@@ -390,7 +394,7 @@ def observe(
 
 
 def _sample_places(size: int) -> IntArray:
-    """Return the positions of the samples along a scan line of `size` px."""
+    """Return the positions (px) of the sampled pixels along a scan line of `size` px."""
     return np.arange(_SAMPLE // 2, size, _SAMPLE * max(1, size // 512))
 
 
@@ -398,9 +402,9 @@ def _sample_places(size: int) -> IntArray:
 def _sample_rays(
     camera: Lens, columns: tuple[int, ...], rows: tuple[int, ...]
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the directions (m, 3) of the samples on scan lines, and which samples the lens images.
+    """Return the directions (m, 3) of the sampled pixels on scan lines, and which of them the lens images.
 
-    The result is cached, because it is the same in successive frames.
+    The directions are cached, because they are the same in successive frames.
     """
     x, y = np.meshgrid(columns, _sample_places(camera.rows), indexing="ij")
     other_y, other_x = np.meshgrid(rows, _sample_places(camera.columns), indexing="ij")

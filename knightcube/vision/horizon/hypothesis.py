@@ -1,10 +1,10 @@
 """A horizon hypothesis: a limb fitted to edges of the image, and the evidence for and against it.
 
 The significance of a horizon is an upper bound of the expected number of equally good horizons among chance
-edges, such as coasts and the rims of clouds. The density of chance edges is estimated from the edges beside
-the limb. A coast or the rim of a cloud with radius R that touches the limb stays within a distance g of the
-limb over a length of 2 sqrt(2 g R). Scan lines that cross the same segment of a coast or cloud are not
-independent, so the test counts segments of this length instead of scan lines.
+edges, such as coasts and the rims of clouds. The density of chance edges is estimated from the edges that lie
+beside the limb. A coast or the rim of a cloud with radius R that touches the limb stays within a distance g
+of the limb over a length of 2 sqrt(2 g R). Scan lines that cross the same segment of a coast or cloud are not
+independent, so that the test counts segments of this length instead of scan lines.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from knightcube.vision.horizon.limb import (
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _GRAZING = 0.3
-"""Minimum cosine of the angle between a scan line and the limb's normal; oblique lines are inaccurate."""
+"""Minimum cosine of the angle between scan line and limb normal; oblique scan lines are inaccurate."""
 _LOWEST_SUN = np.radians(1.0)
-"""Minimum elevation of the Sun at a limb point (rad); below it the limb appears too high."""
+"""Minimum elevation of the Sun (rad) at a limb point; with a lower Sun the limb appears too high."""
 _FINE = SCALE_HEIGHT / 6.0
-"""Pixel size at the limb (m) below which brightness profiles are too long for the stored samples."""
+"""Pixel size at the limb (m) below which the air's brightness profile exceeds the stored samples."""
 _CORRELATED = 10.0
-"""Correlation length (px) of the brightness behind the limb."""
+"""Correlation length (px), along the limb, of the brightness of the ground behind the limb."""
 _PIXEL_SIGMA = 12.0**-0.5
 """Standard deviation (px) of the blur that a square pixel causes."""
 _LEAST_SPREAD = 0.03
@@ -59,14 +59,14 @@ _OTHER_AIR = 500.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbPoints:
-    """The edges assigned to the limb.
+    """The n points on the limb, from the edges assigned to the limb.
 
     Attributes:
         index: indices of the limb's edges among the edges of the image (n,).
         rays: unit vectors to the limb points (n, 3), camera axes.
         sigma: standard deviations of the limb points normal to the limb (n,), rad.
         pixel: angular size of a pixel normal to the limb (n,), rad.
-        inward: cosine of the angle between the scan line and the limb's normal (n,).
+        inward: cosine of the angle between the scan line and the limb normal at each point (n,).
         residuals, gradients: residuals (n,), rad, and their gradients (n, 5) from `limb_gradients`.
     """
 
@@ -80,7 +80,7 @@ class LimbPoints:
 
 
 def near_limb(view: LimbView, observation: Observation, tolerance: float) -> BoolArray:
-    """Return which edges (n,) lie within `tolerance` px of the limb with the bright side towards nadir."""
+    """Return which edges (n,) are within `tolerance` px of the limb with their bright side towards nadir."""
     near = np.abs(limb_residuals(view, observation.rays.rays)) < tolerance * observation.rays.pixel
     return np.asarray(near & (observation.rays.brighter @ view.nadir > 0.0))
 
@@ -88,15 +88,15 @@ def near_limb(view: LimbView, observation: Observation, tolerance: float) -> Boo
 def _limb_points(
     view: LimbView, observation: Observation, members: BoolArray, sun: FloatArray | None
 ) -> LimbPoints:
-    """Return the limb points of those `members` (n,) that are sunlit and whose scan lines are not oblique."""
+    """Return limb points from those edges in `members` (n,) that are sunlit and on no oblique scan line."""
     chosen = np.flatnonzero(members)
     rays = observation.rays.rays[chosen]
     if sun is not None:
         day = sun_elevation(view, rays, sun) > _LOWEST_SUN
         chosen, rays = chosen[day], rays[day]
     residuals, gradients = limb_gradients(view, rays)
-    # A small change s of the ray u changes the residual as much as the rotation u x s does.
-    # The slopes (n, 2) are the changes of the residual per pixel to the right and downwards.
+    # A small change s of a unit vector u changes the residual as much as the rotation u x s of the camera.
+    # The array `slopes` (n, 2) is the change of the residual per pixel to the right and per pixel downwards.
     turns = np.cross(gradients[:, :3], rays)
     steps = observation.across[chosen], observation.down[chosen]
     slopes = -np.stack([np.einsum("ij,ij->i", turns, step) for step in steps], axis=1)
@@ -110,7 +110,7 @@ def _limb_points(
 def _placed_by_profile(
     view: LimbView, observation: Observation, limb: LimbPoints, settings: HorizonSettings
 ) -> LimbPoints:
-    """Return the limb points at positions fitted to their profiles, if the pixels are coarse enough."""
+    """Return limb points at positions fitted to their brightness profiles, if the pixels are large enough."""
     metres = limb.pixel * view.limb_distance
     if not len(metres) or float(np.median(metres)) < _FINE:
         return limb
@@ -127,9 +127,9 @@ def _placed_by_profile(
 
 
 _GATES = (0.25, 0.5, 1.0, 2.0)
-"""Half-widths (px) of the gates around the limb that are tried; the most significant result is used."""
+"""Half-widths (px) of the trial gates around the limb; the most significant result is used."""
 _ROUND = 0.1
-"""Assumed radius of the curves on which chance edges lie, as a fraction of the image size."""
+"""Assumed radius of curves on which chance edges lie, such as coasts, as a fraction of the image size."""
 _BESIDE = 0.05
 """Distance from the limb within which chance edges are counted, as a fraction of the image size."""
 
@@ -140,8 +140,8 @@ class LimbInView:
 
     Attributes:
         length: length of the part of the limb that should show edges, px.
-        crossings: number of times that scan lines cross the part of the limb that should show edges.
-        all_crossings: number of times that scan lines cross the whole limb in the image.
+        crossings: number of crossings of scan lines with the part of the limb that should show edges.
+        all_crossings: number of crossings of scan lines with the whole limb in the image.
     """
 
     length: float
@@ -156,15 +156,15 @@ def limb_in_view(
 
     Args:
         points: successive points around the closed limb (n, 2), px.
-        inside: which points of the limb are inside the image (n,).
-        due: which points of the limb should show an edge (n,).
+        inside: mask of the points that are inside the image (n,).
+        due: mask of the points at which the limb should show an edge (n,).
         space: distances between neighbouring scanned columns and between neighbouring scanned rows, px.
     """
     with np.errstate(invalid="ignore"):
         step = np.abs(np.roll(points, -1, axis=0) - points)
     both = [kept & np.roll(kept, -1) for kept in (inside & due, inside)]
     size = np.hypot(step[:, 0], step[:, 1])
-    # A step along x crosses scanned columns, and a step along y crosses scanned rows.
+    # A step along the limb crosses scanned columns by its x component and scanned rows by its y component.
     crossings = np.sum(step * (step > _GRAZING * size[:, None]) / np.array(space), axis=1)
     return LimbInView(
         *(float(np.sum(each)) for each in (size[both[0]], crossings[both[0]], crossings[both[1]]))
@@ -174,11 +174,11 @@ def limb_in_view(
 def log10_chance(
     limb: LimbInView, residuals: FloatArray, others: FloatArray, camera: CameraModel, unknowns: int
 ) -> float:
-    """Return log10 of the significance of a limb, a bound of the number of equally good false limbs.
+    """Return log10 of an upper bound of the expected number of chance limbs that fit as well as a limb.
 
     Args:
         limb: length of the limb in the image, and its crossings with scan lines.
-        residuals: residuals of the limb's edges (k,), px.
+        residuals: distances of the k edges on the limb from the limb (k,), px.
         others: distances of all other edges from the limb (m,), px.
         camera: camera that took the image.
         unknowns: number of fitted parameters, 2 for nadir alone and 3 for nadir and altitude.
@@ -195,7 +195,7 @@ def log10_chance(
         pieces = min(lines, limb.length / (2.0 * math.sqrt(2.0 * gate * _ROUND * size)))
         chance = min(2.0 * gate * density, 0.5)
         cones = math.log10(len(_GATES)) + unknowns * math.log10(size / gate)
-        # `tail` is Chernoff's bound, as log10, of the probability that chance edges hit this many segments.
+        # Chernoff's bound (log10) of the probability that chance edges hit this many segments is `tail`.
         tail = 0.0
         if share > chance:
             rest = 0.0 if share >= 1.0 else (1.0 - share) * math.log((1.0 - share) / (1.0 - chance))
@@ -205,15 +205,15 @@ def log10_chance(
 
 
 _UNKNOWN_TURN = 1.0
-"""Prior standard deviation (rad) of an unknown rotation about nadir, which has no effect on a sphere."""
+"""Prior standard deviation (rad) of an unknown rotation about nadir, which has no effect for a sphere."""
 _NIGHT = np.radians(-8.0)
 """Elevation of the Sun at a limb point (rad) below which the limb is too dark to show an edge."""
 _LIMB_RAYS, _FINE_RAYS = 120, 720
-"""Number of points along the limb for its coverage, and for its significance."""
+"""Number of points along the limb at which its coverage, and its significance, are computed."""
 _BORDER = 8.0
-"""Distance from the image border (px) within which a limb without edges is accepted."""
+"""Distance from the image border (px) within which a limb without edges is not counted as missing."""
 _NEAR = 0.0375
-"""Distance within which an edge covers a limb point, as a fraction of the image size (two scan lines)."""
+"""Distance of an edge within which a limb point counts as covered, as a fraction of the image size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,19 +222,21 @@ class Hypothesis:
 
     Attributes:
         fit: the fitted limb.
-        members: which edges of the image lie on the fitted horizon (n,).
-        limb: limb points of the edges on the horizon.
-        residual: rms distance of the used edges from the limb, px.
+        members: mask of the image's edges that lie on the fitted horizon (n,).
+        limb: limb points from the edges on the fitted horizon.
+        residual: rms distance of the fitted edges from the limb, px.
         guess: initial guess from which the fit started.
         lighting: agreement of the horizon with the brightness of the image.
         coverage: fraction of the sunlit limb in the image that has an edge nearby; 1 if the image shows no
             sunlit limb.
-        night: fraction of the horizon's edges at which the Sun is well below the horizon.
-        allowance: standard deviation per axis of the nadir due to unmodelled effects, rad.
-        chance: log10 of the significance of the horizon, from `log10_chance`.
-        breadth: median width of the horizon's edges, relative to the width expected from the air.
-        altitude_off: distance of a fitted altitude from `HorizonSettings.altitudes`, in standard deviations
-            of the altitude; 0 if the altitude is known.
+        night: fraction of the edges on the horizon at which the Sun is well below the horizon.
+        allowance: additional standard deviation per axis of the nadir due to effects that are not modelled,
+            rad.
+        chance: log10 of the expected number of equally good chance horizons, from `log10_chance`.
+        breadth: median width of the edges on the horizon, relative to the width expected from the air's
+            brightness profile.
+        altitude_off: distance of a fitted altitude from the range `HorizonSettings.altitudes`, in standard
+            deviations of the altitude; 0 if the altitude is known.
     """
 
     fit: FittedLimb
@@ -285,7 +287,7 @@ def examine(
     if not altitude_known:
         (low, high), altitude = settings.altitudes, view.surface.height_of(view.position)
         altitude_off = max(low - altitude, altitude - high, 0.0) / fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA)
-    # The part of the limb that is known to lie on the night side is not expected to show edges.
+    # The part of the limb that is known to be on the night side is not expected to show edges.
     rays = limb_rays(view, _FINE_RAYS)
     points = camera.project(rays)
     inside = camera.contains(points, -_BORDER)
@@ -320,8 +322,8 @@ def _fitted(
 ) -> tuple[FittedLimb, LimbPoints] | None:
     """Return the limb fitted to the edges of an initial guess, and the limb points, or None if the fit fails.
 
-    The first Gauss-Newton step uses the steepest points of the edges. The following fit uses limb positions
-    from the brightness profiles of the edges.
+    The first Gauss-Newton step of the fit uses the steepest points of the edges. The following steps use limb
+    positions from the brightness profiles of the edges.
     """
     limb = _limb_points(guess.view, observation, guess.members, sun)
     if len(limb.index) < settings.least_edges:
@@ -342,7 +344,7 @@ def _fitted(
 def _coverage(
     view: LimbView, observation: Observation, used: BoolArray, sun: FloatArray | None, camera: CameraModel
 ) -> float:
-    """Return the fraction of the limb in the image that is near a `used` edge (n,).
+    """Return the fraction of the limb in the image that is near an edge in the mask `used` (n,).
 
     If the Sun is known, only the sunlit limb away from the Sun's glare is counted.
     """

@@ -1,20 +1,21 @@
-"""Comparison of images with the brightness that a view of the Earth predicts, and a coarse nadir.
+"""Comparison of images with the brightness that an assumed view of the Earth predicts, and a coarse nadir.
 
-A correct view of the Earth agrees with the whole image: sky and night side are dark, and the sunlit limb has
-edges along its entire length. A view that is fitted to the terminator does not agree. Meller et al., section
-3.3, do not state how to distinguish the limb from the terminator.
+A correct assumption about the view of the Earth agrees with the whole image: sky and night side are dark, and
+the sunlit limb has edges along its entire length. A view that was fitted to the terminator instead of the
+limb does not agree with the image. Meller et al., section 3.3, do not state how to distinguish the limb from
+the terminator.
 
-If no image shows a limb, the Earth fills one camera and the other cameras are dark (Meller et al., section
-4.1). In this case, `coarse_nadir` tries nadir directions that cover the sphere. For each nadir direction, the
-function predicts which samples of the images are bright, namely samples on the sunlit part of the Earth's
-disc. The nadir is the mean of the tried directions, weighted by their likelihood given the samples, and the
-covariance of nadir is the spread of the weighted directions. If the Sun's direction is unknown, any sample on
-the disc may be dark.
+If no image shows a limb, the Earth fills the field of one camera and the other cameras are dark (Meller et
+al., section 4.1). In this case, `coarse_nadir` tries nadir directions that cover the sphere. For each trial
+nadir, the function predicts which samples of the images are bright, namely samples on the sunlit part of the
+Earth's disc. The coarse nadir is the mean of the trial directions, weighted by their likelihood given the
+samples, and the covariance of the nadir is the spread of the weighted directions. If the direction of the Sun
+is unknown, any sample on the Earth's disc may be dark.
 
-`why_false` compares an image with a known attitude. An image is false if it is mostly dark where sunlit
-ground must be, or mostly bright where only sky or night can be. Such an image comes from a camera that is
-dead, blinded, mounted upside down or sends random data. The limb, twilight and the surroundings of the Sun
-are excluded from the comparison.
+The function `why_false` compares an image with the view from a known attitude. An image contradicts the
+attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be.
+Such an image is taken by a camera that is dead, blinded, mounted upside down or sends random data. The
+surroundings of the limb, the twilight zone and the surroundings of the Sun are excluded from this comparison.
 """
 
 from __future__ import annotations
@@ -32,18 +33,18 @@ from knightcube.vision.horizon.edges import Samples
 from knightcube.vision.horizon.limb import MEAN_RADIUS, UNIT_DEPTH_HEIGHT, LimbView, limb_residuals
 
 _TWILIGHT = np.radians(12.0)
-"""Depression of the Sun below the horizon (rad) beyond which ground and air count as dark."""
+"""Depression of the Sun below the horizon (rad) above which ground and air count as dark."""
 DAYLIGHT = np.radians(8.0)
 """Elevation of the Sun (rad) above which ground and limb count as sunlit."""
 GLARE = np.radians(12.0)
-"""Angle from the Sun (rad) within which stray light is as bright as the Earth."""
+"""Angle from the Sun (rad) within which stray light may be as bright as the Earth."""
 _ATMOSPHERE = 60e3
 """Tangent height (m) above which the air counts as dark sky."""
 
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Agreement of a view of the Earth with the brightness of an image.
+    """Agreement of an assumed view of the Earth with the brightness of an image.
 
     Attributes:
         stray: fraction of the samples in the sky and on the night side that are bright.
@@ -75,7 +76,7 @@ def sun_elevation(view: LimbView, rays: FloatArray, sun: FloatArray) -> FloatArr
 
 
 def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agreement:
-    """Return how well a view agrees with samples of an image.
+    """Return how well an assumed view of the Earth agrees with samples of an image.
 
     If the Sun's direction is unknown, only samples in the sky are compared.
     """
@@ -102,19 +103,19 @@ def limb_rays(view: LimbView, count: int) -> FloatArray:
     angle = np.arange(count) * (2.0 * np.pi / count)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     stretched = np.sqrt(1.0 - size**-2) * axis + circle @ (tangent_basis(axis) / size)
-    # The rays are transformed into camera axes from scaled axes, in which the Earth is the unit sphere.
+    # The rays are transformed from scaled axes, in which the Earth is the unit sphere, into camera axes.
     rays = stretched @ (view.rotation @ view.surface.shape(view.limb_height)).T
     return np.asarray(rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None])
 
 
 _SAMPLES = 8
-"""Number of sampled rows, and of sampled columns."""
+"""Number of sampled rows, and of sampled columns, of an image."""
 _DIRECTIONS = 2000
-"""Number of nadir directions that are tried, about 4.5 deg apart."""
+"""Number of trial directions of nadir, about 4.5 deg apart."""
 _STRAY = 0.03
-"""Probability that a sample is bright in the sky, and that a sample is dark on sunlit ground."""
+"""Probability that a sample in the sky is bright, and that a sample on sunlit ground is dark."""
 _WEIGHT = 0.2
-"""Weight of a sample in the log-likelihood; below 1 because errors of neighbours are correlated."""
+"""Weight of a sample in the log-likelihood; below 1 because neighbouring samples have correlated errors."""
 _WIDEST = math.radians(30.0)
 """Largest standard deviation per axis (rad) of a coarse nadir."""
 _SPACE = math.sqrt(4.0 * math.pi / _DIRECTIONS)
@@ -141,7 +142,7 @@ class CoarseNadir:
     Attributes:
         direction: unit vector (3,) in body axes.
         covariance: covariance (3, 3) of the direction's error, rad^2, zero along the direction.
-        explained: mean probability of the samples for the most likely direction.
+        explained: mean probability of the samples' brightness for the most likely nadir.
     """
 
     direction: FloatArray
@@ -155,10 +156,10 @@ class CoarseNadir:
 
 
 def image_brightness(image: Image, camera: MountedCamera, bright: float) -> ImageBrightness:
-    """Return the brightness of 8 x 8 samples of an image (rows, columns).
+    """Return which of 8 x 8 samples of an image (rows, columns) are bright, with their directions.
 
-    `bright` is the threshold in counts. A dark sea under a low Sun must exceed this threshold, and stray
-    light beside the Earth must not exceed it.
+    The argument `bright` is the threshold, counts. A dark sea under a low Sun must exceed this brightness
+    threshold, and stray light beside the Earth must not exceed it.
     """
     rows, columns = (_sample_indices(size) for size in image.shape)
     lit = bright < image[np.ix_(rows, columns)].T
@@ -172,7 +173,7 @@ def coarse_nadir(
     """Return the nadir that explains the brightness of all images, or None if it is too uncertain.
 
     Args:
-        looks: brightness of the samples of each image.
+        looks: directions and brightness of the samples of each image.
         altitude: height of the cameras above the Earth's mean radius, m.
         sun: unit vector (3,) to the Sun in body axes, accurate to ten degrees, or None if unknown.
     """
@@ -206,7 +207,7 @@ def _bright_probability(
 ) -> FloatArray:
     """Return the probability (d, n) that samples in directions `rays` (n, 3) are bright.
 
-    The probability is given for each trial nadir in `tried` (d, 3).
+    The probability is computed for each of d trial nadir directions `tried` (d, 3).
     """
     radius = MEAN_RADIUS + UNIT_DEPTH_HEIGHT
     distance = (MEAN_RADIUS + altitude) / radius
@@ -224,9 +225,9 @@ def _sun_over_ground(cosine: FloatArray, ahead: FloatArray, below: FloatArray, d
     """Return the sine of the Sun's elevation where rays meet the surface of a sphere.
 
     Args:
-        cosine: cosine of the angle between each ray and nadir.
-        ahead: cosine of the angle between each ray and the Sun.
-        below: cosine of the angle between nadir and the Sun.
+        cosine: cosine of the angle between each ray from the camera and nadir.
+        ahead: cosine of the angle between each ray from the camera and the Sun.
+        below: cosine of the angle between nadir and the direction of the Sun.
         distance: distance of the camera from the centre of the sphere, in radii of the sphere.
     """
     depth = np.sqrt(np.maximum(1.0 - distance**2 * (1.0 - cosine**2), 0.0))
@@ -239,7 +240,7 @@ def _sample_indices(size: int) -> IntArray:
 
 @lru_cache(maxsize=8)
 def _sample_rays(lens: Lens) -> tuple[FloatArray, BoolArray]:
-    """Return which samples the lens images, and unit vectors (m, 3) to these samples, camera axes."""
+    """Return which sample positions the lens images, and unit vectors (m, 3) to them, camera axes."""
     x, y = np.meshgrid(_sample_indices(lens.columns), _sample_indices(lens.rows), indexing="ij")
     rays = lens.unit_vectors(np.stack([x.ravel(), y.ravel()], axis=1).astype(float))
     imaged = np.isfinite(rays[:, 0])
@@ -257,22 +258,22 @@ def _sphere(count: int) -> FloatArray:
 
 
 _MARGIN = math.radians(5.0)
-"""Angle on both sides of the limb (rad) that is excluded; it covers the air and 1 deg of attitude error."""
+"""Angle (rad) beside the limb that is not compared; it covers the air and 1 deg of attitude error."""
 _DAY = DAYLIGHT + math.radians(12.0)
 """Elevation of the Sun (rad) above which ground is certainly bright."""
 _STRAY_LIGHT = math.radians(25.0)
-"""Angle of the Sun from the nearest sample (rad) below which stray light may cover the whole image."""
+"""Angle between the Sun and the nearest sample (rad) below which stray light may cover the whole image."""
 _LEAST = 8
-"""Minimum number of samples, out of 64, from which an image can be judged false."""
+"""Minimum number of samples, out of 64, from which an image can be judged to contradict the attitude."""
 _MOST = 0.6
-"""Fraction of samples that contradict the attitude above which an image is false (clouds cause less)."""
+"""Fraction of contradicting samples above which an image contradicts the attitude (clouds cause less)."""
 
 
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:
     """Return why an image contradicts a known attitude, or an empty string if it agrees.
 
     Args:
-        look: brightness of the samples of the image.
+        look: directions and brightness of the samples of the image.
         nadir: unit vector (3,) to nadir in body axes, accurate to a degree.
         altitude: height of the camera above the Earth's mean radius, m.
         sun: unit vector (3,) to the Sun in body axes, accurate to a degree.

@@ -1,17 +1,18 @@
 """Initial guess of a horizon: the cone with which most edges agree, and the camera's rotation about nadir.
 
-All rays u to a sphere's limb make the same angle rho with nadir n: u.g = 1 with g = n / cos rho, an equation
-that is linear in g (Christian & Robinson 2016). If rho is known, two rays determine n up to two solutions. If
-rho is unknown, three rays determine n and rho. Every pair of edges gives a cone, or every triple if the
-altitude is unknown. If there are too many pairs or triples, an evenly spaced selection is used. An edge
-agrees with a cone if the edge lies near the cone and its bright side is towards nadir. The edges of the best
-cone are removed and the search continues, so that the terminator, a coast or a band of clouds gives a cone of
-its own. The search is sample consensus (Fischler & Bolles 1981) without random selection.
+All rays u to the limb of a sphere make the same angle rho with the nadir n, so that u.g = 1 with g = n / cos
+rho, an equation that is linear in g (Christian & Robinson 2016). If rho is known, two rays determine n up to
+two solutions. If rho is unknown, three rays determine n and rho. Every pair of edges gives a trial cone, or
+every triple if the altitude is unknown. If there are too many pairs or triples, an evenly spaced selection is
+used. An edge agrees with a cone if the edge lies near the cone and its bright side is towards nadir. The
+edges of the best cone are removed and the search is repeated, so that the terminator, a coast or a band of
+clouds gives a separate cone. The search is a sample consensus (Fischler & Bolles 1981) without random
+selection.
 
 A horizon does not determine the rotation about nadir. The rotation about nadir is needed because the Earth's
 flattening depends on the direction of the pole, and the illumination depends on the direction of the Sun. A
-rough attitude, the coarse direction of the Sun or the magnetic field gives this rotation. The angle between
-nadir and each of these directions is also known, so a nadir at a different angle is rejected.
+rough attitude, the coarse direction of the Sun or the magnetic field gives this rotation. The angles between
+nadir and these known directions are also known, so that a nadir at a different angle is rejected.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class ConeCandidate:
     Attributes:
         direction: axis of the cone (3,).
         cosine: cosine of the cone's half-angle.
-        members: which edges of the image agree with the cone (n,).
+        members: mask of the image's edges that agree with the cone (n,).
     """
 
     direction: FloatArray
@@ -99,7 +100,7 @@ def best_cone(
 
     Args:
         edges: edges of the image as directions.
-        free: which edges may be used (n,).
+        free: mask of the edges that may be used (n,).
         cosines: lower and upper limit of the cosine of the cone's half-angle; equal if the angle is known.
         tolerance: largest distance of an agreeing edge from the cone, px.
         tries: maximum number of pairs or triples of edges that are tried.
@@ -136,7 +137,7 @@ def left_free(edges: EdgeRays, free: BoolArray, cone: ConeCandidate, tolerance: 
 
 @lru_cache(maxsize=64)
 def _pairs(count: int, tries: int) -> tuple[IntArray, IntArray]:
-    """Return the indices of all pairs of `count` items, or of at most `tries` evenly selected pairs."""
+    """Return the indices of all pairs of `count` items, or of `tries` of them, evenly selected."""
     first, second = np.triu_indices(count, 1)
     if len(first) > tries:
         chosen = np.linspace(0, len(first) - 1, tries).astype(int)
@@ -145,10 +146,10 @@ def _pairs(count: int, tries: int) -> tuple[IntArray, IntArray]:
 
 
 def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the indices of up to `tries` triples of `count` items, with strides of all sizes."""
+    """Return the indices of up to `tries` triples of `count` items, with short and long distances."""
     number = np.arange(tries)
     first = number % count
-    # Fractional parts of multiples of the golden ratio and of sqrt(2) distribute the strides evenly.
+    # Fractional parts of multiples of the golden ratio and of sqrt(2) distribute the distances evenly.
     one = 1 + ((number * 0.6180339887) % 1.0 * (count - 1)).astype(int)
     two = 1 + ((number * 0.4142135624) % 1.0 * (count - 1)).astype(int)
     sound = one != two
@@ -156,13 +157,13 @@ def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tolerance: float) -> BoolArray:
-    """Return which of n edges agree with each of k cones (k, n).
+    """Return which of n edges agree with each of k cones, as an array (k, n).
 
     An edge agrees if it lies within `tolerance` px of the cone and its bright side is towards the axis. The
     cones are given by their axes `directions` (k, 3) and the cosines (k,) of their half-angles.
     """
     sines = np.sqrt(np.maximum(1.0 - cosines**2, 1e-6))
-    # Near a cone of half-angle rho, cos(angle from axis) - cos(rho) is sin(rho) times the distance, rad.
+    # Near a cone of half-angle rho, the distance times sin(rho) is cos(angle from the axis) - cos(rho).
     off = directions @ edges.rays.T
     off -= cosines[:, None]
     near = np.abs(off, out=off) <= sines[:, None] * (tolerance * edges.pixel)
@@ -173,7 +174,7 @@ def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tole
 MOST_MISMATCH = 4.0
 """Largest accepted disagreement of a nadir with a coarse sensor, in standard deviations."""
 _GUESS_SIGMA = math.radians(0.2)
-"""Error (rad) of a cone's nadir before the limb is fitted; measured errors are 0.07 to 0.3 deg."""
+"""Error (rad) of the nadir from a cone before the limb is fitted; measured errors are 0.07 to 0.3 deg."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,9 +183,10 @@ class Orientation:
 
     Attributes:
         rotation: rotation matrix (3, 3) from inertial to camera axes; it agrees with the assumed nadir.
-        sigma: standard deviation of the rotation about nadir, rad; infinite if the rotation is unknown.
+        sigma: standard deviation of the camera's rotation about nadir, rad; infinite if the rotation is
+            unknown.
         mismatch: largest disagreement of a known direction with the assumed nadir, in standard deviations.
-        share: fraction of all possible nadirs that agree with the known directions.
+        share: fraction of all nadir directions that agree with the known directions.
     """
 
     rotation: FloatArray
@@ -202,7 +204,7 @@ def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: Horizo
     if knowledge.attitude is not None:
         matrix, sigma = attitude_matrix(knowledge.attitude.quaternion), knowledge.attitude.sigma
         known += [(matrix @ axis, axis, sigma) for axis in (inertial_nadir, tangent_basis(inertial_nadir)[0])]
-    # Each known direction restricts nadir to a ring on the sphere, and two rings have few common directions.
+    # Each known direction restricts nadir to a ring on the sphere, and two rings share few directions.
     narrowest = sorted(math.hypot(sigma, _GUESS_SIGMA) for _, _, sigma in known)[:2]
     share = math.prod(min(1.0, MOST_MISMATCH * sigma) for sigma in narrowest)
     down = _unit(nadir)
@@ -249,7 +251,7 @@ def _length(vector: Vector) -> float:
 def shortest_turn(source: FloatArray, target: FloatArray) -> FloatArray:
     """Return the smallest rotation (3, 3) from one unit vector to another.
 
-    For opposite vectors it is a half turn about any normal axis.
+    For opposite vectors, the result is a half turn about an arbitrary normal axis.
     """
 
     def half_turn(axis: FloatArray, square: float) -> FloatArray:
@@ -259,14 +261,14 @@ def shortest_turn(source: FloatArray, target: FloatArray) -> FloatArray:
     square = float(middle @ middle)
     if square < 1e-12:
         return half_turn(tangent_basis(source)[0], 1.0)
-    # A half turn about `source` and then one about `middle` are together the smallest rotation to `target`.
+    # A half turn about `source`, followed by one about `middle`, is the smallest rotation to `target`.
     return np.asarray(half_turn(middle, square) @ half_turn(source, 1.0))
 
 
 SPHERE_ALTITUDE_SIGMA = 10e3
 """Error (m) of an altitude above the mean sphere due to the flattening of the Earth."""
 _TURNS = 24
-"""Number of rotations about nadir that are tried if the rotation is unknown."""
+"""Number of trial rotations about nadir if the rotation is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -274,10 +276,10 @@ class Place:
     """The known or assumed position of the camera.
 
     Attributes:
-        position: position (3,), m, in inertial axes if `located`, otherwise in arbitrary axes.
-        surface: the Earth's ellipsoid, or a sphere if only the altitude is known.
+        position: position of the camera (3,), m, in inertial axes if `located`, otherwise in arbitrary axes.
+        surface: ellipsoid of the Earth, or a sphere if only the altitude is known.
         altitude_sigma: standard deviation of the altitude, m; very large if the altitude is unknown.
-        located: whether the position is known; otherwise only its altitude is meaningful.
+        located: whether the position is known; otherwise only the altitude of `position` is meaningful.
     """
 
     position: FloatArray
@@ -299,7 +301,7 @@ def above_sphere(altitude: float, sigma: float = 0.0) -> Place:
 
 
 def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | None:
-    """Return the position of the camera from prior knowledge, or None if the altitude is unknown."""
+    """Return the camera's position from prior knowledge, or None if the altitude is unknown."""
     if knowledge.position is not None:
         position = np.asarray(knowledge.position, dtype=float)
         return Place(position, earth(knowledge.pole), settings.altitude_sigma, True)
@@ -320,7 +322,7 @@ class InitialGuess:
     """The starting point for the fit of a horizon.
 
     Attributes:
-        place: known or assumed position of the camera.
+        place: known or assumed position of the camera relative to the Earth.
         view: assumed position and attitude of the camera and height of the limb.
         orientation: attitude of the camera, with the uncertainty of its rotation about nadir.
         members: which edges of the image agree with the cone of the guess (n,).

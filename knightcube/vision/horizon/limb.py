@@ -1,30 +1,31 @@
 """The Earth's limb: its direction from a camera, its brightness profile, and robust fits of both.
 
-Limb cone: a scaling along the axes of an ellipsoid transforms it into the unit sphere, whose limb is a
-circular cone about the direction of the centre. The scaling transforms rays into rays, so a ray lies on the
+A scaling along the axes of the Earth's ellipsoid transforms it into the unit sphere, whose limb is a circular
+cone about the direction of the centre. The scaling transforms rays into rays, so that a ray lies on the
 ellipsoid's limb if and only if the scaled ray lies on the cone (Christian & Robinson 2016, "Noniterative
 Horizon-Based Optical Navigation by Cholesky Factorization", Journal of Guidance, Control, and Dynamics 39,
-2757). The residual of a ray is the angle between the scaled ray and the scaled centre minus the half-angle of
-the cone. The residual is 0 on the limb and positive outside. The gradient of the residuals is analytic.
+2757). The residual of a ray is the angle between the scaled ray and the scaled direction of the centre, minus
+the half-angle of the limb cone. The residual of a ray is 0 on the limb and positive outside of the Earth. The
+gradient of the residuals is analytic.
 
-Fit of the cone: the cone is fitted by a Gauss-Newton iteration. Huber's weights, and zero weight beyond five
-standard deviations, exclude clouds, glare and the ends of the terminator. The standard deviation is estimated
-from the median of the residuals if this estimate exceeds the stated standard deviation. The limb height, the
+The limb cone is fitted by a Gauss-Newton iteration. Huber's weights, with zero weight beyond five standard
+deviations, exclude clouds, glare and the ends of the terminator. The standard deviation of the residuals is
+estimated from their median if this estimate exceeds the stated standard deviation. The limb height, the
 rotation about nadir and the altitude, which the limb does not determine, have a prior, so that the covariance
 includes their uncertainty.
 
-Brightness profile: a line of sight with tangent height h passes the optical depth t(h) = t0 exp(-h/H) with t0
-= t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's radius and
-H the scale height of the air. A line of sight with h < 0 ends on the ground, where its elevation has the sine
-sqrt(-2h/R). The brightness of sunlit air is 1 - exp(-t), and the air attenuates the ground by exp(-t).
-Without blur, the brightness falls fastest where t = 1, at a tangent height of 15.4 km. Refraction is
-neglected. Refraction lowers the apparent limb by 1 to 2 km, which is within
+Along a line of sight with the tangent height h, the optical depth of the air is t(h) = t0 exp(-h/H) with t0 =
+t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's radius and H
+the scale height of the air. A line of sight with h < 0 ends on the ground, where the sine of its elevation is
+sqrt(-2h/R). The brightness of sunlit air at the optical depth t is 1 - exp(-t), and the air attenuates the
+ground by exp(-t). Without blur, the brightness falls fastest at the optical depth t = 1, at a tangent height
+of 15.4 km. Refraction is neglected. Refraction lowers the apparent limb by 1 to 2 km, which is within
 `HorizonSettings.limb_height_sigma`.
 
-Fit of the profile: the brightness profile across an edge is background + a air(h) + b ground(h), where the
-tangent height h falls by a known number of metres per pixel. The position of unit optical depth is fitted
-together with the brightness of background, air and ground. In contrast to the steepest point, this position
-is not shifted inwards by bright ground behind the limb or outwards by haze.
+The brightness profile across an edge is fitted by background + a air(h) + b ground(h), where a and b are
+free, and the tangent height h falls by a known number of metres per pixel. The position of unit optical depth
+is fitted together with the brightness of background, air and ground. In contrast to the steepest point, the
+position of unit optical depth is not shifted inwards by bright ground behind the limb or outwards by haze.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class Ellipsoid:
     polar: float
 
     def stretching(self, height: float = 0.0) -> FloatArray:
-        """Return the symmetric matrix L (3, 3) with |L x| = 1 on the surface raised by `height` m."""
+        """Return the symmetric matrix L (3, 3) for which |L x| = 1 on the ellipsoid raised by `height` m."""
         return self._along_axes(1.0 / (self.equatorial + height), 1.0 / (self.polar + height))
 
     def shape(self, height: float = 0.0) -> FloatArray:
@@ -88,7 +89,7 @@ def mean_sphere() -> Ellipsoid:
 
 
 PARAMETERS = 5
-"""Number of fitted parameters: small rotation in camera axes (3, rad), limb height (m), altitude (m)."""
+"""Number of fitted parameters: a small rotation in camera axes (3, rad), limb height (m), altitude (m)."""
 LIMB_HEIGHT, ALTITUDE = 3, 4
 """Indices of limb height and altitude among the fitted parameters."""
 
@@ -100,8 +101,8 @@ class LimbView:
     Attributes:
         rotation: rotation matrix (3, 3) from inertial to camera axes.
         position: position (3,) of the camera, m, inertial axes.
-        surface: surface of the Earth, without atmosphere.
-        limb_height: height above the surface, m, at which the limb appears.
+        surface: ellipsoid of the Earth's surface, without atmosphere.
+        limb_height: height above the surface at which the limb appears, m.
     """
 
     rotation: FloatArray
@@ -120,7 +121,7 @@ class LimbView:
         return math.sqrt(max(float(self.position @ self.position) - self.surface.equatorial**2, 1.0))
 
     def moved(self, step: FloatArray) -> LimbView:
-        """Return the view changed by a step (5,) of the fitted parameters."""
+        """Return the view of the camera after a step (5,) of the fitted parameters."""
         distance = float(np.linalg.norm(self.position))
         return LimbView(
             turn(step[:3]) @ self.rotation,
@@ -164,7 +165,7 @@ _AFTER, _BEFORE = [1, 2, 0], [2, 0, 1]
 
 
 def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the residuals (n,) of rays (n, 3), rad, and their gradients (n, 5) by the fitted parameters."""
+    """Return residuals (n,), rad, of rays (n, 3), and their gradients (n, 5) by the fitted parameters."""
     stretching = view.surface.stretching(view.limb_height)
     by_height = view.surface.stretching_by_height(view.limb_height)
     centre = -(stretching @ view.position)
@@ -176,16 +177,16 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     cosine = stretched @ towards / lengths
     sine = np.sqrt(1.0 - cosine * cosine)
     # The derivative with respect to the scaled ray is transformed into camera axes.
-    # The same matrix product also gives the permuted components that a cross product needs.
+    # The same matrix product also gives the permuted components that the cross product below needs.
     slope = (stretched * (cosine / lengths)[:, None] - towards) / (lengths * sine)[:, None]
     back = to_stretched.T
     by_ray = slope @ np.concatenate(
         [back[:, _AFTER], back[:, _BEFORE], (view.rotation @ by_height).T], axis=1
     )
     gradients = np.empty((len(rays), PARAMETERS))
-    # A rotation d of the camera displaces a fixed direction u by -d x u.
+    # A small rotation d of the camera displaces a fixed direction u by -d x u.
     gradients[:, :3] = by_ray[:, :3] * rays[:, _BEFORE] - by_ray[:, 3:6] * rays[:, _AFTER]
-    # `by_size` is minus the derivative of the cone's half-angle arcsin(1 / size) with respect to `size`.
+    # The variable `by_size` is minus the derivative of the half-angle arcsin(1 / size) of the cone by `size`.
     by_size = 1.0 / (size * math.sqrt(size * size - 1.0))
     step = -(by_height @ view.position)
     along = float(towards @ step)
@@ -204,7 +205,7 @@ _LAST_STEP = 3e-5
 _SAME_GRADIENTS = 3e-3
 """Rotation step (rad) below which the gradients change by less than 1 % and are not computed again."""
 _HUBER, _BEYOND = 1.5, 5.0
-"""Residuals, in standard deviations, above which Huber's weights decrease and above which they are zero."""
+"""Residuals (standard deviations) above which Huber's weights decrease, and above which they are zero."""
 _MOST_CORRELATED = 0.8
 """Largest assumed correlation between neighbouring residuals."""
 UNKNOWN = 1e9
@@ -228,7 +229,7 @@ class FittedLimb:
         view: fitted position and attitude of the camera and height of the limb.
         covariance: covariance (5, 5) of the fitted parameters.
         residuals: angles of the edges from the fitted limb (n,), rad, positive outside the limb.
-        used: which edges lie within five standard deviations of the limb (n,).
+        used: mask of the edges that lie within five standard deviations of the limb (n,).
     """
 
     view: LimbView
@@ -251,8 +252,8 @@ class FittedLimb:
 def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior) -> FittedLimb | None:
     """Return the limb fitted to rays (n, 3) with standard deviations `sigma` (n,), rad.
 
-    The iteration begins at the view `start`. Returns None if the rays do not determine the nadir, or if the
-    fit diverges.
+    The iteration begins at the initial view `start`. Returns None if the rays do not determine the nadir, or
+    if the fit diverges.
     """
     information = _information(start, prior)
     view, moved = start, np.zeros(PARAMETERS)
@@ -289,13 +290,13 @@ def shared_error(
         rays: the fitted rays (n, 3).
         sigma: standard deviations of the rays (n,), rad.
         prior: the prior of the fit.
-        groups: index of the group of each ray (n,).
-        error: standard deviation of the shared error of each group (groups,), rad.
+        groups: index of the group to which each ray belongs (n,).
+        error: standard deviation of the error that the rays of each group share (groups,), rad.
     """
     _, gradients = limb_gradients(fit.view, rays)
     weighted = gradients * _weights(fit.residuals, sigma)[0][:, None]
     inverse = _solved(weighted.T @ gradients + _information(fit.view, prior), np.eye(PARAMETERS))
-    assert inverse is not None  # the fit has already solved the same equations
+    assert inverse is not None  # the fit has already solved the same equations, so that they are not singular
     moved = np.array([inverse @ weighted[groups == k].sum(axis=0) for k in range(len(error))])
     return np.asarray((moved * (error**2)[:, None]).T @ moved)
 
@@ -324,7 +325,7 @@ def _information(start: LimbView, prior: Prior) -> FloatArray:
 
 
 def _weights(residuals: FloatArray, sigma: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the weights (n,), rad^-2, of residuals (n,), and which weights are not zero (n,)."""
+    """Return the weights (n,), rad^-2, of residuals (n,), and a mask (n,) of the nonzero weights."""
     scaled = np.abs(residuals) / sigma
     middle = len(scaled) // 2
     spread = max(1.0, MAD_TO_SIGMA * float(np.partition(scaled, middle)[middle]))
@@ -337,9 +338,9 @@ def _weights(residuals: FloatArray, sigma: FloatArray) -> tuple[FloatArray, Bool
 def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray) -> float:
     """Return the factor by which correlation of the residuals increases the variance of their mean.
 
-    Clouds and coasts behind the limb displace neighbouring points in the same direction. For a first-order
-    process with the correlation r between neighbours around the limb, the factor is (1 + r)/(1 - r). The
-    residuals `scaled` (n,) are in standard deviations.
+    Clouds and coasts behind the limb displace neighbouring points in the same direction. If neighbours around
+    the limb have the correlation r (first-order process), the factor is (1 + r)/(1 - r). The residuals
+    `scaled` (n,) are in standard deviations.
     """
     square = float(scaled @ scaled)
     if len(scaled) < 3 or square == 0.0:
@@ -355,7 +356,7 @@ def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray)
 
 
 def _solved(normal: FloatArray, right: FloatArray) -> FloatArray | None:
-    """Return the solution of normal equations whose unknowns have different units, or None if singular."""
+    """Return the solution of normal equations with unknowns of different units, or None if singular."""
     diagonal = normal.diagonal()
     if not diagonal.min() > 0.0:
         return None
@@ -391,13 +392,13 @@ _SHARPEST, _BROADEST, _WIDTHS = 500.0, 50e3, 61
 
 
 def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
-    """Return the brightness of air and of ground, and their slopes per m, at tangent heights, as (4, n, k).
+    """Return brightness of air and of ground, and their slopes per m, at tangent heights, as (4, n, k).
 
-    Sunlit air of infinite optical depth and ground without air have the brightness 1. The blur is rounded to
-    the nearest blur of the table; neighbouring blurs of the table differ by 8 %.
+    The unit of brightness is that of sunlit air of infinite optical depth, and of ground without air. The
+    blur is rounded to the nearest blur of the table; neighbouring blurs of the table differ by 8 %.
 
     Args:
-        heights: tangent heights along n scan lines (n, k), m.
+        heights: tangent heights of k samples along n scan lines (n, k), m.
         blur: standard deviation of the Gaussian blur of each scan line (n,), m.
     """
     table = _limb_table()
@@ -437,7 +438,7 @@ def _limb_table() -> FloatArray:
 def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
     """Return a profile (m,) after Gaussian blurs with standard deviations `widths` (k,), m, as (k, m).
 
-    Beyond its ends the profile is continued with its end values.
+    Beyond its ends, the profile is continued with its end values.
     """
     margin = int(4.0 * _BROADEST / _STEP)
     padded = np.pad(profile, margin, mode="edge")
@@ -448,9 +449,9 @@ def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
 
 _PROFILE_STEPS = 2
 _OUTSIDE, _INSIDE = -8.0, 4.0
-"""Limits of the fitted section of the profile, in px from the steepest point towards the bright side."""
+"""Limits of the fitted section of a profile, in px from the steepest point towards the bright side."""
 _FLOOR, _SHARE = 0.02, 0.08
-"""Noise of a sample: a fraction of the profile's maximum plus a fraction of the sample's own brightness."""
+"""Noise of a profile's sample: a fraction of the profile's maximum plus a fraction of the sample."""
 _FARTHEST = 2.0
 """Largest distance (px) of the fitted limb from the steepest point."""
 _LEAST_SAMPLES = 7
@@ -459,12 +460,12 @@ _LEAST_SAMPLES = 7
 def fit_profiles(
     profiles: FloatArray, steps: FloatArray, metres: FloatArray, blur: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the limb positions on n scan lines, px, their standard deviations, px, and which are valid.
+    """Return limb positions on n scan lines, px, their standard deviations, px, and a mask of valid ones.
 
     Args:
         profiles: brightness along n scan lines (n, m), or NaN for missing samples.
-        steps: positions of the samples (n, m), px, towards the bright side, relative to the edge.
-        metres: change of the tangent height per pixel on each scan line (n,), m.
+        steps: positions of the samples relative to the edge (n, m), px, positive towards the bright side.
+        metres: decrease of the tangent height per pixel on each scan line (n,), m.
         blur: standard deviation of the blur on each scan line (n,), m.
     """
     usable = np.isfinite(profiles) & (steps >= _OUTSIDE) & (steps <= _INSIDE)
@@ -492,7 +493,7 @@ def fit_profiles(
         columns = np.stack([np.ones_like(air), air, ground, shift], axis=2)
         weighted = (columns * weights[:, :, None]).transpose(0, 2, 1)
         right = weighted @ (light - model)[:, :, None]
-        # The second right-hand side gives the last column of the inverse, with the variance of the position.
+        # The second right-hand side of the equations gives the variance of the position.
         answer = np.linalg.solve(weighted @ columns + prior, np.concatenate([right, of_place], axis=2))
         amounts = amounts + answer[:, :3, 0]
         place = place + np.minimum(np.maximum(answer[:, 3, 0], -1.0), 1.0)

@@ -6,15 +6,15 @@
 
 `find_nadir` finds edges on scan lines and cones with which many edges agree, and fits the ellipsoid's limb to
 the edges of each cone. Each fitted limb is tested against chance edges, the width of the atmosphere's
-brightness profile, the brightness of the whole image, the coarse sensors and the rough attitude. If a single
-limb passes all tests, it gives the nadir. If several limbs pass all tests, the image is ambiguous. If no limb
-passes all tests, the image is refused and the reason is stated.
+brightness profile, the brightness of the whole image, the coarse sensors and the rough attitude. If exactly
+one limb passes all tests, this limb gives the nadir. If several limbs pass all tests, the image is ambiguous.
+If no limb passes all tests, the image is refused and the reason is stated.
 
-`nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four cameras). The
-nadirs of different cameras must agree. An image that gave no nadir, or several, is searched again with the
-nadir of the other cameras as prior knowledge. One limb is then fitted to the limb points of all images. The
-unknown height of the air displaces every limb outwards, which displaces nadir only if a single side of the
-limb is visible.
+The function `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four
+cameras). The nadirs of different cameras must agree. An image that gave no nadir, or several nadirs, is
+searched again with the nadir of the other cameras as prior knowledge. One limb is then fitted to the limb
+points of all images. The unknown height of the air displaces every limb outwards, which displaces the nadir
+only if a single side of the limb is visible.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class NadirMeasurement:
         altitude: height above the ellipsoid, or above the mean sphere if the position is unknown, m.
         altitude_sigma: standard deviation of the altitude, m.
         residual: rms distance of the used points from the fitted horizon, px.
-        used: number of points on the horizon.
+        used: number of limb points from which the horizon was fitted.
     """
 
     direction: FloatArray
@@ -116,9 +116,9 @@ class HorizonSolution:
         status: outcome of the search.
         reason: why no nadir was found, in one sentence; empty if a nadir was found.
         nadir: the measured nadir, or None unless the status is FOUND.
-        candidates: the horizons that were not selected, or all horizons if no nadir was found.
+        candidates: nadirs of the horizons that were not selected, or of all horizons if no nadir was found.
         points: positions of all edges from dark to bright (n, 2), px.
-        on_horizon: which edges lie on the best horizon (n,).
+        on_horizon: mask of the edges that lie on the best horizon (n,).
         limb: unit vectors (k, 3) to the limb points on the best horizon, camera axes.
         limb_sigma: standard deviations of the limb points normal to the limb (k,), rad.
         view: position and attitude of the camera from the best fit, even if refused, or None without a fit.
@@ -142,19 +142,19 @@ class HorizonSolution:
 
 
 _WIDER = 2.0
-"""Factor that widens the altitude range of the search for cones; a cone through three edges is inaccurate."""
+"""Factor that widens the altitude range in the search for cones, which is inaccurate with three edges."""
 _MOST_ALTITUDE = 3.0
 """Largest distance of a fitted altitude from `HorizonSettings.altitudes`, in standard deviations."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
-"""Thresholds of the tests that a horizon must pass.
+"""Thresholds of three tests that a horizon must pass.
 
-The values are the largest fraction of bright samples in the sky and on the night side, the minimum coverage
-of the sunlit limb by edges, and the largest fraction of limb points on the night side.
+These thresholds are the largest fraction of bright samples in the sky and on the night side, the minimum
+coverage of the sunlit limb by edges, and the largest fraction of limb points on the night side.
 """
 _RIVAL = 0.3
-"""Fraction of the best horizon's edges above which a second horizon makes the result ambiguous."""
+"""Fraction of the best horizon's edge count above which a second horizon makes the result ambiguous."""
 _SAME = np.radians(1.0)
-"""Angle (rad) below which two nadirs in one image count as the same nadir."""
+"""Angle (rad) between two nadirs from one image below which they count as the same nadir."""
 _MOST_CHANCE = -6.0
 """Largest accepted log10 of the expected number of cones that chance edges fit as well as a horizon."""
 _BREADTH = 0.125, 2.0
@@ -178,8 +178,8 @@ def find_nadir(
     Args:
         image: pixel values (rows, columns) of any integer or floating type; a larger value is brighter.
         camera: camera model of the image, a `Pinhole` or `Lens` of `knightcube.vision.camera.lens`.
-        knowledge: prior knowledge of position, altitude, Sun and attitude. If it contains neither position
-            nor altitude, the altitude is fitted too.
+        knowledge: prior knowledge of position, altitude, Sun and attitude. If `knowledge` contains neither
+            position nor altitude, the altitude is fitted too.
         settings: settings of the search, or None for the defaults.
 
     Raises:
@@ -202,7 +202,7 @@ def find_nadir(
         read += closer.read
         second = closer.solution()
         if second.nadir is not None and second.nadir.used >= _GAIN * found.nadir.used:
-            # The first search has already compared this horizon with the other horizons.
+            # The first search has already compared this horizon with the other horizons in the image.
             return replace(second, candidates=found.candidates, pixels_read=read)
     second = _search(image, camera, knowledge, again).solution()
     return replace(second, pixels_read=read + second.pixels_read)
@@ -214,8 +214,8 @@ class _Search:
 
     Attributes:
         observation: edges and sampled pixels as directions.
-        levels: brightness levels of dark and bright pixels.
-        hypotheses: horizons found, the best first.
+        levels: brightness levels of the dark and bright pixels of the image.
+        hypotheses: horizons that were fitted to the edges, the best first.
         read: number of pixels read.
     """
 
@@ -293,7 +293,7 @@ def _hypotheses(
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> list[Hypothesis]:
-    """Return the horizons fitted to the cones with which most edges agree, the best first."""
+    """Return the horizons that were fitted to the cones with which most edges agree, the best first."""
     if place is None:
         least, most = settings.altitudes
         low, high = (above_sphere(altitude).cosine for altitude in (least / _WIDER, most * _WIDER))
@@ -302,7 +302,7 @@ def _hypotheses(
     free = np.ones(len(observation.edges), dtype=bool)
     sound: list[Hypothesis] = []
     contradicted: list[InitialGuess] = []
-    # Cones with too few edges to make an accepted horizon ambiguous are skipped.
+    # Cones are skipped if they have too few edges to make an accepted horizon ambiguous.
     enough = float(settings.least_edges)
     for _ in range(settings.candidates):
         if np.count_nonzero(free) < enough:
@@ -321,7 +321,7 @@ def _hypotheses(
             if not _flaw(found):
                 enough = max(enough, _RIVAL * np.count_nonzero(found.members))
     if all(_flaw(each) for each in sound):
-        # Guesses that contradict prior knowledge are fitted only in order to report why they are refused.
+        # Initial guesses that contradict prior knowledge are fitted only to report why they are refused.
         fitted = (examine(each, observation, knowledge, settings, camera) for each in contradicted)
         sound += [each for each in fitted if each is not None and _is_limb(each)]
     return sorted(sound, key=lambda each: (_flaw(each) != "", -np.count_nonzero(each.members)))
@@ -369,7 +369,7 @@ def _flaw(one: Hypothesis) -> str:
 
 
 def _measurement(fit: FittedLimb, covariance: FloatArray, located: bool, residual: float) -> NadirMeasurement:
-    """Return the nadir of a fitted limb; `located` states whether the camera's position is known."""
+    """Return the nadir of a fitted limb; The flag `located` states whether the camera's position is known."""
     view = fit.view
     return NadirMeasurement(
         view.nadir,
@@ -386,7 +386,7 @@ _IMPROBABLE = 1e-6
 _COMMON = 2.0
 """Factor by which the variance of the difference of two nadirs may exceed the sum of their variances.
 
-The factor is above 1, because an unknown height of the air displaces the nadirs from opposite limbs in
+This factor is above 1, because an unknown height of the air displaces the nadirs from opposite limbs in
 opposite directions.
 """
 _UNKNOWN_TURN = 1.0
@@ -402,8 +402,8 @@ class JointNadir:
     Attributes:
         status, reason: outcome of the search, and why no nadir was found.
         nadir: the measured nadir in body axes, or None unless the status is FOUND.
-        cameras: indices of the cameras whose limb was used.
-        each: solution of each image by the index of its camera, in camera axes.
+        cameras: indices of the cameras whose limb points were used.
+        each: result of the search in each image, by the index of the camera, in camera axes.
         limb_height: fitted height of the limb above the ellipsoid, m, or NaN if no nadir was found.
     """
 
@@ -462,7 +462,7 @@ def nadir_of_cameras(
         return JointNadir(*_why_none(each), None, (), each)
     vote = max(group, key=lambda one: one.edges)
     view = each[vote.camera].view
-    assert view is not None  # the camera of a vote has fitted a horizon
+    assert view is not None  # the camera of each vote has a fitted horizon
     position = knowledge.position if knowledge.position is not None else view.position
     sigma = float(np.sqrt(0.5 * np.trace(vote.covariance)))
     sensed = (*knowledge.sensed, SensedDirection(vote.nadir, -position, _COMMON * sigma))
@@ -491,7 +491,7 @@ def _in_camera(camera: MountedCamera, knowledge: HorizonKnowledge) -> HorizonKno
 
 
 def _votes(number: int, solution: HorizonSolution, camera: MountedCamera) -> list[_Vote]:
-    """Return the nadir found in an image as a vote, or all candidates of an ambiguous image as votes."""
+    """Return the nadir found in an image as a vote, or all candidates as votes if the image is ambiguous."""
     if solution.nadir is not None:
         left: tuple[NadirMeasurement, ...] = (solution.nadir,)
     else:
@@ -503,8 +503,8 @@ def _votes(number: int, solution: HorizonSolution, camera: MountedCamera) -> lis
 def _agreed(votes: Sequence[_Vote]) -> tuple[list[_Vote], str]:
     """Return the votes for the nadir on which most cameras agree, or no vote and the reason.
 
-    If two nadirs have the same number of cameras, the nadir with more edges is selected. Two candidates of
-    the same camera never support each other.
+    If two nadirs are supported by the same number of cameras, the nadir with more edges is selected. Two
+    candidates of the same camera never support each other.
     """
     groups = []
     for first in votes:
@@ -537,7 +537,7 @@ def _same(one: _Vote, other: _Vote) -> bool:
 
 
 def _why_none(each: Mapping[int, HorizonSolution]) -> tuple[HorizonStatus, str]:
-    """Return the most favourable status among the cameras' images, and its reason."""
+    """Return the most favourable status of the searches in all images, and the reason for it."""
     for status in (HorizonStatus.AMBIGUOUS, HorizonStatus.REFUSED, HorizonStatus.NO_HORIZON):
         for number, solution in each.items():
             if solution.status is status:
@@ -555,7 +555,7 @@ def _joint_fit(
     """Return the nadir of one limb fitted to the limb points of all agreeing cameras."""
     most = max(numbers, key=lambda number: len(each[number].limb))
     view, camera = each[most].view, cameras[most]
-    assert view is not None  # the camera has found a horizon
+    assert view is not None  # each agreeing camera has found a horizon
     place = place_of(knowledge, settings)
     located = place is not None and place.located
     body = replace(view, rotation=camera.to_camera.T @ view.rotation, limb_height=UNIT_DEPTH_HEIGHT)

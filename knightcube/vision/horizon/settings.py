@@ -1,7 +1,7 @@
 """Settings of the horizon search, the response of the detector, and prior knowledge for one image.
 
 A horizon does not determine the rotation about nadir. Prior knowledge (position, Sun, rough attitude,
-directions from other sensors) determines this rotation and tests a fitted horizon.
+directions from other sensors) determines the rotation about nadir and tests a fitted horizon.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.errors import UsageError
 
 LEAST_ALTITUDE = 50e3
-"""Lowest altitude (m) from which a limb is visible; a lower camera is inside the atmosphere."""
+"""Lowest altitude (m) from which the limb is visible; a lower camera is inside the atmosphere."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +96,7 @@ class LogarithmicResponse:
 
 
 def light_of(counts: Image, response: LogarithmicResponse | None) -> FloatArray:
-    """Return the light intensity for counts (...), in arbitrary units.
+    """Return the light intensity for `counts` (...), in arbitrary units.
 
     Without a `response` of the detector, the intensity is proportional to the counts.
     """
@@ -113,12 +113,12 @@ class EdgeSettings:
 
     Attributes:
         lines: number of columns, and of rows, that the first search reads.
-        more_lines: number of columns, and of rows, that a second search reads.
+        more_lines: number of columns, and of rows, that a second search of the image reads.
         run: window of the majority filter that removes short fluctuations, px, odd (Meller et al., section
             3.1).
         threshold: brightness above which a pixel counts as bright, as a fraction of the range from the dark
             level to the bright level.
-        contrast: minimum height of an edge, as a fraction of the range from the dark level to the bright
+        contrast: minimum step height of an edge, as a fraction of the range from the dark level to the bright
             level.
         most: maximum number of edges per scan line; the edges with the darkest dark side are kept.
         psf_sigma: standard deviation of the blur of the optics, px.
@@ -150,14 +150,14 @@ class HorizonSettings:
 
     Attributes:
         edges: settings of the search for edges.
-        limb_height_sigma: standard deviation of the apparent limb's height, m. The default holds for air of
-            unknown scale height (6.5 to 9.5 km) and unknown haze; use 1,000 m if scale height and haze are
-            known.
+        limb_height_sigma: standard deviation of the apparent limb's height, m. The default limb height error
+            holds for air of unknown scale height (6.5 to 9.5 km) and unknown haze; use 1,000 m if scale
+            height and haze are known.
         altitude_sigma: standard deviation of the altitude of a known position, m.
-        altitudes: range of an unknown altitude, m. The default is for low orbits; a range without limits
-            would accept any bright disc as the Earth, for instance a lens ghost.
-        tolerance: largest distance of an edge from a circular cone, px; it must cover the flattening of the
-            Earth.
+        altitudes: range of an unknown altitude, m. The default range is for low orbits; a range without
+            limits would accept any bright disc as the Earth, for instance a lens ghost.
+        tolerance: largest distance of an edge from the circular cone of a horizon, px; it must cover the
+            flattening of the Earth.
         least_edges: minimum number of edges on a horizon.
         enough_edges: number of edges on a horizon below which the image is searched again on more scan lines.
         some_edges: number of edges in an image below which the image is not searched again.
