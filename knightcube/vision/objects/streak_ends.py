@@ -194,7 +194,7 @@ def measure_streaks(
     """Return the streaks, which are the candidate regions whose cornerness has exactly two peaks.
 
     The argument `cornerness` is a function of an image and the settings that returns the response at each
-    pixel, in place of the Harris corner detector.
+    pixel, used instead of the Harris corner detector.
     """
     respond = harris_cornerness if cornerness is None else cornerness
     sigma = expected_sigma(segmented.candidates, segmented.background, settings)

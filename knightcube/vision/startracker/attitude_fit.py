@@ -3,17 +3,17 @@
 `refine` solves Wahba's problem with one more unknown, the scale k, which multiplies all tangents x/z and y/z
 to correct the assumed focal length. A Gauss-Newton iteration minimises the residuals e = b(k) - A r, where b
 is an observed unit vector, A the attitude matrix and r the unit vector from the catalogue. A small rotation d
-about the camera axes and a small change of ln k change e by -[A r x] d + s dlnk, with s = (x z^2, y z^2,
--z (x^2 + y^2)). The minimum of the sum of |e|^2 / sigma^2 is the maximum likelihood estimate if sigma, rad,
-is the standard deviation of a direction along each of the two axes normal to it.
+about the camera axes and a small change dlnk of ln k change the residual e by -[A r x] d + s dlnk, with s =
+(x z^2, y z^2, -z (x^2 + y^2)). The minimum of the sum of |e|^2 / sigma^2 is the maximum likelihood estimate
+if sigma, rad, is the standard deviation of a direction along each of the two axes normal to it.
 
-`fit_with_distortion` also fits the radial distortion of an uncalibrated lens. Such a lens displaces stars by
-some per cent of their distance from the axis. Without distortion, the fit agrees only with a group of
-neighbouring stars, and its attitude error is larger than the residuals suggest. A star whose true direction
-has the tangent t appears at the tangent t (1 + c (t / R)^2), where R is the tangent of the image corner
-(first radial term of Brown 1966). The distortion c has the prior standard deviation `PRIOR`. The match starts
-with the stars that match without distortion and grows outwards as c is determined. The covariance of the
-attitude includes the uncertainty of c.
+`fit_with_distortion` also fits the radial distortion of an uncalibrated lens. An uncalibrated lens displaces
+stars by some per cent of their distance from the axis. If the fit includes no distortion, it agrees only with
+a group of neighbouring stars, and its attitude error is larger than the residuals suggest. A star whose true
+direction has the tangent t appears at the tangent t (1 + c (t / R)^2), where R is the tangent of the image
+corner (first radial term of Brown 1966). The distortion coefficient c has the prior standard deviation
+`PRIOR`. The match starts with the stars that match without distortion, and is extended outwards as the
+distortion c is determined. The covariance of the attitude includes the uncertainty of the distortion c.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class StarField:
         direction: unit vectors to the points (n, 3), camera frame, for the assumed focal length.
         sigma: standard deviation of each direction along one axis (n,), rad.
         half_width: tangents of half the field of view along x and along y (2,).
-        scale: lowest and highest possible factor that corrects the tangents x/z, y/z for the true focal
-            length; (1, 1) for a calibrated camera.
+        scale: lowest and highest possible factor by which the tangents x/z, y/z must be multiplied for the
+            true focal length; (1, 1) for a calibrated camera.
         magnitude: instrumental magnitudes of the points (n,), or None if only their order is known.
     """
 
@@ -54,7 +54,7 @@ class StarField:
         return len(self.direction)
 
     def rescaled(self, factor: float) -> StarField:
-        """Return the field with its tangents multiplied by `factor` and its limits of scale divided by it."""
+        """Return the field with tangents multiplied by `factor`, and its scale limits divided by `factor`."""
         stretched = self.direction * np.array([factor, factor, 1.0])
         return replace(
             self,
@@ -69,7 +69,7 @@ class StarField:
         return replace(self, direction=self.direction * np.array([-1.0, 1.0, 1.0]))
 
     def subset(self, chosen: IntArray) -> StarField:
-        """Return the field with only the points whose indices are in `chosen` (k,), in this order."""
+        """Return the field reduced to the points with the indices `chosen` (k,), in this order."""
         magnitude = None if self.magnitude is None else self.magnitude[chosen]
         return replace(self, direction=self.direction[chosen], sigma=self.sigma[chosen], magnitude=magnitude)
 
@@ -91,16 +91,16 @@ class StarMatch:
         status: outcome of the identification; the other attributes are valid for IDENTIFIED only.
         star: index of the guide star of each point (n,); -1 for a point without a guide star.
         fix: attitude from all matched stars, ICRS to camera, with its covariance, or None unless identified.
-        scale: factor that corrects the tangents of the observed directions for the true focal length.
+        scale: factor by which the observed tangents x/z, y/z must be multiplied for the true focal length.
         scale_sigma: standard deviation of the scale; 0 if the scale was given.
         log10_false_alarm: log10 of the probability that random stars would match as well anywhere in the sky;
             0 if unknown.
         distortion: fitted distortion of the lens, as the relative displacement of a star in the image corner;
             0 if the stars matched without distortion.
-        from_lens: part of the covariance of `fix` that is due to the uncertainty of `distortion` (3, 3),
-            rad^2.
-        mirrored: whether the stars were identified in the mirrored field (`StarField.mirrored`). In this case
-            `fix` is the attitude of the mirrored field.
+        from_lens: part of the attitude covariance of `fix` that is due to the uncertainty of `distortion` (3,
+            3), rad^2.
+        mirrored: whether the stars were identified in the mirrored field (`StarField.mirrored`). For a
+            mirrored field, `fix` is the attitude of the mirrored field.
     """
 
     status: MatchStatus
@@ -114,15 +114,15 @@ class StarMatch:
     mirrored: bool = False
 
 
-# The product v @ _CROSS, reshaped to (3, 3), is the cross-product matrix [v x].
+# For a vector v, the product v @ _CROSS, reshaped to (3, 3), is the cross-product matrix [v x].
 _CROSS = np.array(
     [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0.0]]
 )
-# Step (rad) below which the iteration ends; a step d leaves an error of about d^2, or 0.002 arcsec.
+# Rotation step (rad) below which the iteration ends; a step d leaves an error of about d^2, or 0.002 arcsec.
 _SETTLED = 1e-4
 _MOST_STEPS = 6
 # Minimum reciprocal condition number of the normal equations.
-# This minimum is reached if all stars lie within 1e-6 rad of one direction.
+# The condition number reaches this minimum if all stars lie within 1e-6 rad of one direction.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -132,10 +132,10 @@ class Refinement:
 
     Attributes:
         matrix: attitude matrix (3, 3) from ICRS to camera axes.
-        scale: factor that corrects the tangents of the observed directions.
+        scale: factor by which the tangents of the observed directions are multiplied.
         covariance: covariance of the rotation about the camera axes (rad) and of ln scale (4, 4), or of the
             rotation alone (3, 3) if the scale was fixed.
-        squares: squared residual of each star divided by its variance (n,).
+        squares: squared residual of each star, divided by the variance of the star's direction (n,).
     """
 
     matrix: FloatArray
@@ -181,9 +181,9 @@ def scale_slope(direction: FloatArray) -> FloatArray:
 def inflation(squares: FloatArray, parameters: float) -> float:
     """Return the factor by which variances must be increased to agree with the residuals of a fit.
 
-    Each of the `squares` (n,) is the chi-square of one star, with two components. The sum of the squares has
-    a chi-square distribution with 2n - `parameters` degrees of freedom. The factor is 1 if the sum exceeds
-    its mean by less than three standard deviations.
+    Each of the values `squares` (n,) is the chi-square of one star, which has two components. The sum of the
+    squares has a chi-square distribution with 2n - `parameters` degrees of freedom. The factor is 1 if this
+    sum exceeds its mean by less than three standard deviations.
     """
     freedom = 2 * len(squares) - parameters
     if freedom <= 0:
@@ -202,7 +202,7 @@ def refine(
 ) -> Refinement | None:
     """Return the attitude and scale that best transform `reference` directions into `observed` directions.
 
-    Returns None if the stars do not determine the parameters, or if the fit diverges.
+    Returns None if the stars do not determine attitude and scale, or if the fit diverges.
 
     Args:
         observed: observed unit vectors to the stars (n, 3), camera frame, at scale 1.
@@ -261,11 +261,11 @@ _MOST = 0.25
 _GROWTH_ROUNDS = 12
 _DISTORTION_STEPS = 6
 _DISTORTION_SETTLED = 1e-6
-# Half-width of the gate within which a star matches, in standard deviations of the star.
+# Half-width of the gate within which a star matches a guide star, in standard deviations of the star.
 _GATE_SIGMAS = 8.0
-# Minimum half-width of the gate within which a star matches, relative to the corner's tangent.
+# Minimum half-width of the gate within which a star matches a guide star, relative to the corner's tangent.
 _GATE_SHARE = 0.004
-# Residual above which a star is excluded from the final fit, in standard deviations of the scatter.
+# Residual above which a star is excluded from the final fit, in standard deviations of all residuals.
 _OUTLIER = 4.0
 # Median of the square root of chi-square with 2 degrees of freedom (the Rayleigh distribution).
 _RAYLEIGH_MEDIAN = 1.1774
@@ -276,7 +276,7 @@ class DistortedFit:
     """The matched stars and the attitude of a camera with a distorted lens.
 
     Attributes:
-        observed: indices of the matched observed points (k,).
+        observed: indices of the observed points that match guide stars (k,).
         star: indices of the guide stars that they match (k,).
         refined: attitude and scale, with a covariance that is increased if the residuals are too large.
         distortion: radial distortion, as the relative displacement of a star in the image corner.
@@ -301,7 +301,7 @@ def fit_with_distortion(
     star: IntArray,
     start: Refinement,
 ) -> DistortedFit | None:
-    """Return a match that is extended to stars for which the distortion of the lens must be fitted.
+    """Return a match that is extended to stars that match only with a distorted lens.
 
     Returns None if the matched stars do not determine the distortion.
 
@@ -345,7 +345,7 @@ def fit_with_distortion(
         if fitted is None:
             return None
     pose, normal, squares = fitted
-    # Residuals that are too large increase the covariance from the stars, but not the prior covariance.
+    # Too large residuals increase the part of the covariance from the stars, but not that from the prior.
     normal[4, 4] -= PRIOR**-2
     normal /= inflation(squares, 5)
     normal[4, 4] += PRIOR**-2
@@ -371,8 +371,8 @@ class _DistortedPose:
     def ratio(self, direction: FloatArray, corner: float) -> FloatArray:
         """Return the ratios r (n,) of true to observed tangents.
 
-        A ratio solves r (1 + c s^2 r^2) = 1, where c is the distortion and s is the observed tangent divided
-        by the corner's tangent.
+        The ratio r of a star solves r (1 + c s^2 r^2) = 1, where c is the distortion and s is the observed
+        tangent divided by the corner's tangent.
         """
         squared = self.distortion * _squared_tangent(direction) / corner**2
         ratio = np.ones(len(direction))
@@ -388,9 +388,9 @@ def _squared_tangent(direction: FloatArray) -> FloatArray:
 def _distorted_fit(
     field: StarField, sky: SkyIndex, observed: IntArray, star: IntArray, pose: _DistortedPose, corner: float
 ) -> tuple[_DistortedPose, FloatArray, FloatArray] | None:
-    """Return attitude, scale and distortion from matched stars, the normal matrix (5, 5) and squares (k,).
+    """Return attitude, scale and distortion from matched stars, normal matrix (5, 5) and chi-squares (k,).
 
-    The normal matrix includes the prior of the distortion. The squares are the chi-squares of the stars.
+    The normal matrix includes the prior of the distortion. Each chi-square is that of one matched star.
     """
     direction, reference = field.direction[observed], sky.stars.direction[star]
     weight = 1.0 / (field.sigma[observed] * pose.scale)
@@ -400,7 +400,7 @@ def _distorted_fit(
         predicted = reference @ pose.matrix.T
         residual = weight[:, None] * (seen - predicted)
         slope = np.empty((len(seen), 3, 5))
-        # A rotation d changes A r by -[d x] A r = [A r x] d, and changes the residual by -[A r x] d.
+        # A rotation d changes the prediction A r by -[d x] A r = [A r x] d, and the residual by -[A r x] d.
         slope[:, :, :3] = -cross_matrices(predicted)
         slope[:, :, 3] = scale_slope(seen)
         share = _squared_tangent(direction) * ratio**2 / corner**2

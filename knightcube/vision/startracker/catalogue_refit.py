@@ -1,12 +1,12 @@
-"""Refit of the streaks of an identified frame with all stars of the catalogue, including faint stars.
+"""Second fit of the streaks of an identified frame, with all stars of the catalogue, including faint stars.
 
 In a frame of long streaks, most stars are fainter than the noise of a pixel. The light of these faint stars
 overlaps the bright streaks and displaces the measured positions, and a close pair of stars is measured as one
 star. After a frame is identified, the catalogue gives the positions of all stars. The catalogue also gives
-the brightness of all stars, which is scaled to the measured stars. Stars that are too faint, or too near to a
-brighter star, to be fitted are subtracted from the frame, and the uncertainty of their brightness is added to
-the noise. The fit of the other stars starts at their catalogue positions. Objects that are not in the
-catalogue are fitted but do not affect the motion.
+the magnitudes of all stars, which are converted to counts with the measured stars. Stars that are too faint
+to be fitted, or too near to a brighter star, are subtracted from the frame, and the uncertainty of their
+brightness is added to the noise. All stars that are fitted start at their catalogue positions. Light sources
+that are not in the catalogue are fitted but do not affect the motion.
 """
 
 from __future__ import annotations
@@ -44,25 +44,25 @@ from knightcube.vision.streaks.normal_equations import light_of
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 
-# Distance below which a streak overlaps the pixels of a bright streak, relative to the half-width of the fit.
+# Distance below which a streak overlaps the fitted pixels of a bright streak, relative to their half-width.
 _NEAR = 1.4
 # Distance (px) below which two stars are too close to be fitted separately.
 _TWIN = 2.0
-# Largest distance (px) between a measured star and its catalogue star, and minimum ratio of their fluxes.
+# Largest distance (px) of a measured star from its catalogue star, and minimum ratio of their fluxes.
 _SAME, _ALIKE = 5.0, 0.3
 # Distance (px) from a catalogue star's streak within which a measured star is a segment of this streak.
 _BESIDE = 2.5
 # Relative error of a star's flux that is predicted from the catalogue.
 _LIGHT_ERROR = 0.15
-# Number of stars that are subtracted in one batch.
+# Number of stars that are subtracted from the frame in one batch.
 _AT_ONCE = 25
 # Number of instants during the exposure at which a star is tested for being in the frame.
 _INSTANTS = 9
-# Factor on the maximum number of pixels in the refit, which includes more stars than the first fit.
+# Factor on the maximum number of pixels in the second fit, which includes more stars than the first.
 _ROOM = 1.7
-# Largest chi-square of the difference between the rates of both fits (false rejection of 1 in 100,000).
+# Largest chi-square of the difference between the rates of both fits (false alarm in 1 of 100,000 frames).
 _ONE_MOTION = 25.9
-# Increase (px) of the uncertainty of the attitude that is the prior of the refit.
+# Increase (px) of the standard deviation of the attitude that is the prior of the new identification.
 _PRIOR_PX = 1.0
 
 
@@ -73,7 +73,7 @@ def refit_with_catalogue(
     settings: SolveSettings,
     likelihood: LikelihoodSettings,
 ) -> FrameSolution:
-    """Return a solution with motion and attitude refitted, or the same solution if the refit fails.
+    """Return a solution with motion and attitude fitted again, or the same solution if the new fit fails.
 
     Args:
         pixels: counts of the solved frame (rows, columns).
@@ -104,7 +104,7 @@ def refit_motion(
     settings: SolveSettings,
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
-    """Return `motion` refitted with all catalogue stars, or None if the fit fails or the rate changes."""
+    """Return `motion` fitted again with all catalogue stars, or None if the fit fails or changes the rate."""
     # With a rolling shutter, an ambiguous rate lies between two possible rates and is not a valid start.
     between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
@@ -131,7 +131,7 @@ def refit_motion(
     done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
-    # `hidden` is cleared, so that the fit is not repeated with fewer streaks.
+    # The stars `hidden` are cleared, so that the fit is not repeated with fewer streaks.
     done = replace(done, hidden=None)
     refit = with_rate(with_stars(motion, camera, done), camera, done, StreakVerdict.CONFIRMED)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
@@ -141,7 +141,7 @@ def refit_motion(
     apart = refit.rate - motion.rate
     if not apart @ np.linalg.solve(motion.covariance + covariance, apart) < _ONE_MOTION:
         return None
-    # Faint streaks that are not among the refitted streaks are kept.
+    # Faint streaks that are not among the streaks of the new fit are kept.
     worst = np.linalg.norm(motion.faint_endpoints[:, None] - refit.endpoints, axis=-1).max(axis=-1)
     left = (worst > _SAME).all(axis=1)
     return replace(
@@ -205,7 +205,7 @@ def _known_stars(
 ) -> _Known | None:
     """Return the catalogue stars in the frame, or None if no fitted star is identified.
 
-    The identified stars give the counts of a star of magnitude zero.
+    The counts of a star of magnitude zero are determined from the identified stars.
     """
     matched = solution.matched
     apart = np.linalg.norm(solution.points[matched, None] - motion.stars, axis=-1)
@@ -228,7 +228,7 @@ def _known_stars(
 def _scenes(
     camera: FitProblem, course: CameraMotion, known: _Known, motion: MotionResult
 ) -> tuple[StreakScene, StreakScene]:
-    """Return the stars to fit, of which the brightest determine the motion, and the stars to subtract."""
+    """Return the stars to fit, the brightest of which determine the motion, and the stars to subtract."""
     settings = camera.settings
     width = float(np.sqrt(motion.psf_sigma**2 + 1.0 / 12.0))
     leading = np.arange(len(known.light)) < settings.most_stars
@@ -251,7 +251,7 @@ def _scenes(
 
 
 def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known: _Known) -> IntArray:
-    """Return the indices of measured stars that are near neither a catalogue star nor its streak.
+    """Return the indices of measured stars that are near no catalogue star and no catalogue star's streak.
 
     The streak of a catalogue star is also examined because the first fit may divide it into two stars.
     """
@@ -265,7 +265,7 @@ def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known
 
 
 def _without(camera: FitProblem, hidden: StreakScene) -> ReducedFrame:
-    """Return the frame without the light of `hidden` stars, and with its uncertainty added to the noise."""
+    """Return the frame without the light of `hidden` stars, whose uncertainty is added to the noise."""
     frame = camera.frame
     if not len(hidden.light):
         return frame

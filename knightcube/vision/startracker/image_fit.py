@@ -1,21 +1,21 @@
 """The attitude from matched stars whose image positions have individual covariances.
 
-The position of a streaked star is accurate across its path and inaccurate along its path. Each residual,
-which is the difference between observed and predicted unit vector, is resolved in two directions normal to
-the star and whitened by the covariance of the position. The minimum of the sum of squares, found by a
-Gauss-Newton iteration, is the maximum likelihood estimate for Gaussian errors. A streak that overlaps another
-star has a wrong position. Streaks with wrong positions are found with Huber's weights, which bound the
-influence of any star, and are excluded.
+The position of a streaked star is accurate across its path and inaccurate along its path. The residual of a
+star, which is the difference between observed and predicted unit vector, is resolved in two directions normal
+to the star and scaled to unit variance with the covariance of the position. The minimum of the sum of
+squares, found by a Gauss-Newton iteration, is the maximum likelihood estimate for Gaussian errors. A streak
+that overlaps another star has a wrong position. Streaks with wrong positions are found with Huber's weights,
+which bound the influence of any star, and are excluded.
 
-Tilt, decentring and distortion of an inexact lens (the bend, see `sky_map`) are also fitted, with a prior
-from the calibration or from typical lenses. The covariance of the attitude includes the remaining uncertainty
-of the lens. An error of the line time of a rolling shutter, which displaces each star along its motion in
-proportion to its row, is also fitted.
+Tilt, decentring and distortion of an inexact lens (together called the bend, see `sky_map`) are also fitted,
+with a prior from the calibration or from typical lenses. The covariance of the attitude includes the
+remaining uncertainty of the lens. An error of the line time of a rolling shutter, which displaces each star
+along its motion in proportion to its row, is also fitted.
 
 The positions of streaks that do not fit the streak model have errors of some pixels, regardless of their
 brightness. If the residuals of streaks exceed the noise, a common variance is added to the noise, so that the
 sum of squares equals the degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without this
-variance, the brightest stars would dominate the fit, and the covariance would be too small.
+common variance, the brightest stars would dominate the fit, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from knightcube.vision.startracker.sky_map import BENDS, bend_slope, bent
 
 _MOST_STEPS = 8
 _SETTLED = 1e-11
-# Step (px) of the numerical derivative of a direction with respect to the image position.
+# Step (px) for the numerical derivative of a star's direction by its image position.
 _STEP_PX = 0.5
-# Value of chi-square with 2 degrees of freedom that is exceeded with a probability of 0.1 %, and its median.
+# Value of chi-square (2 degrees of freedom) that is exceeded with a probability of 0.1 %, and its median.
 _FARTHEST = 13.8
 _MEDIAN = 2.0 * float(np.log(2.0))
-# Residual (standard deviations) above which Huber's weights bound the influence of a star.
+# Residual (standard deviations) above which Huber's weights limit the influence of a star.
 _PULL = 1.5
 _HUBER_ROUNDS = 10
 _LEAST_AGREEING = 4
@@ -56,12 +56,12 @@ class Unknowns:
     """The parameters that are fitted together with the attitude.
 
     Attributes:
-        scale: whether the focal length is fitted.
+        scale: whether the scale of the image, and thus the focal length, is fitted.
         bend: reciprocal prior variances (6,) of tilt, decentring and distortion of the lens (`sky_map`);
             empty (0,) if the lens is exact.
         late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
             line time; (0, 2) if the line time is exact.
-        scatter: whether a common variance may be added to the variances of the positions.
+        scatter: whether a variance common to all stars may be added to the variances of the positions.
     """
 
     scale: bool = False
@@ -79,12 +79,13 @@ class ImageFit:
 
     Attributes:
         fix: attitude from the stars that agree; its covariance is increased if their residuals are too large.
-        scale: factor that corrects the observed tangents x/z, y/z; 1 if the focal length was fixed.
+        scale: factor by which the observed tangents x/z, y/z must be multiplied; 1 if the focal length was
+            fixed.
         scale_sigma: relative standard deviation of the scale; 0 if the focal length was fixed.
         bend: fitted tilt, decentring and distortion of the lens (6,), see `sky_map`; zeros for an exact lens.
         delay: fitted error of the shutter's line time, in standard deviations.
-        squares: chi-square of each star (n,), with two degrees of freedom.
-        agree: which stars were used for the attitude (n,).
+        squares: chi-square of the residual of each star (n,), with two degrees of freedom.
+        agree: mask of the stars that were used for the attitude (n,).
     """
 
     fix: AttitudeFix
@@ -116,7 +117,7 @@ def fit_in_image(
 
     Raises AttitudeError if the stars do not determine the parameters.
     """
-    # The slopes (n, 3, 2) are the derivatives of the directions with respect to the positions.
+    # The array `slopes` (n, 3, 2) contains the derivatives of the directions by the image positions.
     moved = [
         camera.unit_vectors(points + offset) - camera.unit_vectors(points - offset)
         for offset in _STEP_PX * np.eye(2)
@@ -140,7 +141,7 @@ def fit_in_image(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FittedPose:
-    """Fitted attitude matrix (3, 3), scale, bend (6,) and delay, and their covariance."""
+    """Fitted attitude matrix (3, 3), scale, lens errors (bend, (6,)) and delay, and their covariance."""
 
     matrix: FloatArray
     scale: float
@@ -151,7 +152,7 @@ class _FittedPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """Observed stars and the parameters to be fitted to them.
+    """The n observed stars and the parameters that are fitted to them.
 
     Attributes:
         observed: observed unit vectors to the stars (n, 3), camera frame.
@@ -160,7 +161,7 @@ class _Seen:
         reference: unit vectors to the stars from the catalogue (n, 3).
         unknowns: parameters that are fitted together with the attitude.
         whitener: transformation (n, 2, 3) of a direction error into two components of unit variance.
-        late: displacement of each direction due to one standard deviation of the line time (n, 3), rad.
+        late: displacement of each direction due to a line time error of one standard deviation (n, 3), rad.
     """
 
     observed: FloatArray
@@ -172,7 +173,7 @@ class _Seen:
     late: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        # The whitener is a pseudo-inverse, because a direction has no error along the line of sight.
+        # The `whitener` is a pseudo-inverse, because a direction has no error along the line of sight.
         spread = self.slopes @ np.linalg.cholesky(self.covariance)
         across = np.swapaxes(spread, -1, -2)
         object.__setattr__(self, "whitener", np.asarray(np.linalg.inv(across @ spread) @ across))
@@ -182,21 +183,21 @@ class _Seen:
 
     @property
     def before(self) -> FloatArray:
-        """The reciprocal prior variances of the bend and of the delay, which are the last parameters."""
+        """The reciprocal prior variances of the last parameters: the lens errors (bend) and the delay."""
         return np.append(self.unknowns.bend, np.ones(min(len(self.late), 1)))
 
     @property
     def camera(self) -> IntArray:
-        """The indices of the bend and of the delay among the parameters."""
+        """The indices of the lens errors (bend) and of the delay among the fitted parameters."""
         return 3 + int(self.unknowns.scale) + np.arange(len(self.before))
 
     def parameters(self, pose: _FittedPose) -> float:
-        """Return the effective number of parameters that the stars, and not the prior, determine."""
+        """Return the effective number of parameters that the stars determine instead of the prior."""
         before = self.before * np.diagonal(pose.covariance)[self.camera]
         return len(pose.covariance) - float(before.sum())
 
     def fitted(self, start: _FittedPose, weight: FloatArray) -> _FittedPose:
-        """Return the pose that minimises the sum of the stars' chi-squares, weighted with `weight` (n,)."""
+        """Return the pose with the smallest sum of the stars' chi-squares, weighted with `weight` (n,)."""
         whitener = self.whitener * np.sqrt(weight)[:, None, None]
         matrix, scale, known, bends = start.matrix, start.scale, self.before, len(self.unknowns.bend)
         held = np.append(start.bend[:bends], np.full(len(known) - bends, start.delay))
@@ -223,14 +224,15 @@ class _Seen:
         return replace(self._pose(matrix, scale, held), covariance=np.asarray(inverse, dtype=np.float64))
 
     def _pose(self, matrix: FloatArray, scale: float, held: FloatArray) -> _FittedPose:
-        """Return a pose; `held` contains the fitted bend and delay, 0, 1, 6 or 7 values."""
+        """Return a pose; `held` contains the fitted lens errors (bend) and delay: 0, 1, 6 or 7 values."""
         bends = len(self.unknowns.bend)
         return _FittedPose(matrix, scale, np.pad(held[:bends], (0, BENDS - bends)), float(held[bends:].sum()))
 
     def _slope(self, whitener: FloatArray, seen: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the derivatives of the whitened residuals with respect to the parameters, (2n, 3 to 11).
+        """Return the derivatives of the residuals, scaled to unit variance, by the parameters, (2n, 3 to 11).
 
-        The parameters are the rotation, ln scale, the bend and the delay, as far as they are fitted.
+        The parameters are the rotation, ln scale, the lens errors (bend) and the delay, as far as they are
+        fitted.
         """
         slopes = [-whitener @ cross_matrices(predicted)]
         if self.unknowns.scale:
@@ -242,7 +244,7 @@ class _Seen:
         return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
 
     def directions(self, pose: _FittedPose) -> FloatArray:
-        """Return the observed unit vectors (n, 3) at mid-exposure, corrected for a pose's lens errors."""
+        """Return observed unit vectors (n, 3) at mid-exposure, corrected for the lens errors of a pose."""
         seen = bent(stretched(self.observed, pose.scale), pose.bend)
         return seen - pose.delay * self.late if len(self.late) else seen
 
@@ -256,16 +258,16 @@ class _Seen:
 
 
 def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tuple[_FittedPose, BoolArray]:
-    """Return the fit to the stars that agree with each other, and which stars these are (n,).
+    """Return the fit to the stars that agree with each other, and a mask of these stars (n,).
 
-    An outlier affects the residuals of all stars. Therefore the influence of outliers is bounded before the
-    scatter of the residuals is computed.
+    An outlier affects the residuals of all stars in the fit. Therefore the influence of outliers is bounded
+    before the scatter of the residuals is computed.
     """
     for _ in range(_HUBER_ROUNDS):
         pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))
         squares = seen.squares(pose)
     # A star agrees if its residual is within the scatter of the majority.
-    # If too few stars agree, all stars are used.
+    # If too few stars agree with the majority, all stars are used.
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
     if np.count_nonzero(agree) < max(_LEAST_AGREEING, len(squares) // 2):
         agree = np.ones(len(squares), dtype=np.bool_)
@@ -275,7 +277,7 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
 def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose]:
     """Return stars and fit after a common variance, px^2, is added to the variances of the positions.
 
-    The variance is estimated from the stars that `agree` (n,).
+    The common variance is estimated from the stars in the mask `agree` (n,).
     """
     weight, own, variance = agree.astype(np.float64), seen.covariance, 0.0
     for _ in range(_SCATTER_ROUNDS):
@@ -284,7 +286,7 @@ def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen,
         excess = float(np.sum(missed**2)) - (2 * len(missed) - seen.parameters(pose))
         if excess <= _EXPLAINED or len(missed) <= _LEAST_AGREEING:
             break
-        # The Newton step uses the derivative of chi-square by the variance at a fixed pose.
+        # The Newton step uses the derivative of chi-square by the common variance for a fixed pose.
         variance += excess / float(np.sum(np.linalg.solve(root.swapaxes(1, 2), missed[..., None]) ** 2))
         seen = replace(seen, covariance=own + variance * np.eye(2))
         pose = seen.fitted(pose, weight)
@@ -303,7 +305,7 @@ def attitude_by(
     """Return the attitude from a solver of Wahba's problem for the stars that agree in an image fit.
 
     The image fit excludes outliers and determines the lens errors. The solver uses the directions of the
-    other stars, each with one standard deviation for both axes (Michalski, section 3.4).
+    stars that are not outliers, each with one standard deviation for both axes (Michalski, section 3.4).
 
     Args:
         solver: solver of Wahba's problem.

@@ -1,15 +1,16 @@
 """Lost in space: identification of the stars of a frame without prior information.
 
 Triangles of the brightest observed stars are looked up by shape, orientation and size among the triangles of
-guide stars. Each match of two triangles votes for three pairs of an observed star and a guide star. True
-pairs occur in many triangles, and chance pairs in only one. The matches with the most votes are verified
-against the whole field until one match is accepted. If no match is accepted, triangles of all observed stars,
-not only of the brightest, are looked up. Of a thousand such triangles, enough consist of true stars even if
-most observed points are false. If no match is accepted, the mirrored field is tried. Finally, scales outside
-the given range are tried if the given range is narrow, because a narrow range may be wrong.
+guide stars. Each match of an observed triangle with a triangle of the index votes for three pairs of an
+observed star and a guide star. Correct pairs occur in many triangles, and chance pairs in only one. The
+matches with the most votes are verified against the whole field until one match is accepted. If no match is
+accepted, triangles of all observed stars, and not only of the brightest, are looked up. Even if most observed
+points are not stars, enough of a thousand such triangles consist of true stars. If no match is accepted, the
+mirrored field is tried. Finally, image scales outside the given range are tried if this range is narrow,
+because it may be wrong.
 
-The shape of a triangle on the sphere depends slightly on the scale of the image. A wide range of scales is
-divided into steps that are so narrow that the side ratios stay within the tolerance.
+The shape of a triangle on the sphere depends slightly on the scale of the image. A wide range of image scales
+is divided into steps that are so narrow that the side ratios stay within the tolerance.
 """
 
 from __future__ import annotations
@@ -50,18 +51,19 @@ _NEIGHBOURS = 5
 _CENTRES = 40
 _MOST_STARS = 64
 # Limits of the longest side of a triangle, relative to the width of the field.
-# Larger triangles in the index have only bright stars, and smaller triangles are less accurate.
+# Larger triangles in the index consist of bright stars only, and smaller triangles are less accurate.
 _MIDDLE_SIZES = 0.3, 0.75
 
 
 @dataclass(frozen=True, slots=True)
 class BatchSizes:
-    """Numbers of triangles in the successive batches that are looked up.
+    """Numbers of triangles in successive batches of triangles that are looked up in the index.
 
     Attributes:
-        bright: numbers of triangles of the brightest stars, for each step of scale; they identify most
-            frames.
-        spread: numbers of triangles of many stars, for frames whose brightest points are not stars.
+        bright: numbers of triangles of the brightest stars in each batch, for each step of scale; they
+            identify most frames.
+        spread: numbers of triangles of many stars in each batch, for frames whose brightest points are not
+            stars.
     """
 
     bright: tuple[int, ...] = (60, 250)
@@ -131,7 +133,7 @@ class ScaleSteps:
     """Steps that divide the range of possible scales, so that triangle shapes are constant within a step.
 
     Attributes:
-        middle: scale of each step for which the triangle shapes are computed (s,).
+        middle: scale in each step with which the triangle shapes are computed (s,).
         lowest, highest: limits of the scale of each step (s,).
     """
 
@@ -144,11 +146,11 @@ class ScaleSteps:
 
     @classmethod
     def of(cls, field: StarField, tolerance: float) -> ScaleSteps:
-        """Return the steps of a field's range of scales; side ratios vary by `tolerance` within a step.
+        """Return steps of a field's range of scales, within each of which side ratios vary by `tolerance`.
 
-        At the tangent t from the boresight, a gnomonic image is enlarged by 1 + t^2 along the radius and by
-        1 + t^2 / 2 across the radius. Therefore a side ratio at this tangent varies by t^2 / 2. The steps are
-        computed for the tangent half-way to the corner.
+        At a field angle of tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2
+        / 2 across the radius. Therefore the ratio of two sides of a triangle there varies by t^2 / 2. The
+        steps are computed for the field angle half-way to the corner of the field.
         """
         lowest, highest = field.scale
         half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
@@ -163,8 +165,9 @@ class TriangleMatches:
 
     Attributes:
         observed: indices of the observed stars at the corners of each match (k, 3), uint32.
-        star: indices of the guide stars at the same corners (k, 3), uint32.
-        scale: factor on the observed tangents that makes the longest sides of each match equal (k,).
+        star: indices of the guide stars at the corresponding corners (k, 3), uint32.
+        scale: factor by which the observed tangents must be multiplied to make the longest sides of each
+            match equal (k,).
     """
 
     observed: npt.NDArray[np.uint32]
@@ -193,7 +196,7 @@ class TriangleMatches:
         bins = np.log(self.scale) * _BINS_PER_LN_SCALE
         bins -= bins.min()
         bits = max(13, self.star.size.bit_length())
-        # With this multiplicative hash, two pairs rarely share a slot; a collision only adds wrong votes.
+        # With this multiplicative hash, two pairs rarely share a slot, which would only add wrong votes.
         code = (self.star * np.uint32(1021) + self.observed) * np.uint32(257)
         code += bins.astype(np.uint32)[:, None]
         slot = (code * np.uint32(2654435761)) >> np.uint32(32 - bits)
@@ -215,13 +218,13 @@ def look_up(
     """Return the matches of observed triangles in the index, and the number of index entries read.
 
     Args:
-        field: observed points of the frame.
+        field: observed points of the frame, some of which may not be stars.
         sky: sky index of guide stars and their triangles.
-        steps: steps of the scale of the image.
+        steps: steps into which the range of image scales is divided.
         triangles: indices of the observed stars at the corners of each triangle (t, 3).
         tolerance: tolerance of a side ratio, in standard deviations.
         distortion: additional error of a side ratio due to distortion of the lens.
-        most: maximum number of index entries to read, beginning with the first triangles.
+        most: maximum number of index entries to read, in the order of the observed triangles.
     """
     corners, sides, left = _forms(field, triangles, steps)
     size = np.maximum(sides[:, 2], SIZE_UNIT)
@@ -236,26 +239,26 @@ def look_up(
     lowest = size * (steps.lowest / steps.middle)[step] * (1.0 - slack)
     highest = size * (steps.highest / steps.middle)[step] * (1.0 + slack)
     query, short, middle, begin, end = _runs(sky, ratio, slack, left, lowest, highest)
-    # Only the first runs of index entries, with at most `most` entries in total, are read.
+    # Only the first ranges of index entries are read, with at most `most` entries in total.
     count = end - begin
     kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
     begin, count = begin[:kept], count[:kept]
     query, short, middle = query[: len(count)], short[: len(count)], middle[: len(count)]
-    # Most of the time is spent on these entries, and int32 halves it.
+    # Most of the time is spent on index entries, and int32 halves it.
     first = (begin - (np.cumsum(count) - count)).astype(np.int32)
     entry = np.arange(int(count.sum()), dtype=np.int32) + np.repeat(first, count)
     near = np.ones(len(entry), dtype=np.bool_)
     for column, cells in enumerate((short, middle)):
         lowest_place, width = _places(ratio[query, column], slack[query], cells)
         place = sky.triangles.shape[:, column][entry]
-        # For a position below the lowest one, the difference of unsigned bytes wraps to a large number.
+        # For a position below the lowest position, the difference of unsigned bytes wraps to a large number.
         near &= place - np.repeat(lowest_place, count) <= np.repeat(width, count)
     chosen = np.flatnonzero(near)
     total = len(entry)
     entry = entry[chosen]
     query = query[np.searchsorted(np.cumsum(count), chosen, side="right")]
     longest = (sky.triangles.key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
-    # The runs also contain some triangles that are too small or too large for the step of scale.
+    # The ranges of entries also contain some triangles that are too small or too large for the step of scale.
     fits = np.flatnonzero((longest >= lowest[query]) & (longest <= highest[query]))
     entry, query, longest = entry[fits], query[fits], longest[fits]
     scale = longest / size[query] * steps.middle[step[query]]
@@ -266,11 +269,11 @@ def look_up(
 def _places(
     ratio: FloatArray, slack: FloatArray, cells: IntArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest position in a cell that agrees with each ratio, and the number of further positions.
+    """Return the lowest position within a cell that agrees with each side ratio, and the number of others.
 
-    A position agrees with a ratio if it differs from the ratio by at most `slack`.
+    A position agrees with a side ratio if they differ by at most `slack`.
     """
-    # Positions are in units of 1 / FINE of a cell, and refer to the middle of such a unit.
+    # Positions within a cell are in units of 1 / FINE of its width, and refer to the middle of such a unit.
     wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
     reach = slack * (CELLS * FINE) + 0.5
     lowest = np.clip(np.ceil(wanted - reach), 0, FINE - 1)
@@ -281,9 +284,9 @@ def _places(
 def _forms(
     field: StarField, triangles: IntArray, steps: ScaleSteps
 ) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return corners and sides (t s, 3) of t triangles at s scales, sorted by the length of the side.
+    """Return corners and sides (t s, 3) of t triangles at s scales, sorted by side length.
 
-    The third value is the orientation of the corners in the image (t s,).
+    The third returned value is the orientation of the corners in the image (t s,).
     """
     x, y, z = field.direction.T
     direction = np.empty((len(steps), len(field), 3))
@@ -313,17 +316,18 @@ def _runs(
     lowest: FloatArray,
     highest: FloatArray,
 ) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
-    """Return the runs of contiguous keys that contain triangles similar to the observed triangles (queries).
+    """Return the ranges of the sorted triangle keys that may contain triangles similar to the observed ones.
 
-    Each run has the index of its query, the cells of both side ratios, and its beginning and end in the keys.
-    Each side ratio of a query may lie in up to three cells.
+    For each range, the result holds the index of the observed triangle (query), the cells of its two side
+    ratios, and the first and last + 1 index in the sorted keys. Each side ratio of an observed triangle may
+    lie in up to three cells.
     """
     low = np.maximum(((ratio - slack[:, None]) * CELLS).astype(np.int64), 0)
     high = np.minimum(((ratio + slack[:, None]) * CELLS).astype(np.int64), CELLS - 1)
     spans = high - low
     widest = int(spans.max(initial=0)) + 1
     here = np.arange(widest) <= spans[:, :, None]
-    # The runs are in the order of the queries, so that the runs of the first triangles are read first.
+    # The ranges are in the order of the triangles, so that those of the first triangles are read first.
     query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
     short = low[query, 0] + along_short
     middle = low[query, 1] + along_middle
@@ -340,12 +344,12 @@ class IdentificationSettings:
     """Settings of the identification without prior attitude.
 
     Attributes:
-        tolerance: tolerance of the side ratios, in standard deviations.
+        tolerance: tolerance of the ratios of a triangle's sides, in standard deviations.
         distortion: additional error of a side ratio due to distortion of the lens.
-        batches: numbers of triangles to look up.
+        batches: numbers of observed triangles to look up in each batch.
         work: maximum number of index entries to read.
-        verified: maximum number of candidates to verify after each batch.
-        mirror: whether the mirrored field is searched too.
+        verified: maximum number of candidate attitudes to verify after each batch of triangles.
+        mirror: whether the mirrored field is searched for as well.
         hint_error: factor by which the true scale may lie outside a narrow range of scales; 1 if the range is
             certain. A calibrated scale, (1, 1), is always considered certain.
         verification: settings of the verification of candidates.
@@ -361,10 +365,10 @@ class IdentificationSettings:
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
-# Factor on the tolerance and on the number of verified candidates for triangles of many stars.
+# Factor on the tolerance and on the number of verified candidates, for batches of triangles of many stars.
 # The factor is below 1, because many true triangles vote for the same stars.
 _OF_SPREAD = 0.6
-# Factor by which a match in the mirrored field or outside the range of scales must be less likely by chance.
+# Factor by which chance matches must be less likely in the mirrored field or outside the range of scales.
 _RARE = 10.0
 DEFAULT = IdentificationSettings()
 
@@ -418,7 +422,7 @@ def _search(
 def _candidates(
     observed: StarField, sky: SkyIndex, finds: TriangleMatches, tried: set[tuple[int, int]], most: int
 ) -> Iterator[tuple[FloatArray, float]]:
-    """Yield the attitudes (3, 3) and scales of the matches with the most votes, each only once."""
+    """Yield attitude matrices (3, 3) and scales of the matches with the most votes, each only once."""
     if not len(finds):
         return
     votes = finds.votes().sum(axis=1)
@@ -442,9 +446,9 @@ def _candidates(
 
 
 def _frame(corners: FloatArray) -> FloatArray:
-    """Return the axes, as rows (3, 3), of a frame that is fixed to a triangle of unit vectors (3, 3).
+    """Return the axes, as rows (3, 3), of a coordinate frame fixed to a triangle of unit vectors (3, 3).
 
-    The first axis points to the centre of the triangle.
+    The first axis of this frame points to the centre of the triangle.
     """
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners.tolist()
     mx, my, mz = ax + bx + cx, ay + by + cy, az + bz + cz

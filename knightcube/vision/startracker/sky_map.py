@@ -5,9 +5,9 @@ up to 20.8". Aberration is computed by the exact formula of special relativity (
 1985, section 8.3, and Explanatory Supplement, section 7.2.3).
 
 The conversion also includes lens errors: tilt and decentring, which displace the optical axis from the image
-centre, and distortion. These errors displace a tangent u by (u . a) u + |u|^2 b + k |u|^2 u + l |u|^4 u, with
-tilt a, decentring b and distortion k, l (Brown 1966). The vector (a, b, k, l) of the six lens errors is
-called the bend of the lens.
+centre, and distortion. The lens errors displace a point with the tangents u by (u . a) u + |u|^2 b + k |u|^2
+u + l |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966). The vector (a, b, k, l) of the six
+lens errors is called the bend of the lens.
 
 `Pointing` gives the right ascension, declination and roll of an attitude.
 """
@@ -46,7 +46,7 @@ def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
 
 
 BENDS = 6
-# Standard deviation of a typical lens's tilt, relative to the corner's tangent (20 px of 1024 px).
+# Standard deviation of the tilt of a typical lens, relative to the corner's tangent (20 px of 1024 px).
 # Standard deviations of a typical lens's two distortion terms at the image corner (3 % and 1 %).
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
 
@@ -55,7 +55,7 @@ _LEAST_CENTRE, _LEAST_DISTORTION = 1e-3, 1e-6
 
 
 def usual_bend(camera: CameraModel) -> FloatArray:
-    """Return the reciprocal prior variances (6,) of the lens errors (bend) of a typical uncalibrated lens."""
+    """Return the reciprocal prior variances (6,) of the lens errors of a typical uncalibrated lens."""
     corner = float(np.tan(camera.half_diagonal))
     first, second = _DISTORTION
     off = [_TILT * corner] * 2 + [_TILT * first / corner] * 2
@@ -63,10 +63,11 @@ def usual_bend(camera: CameraModel) -> FloatArray:
 
 
 def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
-    """Return the reciprocal prior variances (6,) of the lens errors (bend) of a lens of known accuracy.
+    """Return the reciprocal prior variances (6,) of the lens errors of a lens of known accuracy.
 
-    For an exact lens the result is empty (0,). An error of the optical axis tilts the lens. The common
-    rotation of all stars by this error counts as an error of the camera's mounting, not of the lens.
+    For an exact lens, an empty array (0,) is returned. An error of the optical axis in the image acts as a
+    tilt of the lens. The rotation that is common to all stars in this error counts as an error of the
+    camera's mounting, not of the lens.
     """
     if lens.centre == lens.distortion == 0.0:
         return np.zeros(0)
@@ -86,7 +87,7 @@ def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
 
 
 def bend_slope(seen: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 3, 6) of unit vectors `seen` (n, 3) by tilt, decentring and distortion."""
+    """Return derivatives (n, 3, 6) of unit vectors `seen` (n, 3) by the six lens errors."""
     tangent = seen[:, :2] / seen[:, 2:]
     square = np.sum(tangent**2, axis=1, keepdims=True)
     # Tilt and distortion scale a tangent u by relative amounts proportional to u_x, u_y, |u|^2 and |u|^4.
@@ -145,7 +146,7 @@ def _north_and_east(right_ascension: float, declination: float) -> tuple[FloatAr
     return north, np.array([-sine, cosine, 0.0])
 
 
-# Number of iterations that invert the lens errors; each iteration reduces the error to a few per cent.
+# Number of iterations that invert the lens errors; each reduces the remaining error to a few per cent.
 _BEND_STEPS = 8
 
 
@@ -170,7 +171,7 @@ class SkyMap:
     def directions(self, points: FloatArray) -> FloatArray:
         """Return the ICRS directions of pixels (n, 2), as unit vectors (n, 3)."""
         seen = bent(self.camera.unit_vectors(points), self.bend) @ attitude_matrix(self.quaternion)
-        # The aberration of the opposite velocity is the inverse, accurate to (v/c)^2 or 0.002".
+        # The aberration for the opposite velocity is the inverse, accurate to (v/c)^2 or 0.002".
         return seen if self.velocity is None else apparent(seen, -self.velocity)
 
     def pixels(self, directions: FloatArray) -> FloatArray:
@@ -189,7 +190,7 @@ class ShortTrails:
     """The motion of stars by a few pixels during an exposure.
 
     Attributes:
-        turn: rotation vector of the camera during the exposure (3,), rad, camera axes.
+        turn: rotation vector of the camera over the exposure (3,), rad, camera axes.
         delay: delay between consecutive rows of a rolling shutter, as a fraction of the exposure time.
         delay_sigma: standard deviation of `delay`.
     """

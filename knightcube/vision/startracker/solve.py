@@ -1,14 +1,15 @@
 """Attitude of a frame from its stars, in steps that `knightcube.vision.frame_job` selects.
 
-If stars are points, `detection` measures their positions. If stars are streaks, their positions at
-mid-exposure are used instead. Identification first searches near a prior attitude, if there is one, and then
-in the whole sky. The result is the attitude at mid-exposure.
+If the stars are points, the package `detection` measures their positions. If the stars are streaks, their
+fitted positions at mid-exposure are used instead. Identification first searches near a prior attitude, if
+there is one, and then in the whole sky. The result is the attitude at mid-exposure.
 
-During an exposure of length T at a constant rate, the middle of a streak is the position of the star at
-mid-exposure. An angular acceleration a displaces the centroid of a point by a T^2 / 24, and the midpoint
-between the two ends of a streak by a T^2 / 8. A fit that includes the acceleration is displaced only by terms
-of higher order in time. White angular acceleration of density q adds a variance of q T^3 / 320 for points, of
-q T^3 / 48 for the midpoint of the ends, and of q T^3 / 4743 for a fit that includes the acceleration.
+During an exposure at a constant rate, the middle of a streak is the position of the star at mid-exposure.
+During an exposure of length T, an angular acceleration a displaces the centroid of a point by a T^2 / 24, and
+the midpoint between the two ends of a streak by a T^2 / 8. A fit of a streak that includes the acceleration
+is displaced only by terms of higher order in time. White angular acceleration of density q adds a variance of
+q T^3 / 320 to the position of a point, of q T^3 / 48 to the midpoint of a streak's ends, and of q T^3 / 4743
+to a fit that includes the acceleration.
 """
 
 from __future__ import annotations
@@ -71,10 +72,11 @@ class FrameSolution:
         bend: fitted tilt, decentring and distortion of the lens (6,), see `sky_map`; zeros if the lens is
             exact.
         log10_false_alarm: log10 of the probability that a frame of random points would have been solved.
-        tracked: whether the stars were identified near the prior attitude.
+        tracked: whether the stars were identified by a search near the prior attitude.
         motion: motion of the camera from the streaks, camera frame, or None for points.
-        mirrored: whether the image shows the mirrored sky. In this case `fix` is the attitude of the image
-            with left and right exchanged about the optical axis, but points are those of the original image.
+        mirrored: whether the image shows the mirrored sky. For a mirrored sky, `fix` is the attitude of the
+            image with left and right exchanged about the optical axis, but the points are those of the
+            original image.
     """
 
     status: SolveStatus
@@ -100,7 +102,7 @@ class FrameSolution:
         return np.flatnonzero(self.star >= 0)
 
     def wider(self, by: FloatArray) -> FrameSolution:
-        """Return the solution with `by` (3, 3), rad^2, added to the attitude covariance, if solved."""
+        """Return the solution, if solved, with `by` (3, 3), rad^2, added to the attitude covariance."""
         if self.fix is None:
             return self
         return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
@@ -120,11 +122,11 @@ MOVED = {StreakStatus.RATE, StreakStatus.AMBIGUOUS}
 
 @dataclass(frozen=True, slots=True)
 class Weighting:
-    """Weights with which the measured attitude of a frame averages the attitudes during the exposure.
+    """Weights with which the attitude measured in a frame averages the attitudes during the exposure.
 
     Attributes:
-        weights: weights of the rotations at the times `NODES`; the weight of mid-exposure is one minus their
-            sum.
+        weights: weights of the rotations since mid-exposure at the times `NODES`; the weight of mid-exposure
+            is one minus their sum.
         noise_share: variance due to white angular acceleration, in units of its density times the cube of the
             exposure time.
     """
@@ -134,11 +136,11 @@ class Weighting:
 
 
 MEAN = Weighting((1 / 12, 1 / 3, 1 / 3, 1 / 12), 1 / 320)
-"""Weighting of points, which show the mean attitude over the exposure, from Simpson's rule."""
+"""Weighting for points, which show the mean attitude over the exposure, from Simpson's rule."""
 ENDS = Weighting((1 / 2, 0.0, 0.0, 1 / 2), 1 / 48)
-"""Weighting of streaks that are fitted with a constant rate or only measured at their ends."""
+"""Weighting for streaks that are fitted with a constant rate, or of which only the ends are measured."""
 MIDDLE = Weighting((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
-"""Weighting of streaks that are fitted with an acceleration, from the vertex of the best-fitting parabola."""
+"""Weighting for streaks fitted with an acceleration, from the vertex of the best-fitting parabola."""
 
 
 def weighting_of(motion: FrameMotion) -> Weighting:
@@ -182,29 +184,29 @@ def timing_covariance(motion: MotionResult) -> FloatArray:
     return np.outer(motion.rate, motion.rate) * float(np.min(along / speed[moving] ** 4))
 
 
-# Minimum position error (px) of a star, due to residual distortion of the lens and the colour of the star.
+# Minimum position error (px) of a star, due to residual lens distortion and to the colour of the star.
 _LEAST_SIGMA_PX = 0.005
 # Minimum position error (px) of a star due to its colour, for a lens whose accuracy is stated.
 _COLOUR_PX = 0.002
-# Centroid error that all stars share, as a fraction of the excess PSF width (from the campaign `resting`).
+# Centroid error that all stars share, as a fraction of the excess PSF width (from campaign `resting`).
 _SHAPE_DOUBT = 0.05
 # Position error (px) assumed for an uncalibrated lens in the second attempt to identify the stars.
-# The first attempt assumes smaller errors, so that fewer stars agree by chance.
+# The first attempt to identify the stars assumes smaller errors, so that fewer stars agree by chance.
 _UNCALIBRATED_SIGMA_PX = 0.3
-# Attitude error (px) from an uncalibrated lens and from refraction that the fit of the lens does not remove.
-# The rotation error about the boresight is measured in px at the image edge.
-# Attitudes of the same photograph from different solvers differ by this value.
+# Attitude error (px) from an uncalibrated lens and from refraction that remains after the fit of the lens.
+# For the rotation about the boresight, this attitude error is measured in px at the image edge.
+# This attitude error is the difference between the attitudes of one photograph from different solvers.
 _UNCALIBRATED_LENS_PX = 0.25
 # Minimum flux of a streak used for identification, in standard deviations of the flux.
 _LEAST_SIGNIFICANCE = 5.0
-# Standard deviation (px) above which a position is not used, for instance of a streak that the border cuts.
+# Standard deviation (px) above which a star position is not used, for instance of a truncated streak.
 _PLACELESS_PX = 5.0
 # Largest chi-square of the difference from the prior attitude (false rejection of one in 100,000 frames).
 _NEAR = 25.9
-# Number of guide stars that tracking searches near their predicted positions.
+# Number of guide stars that are searched near their predicted positions in tracking.
 _LOOKED_FOR = 30
 # Minimum and maximum search radius (px) around a predicted position.
-# If a larger radius is needed, a search of the whole frame is faster.
+# If a larger search radius is needed, a search of the whole frame is faster.
 _LEAST_RADIUS_PX, _MOST_RADIUS_PX = 3.0, 15.0
 
 
@@ -216,11 +218,12 @@ class SolveSettings:
         detection: settings of the detection of points.
         likelihood: settings of the streak estimator for images from files; flight uses other settings.
         identification: settings of the default identification method.
-        method: function that replaces the default identification method, or None for the default.
-        attitude: solver of Wahba's problem for the attitude, or None for the fit of the image positions.
+        method: function used instead of the default identification method, or None for the default.
+        attitude: solver of Wahba's problem that determines the attitude, or None for the fit of the image
+            positions.
         velocity: velocity of the camera relative to the solar system barycentre (3,), m/s, for the correction
             of aberration, or None for no correction.
-        lens: accuracy of a lens of known focal length, or None if the lens is exact.
+        lens: standard deviations of a lens of known focal length, or None if the lens is exact.
         uncalibrated_lens: whether a lens of uncertain focal length may also have a displaced optical axis and
             distortion.
     """
@@ -340,8 +343,8 @@ def points_near(
 ) -> Detections:
     """Return the stars detected near the predicted positions of the brightest guide stars.
 
-    If the prior is too uncertain, no stars are returned. `trails` describes the motion of the stars during
-    the exposure, if the motion is known and at most a few pixels.
+    If the prior is too uncertain, no stars are returned. The argument `trails` describes the motion of the
+    stars during the exposure, if this motion is known and at most a few pixels.
     """
     radius = PRIOR_SIGMAS * prior.sigma * camera.focal_length + _LEAST_RADIUS_PX
     if radius > _MOST_RADIUS_PX:
@@ -365,7 +368,7 @@ def solve_near(
 ) -> FrameSolution | None:
     """Return the attitude from stars near their predicted positions, or None if the stars do not agree.
 
-    `trails` describes the motion of the stars during the exposure, as for `points_near`.
+    The argument `trails` describes the motion of the stars during the exposure, as for `points_near`.
     """
     found = points_near(pixels, camera, sky, settings, prior, trails)
     if not len(found):
@@ -385,7 +388,7 @@ def solve_near(
 
 
 def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
-    """Return whether an attitude agrees with the prior; otherwise its significance is not valid."""
+    """Return whether an attitude agrees with the prior attitude; if not, its significance is not valid."""
     if solution.fix is None:
         return True
     off = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(prior.quaternion)))
@@ -397,7 +400,7 @@ def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSe
     """Return the solution with its covariance increased if the stars are wider than the given PSF.
 
     If star images have a tail, due to the lens or to stray light, the centroids depend on the pixel weights,
-    and all positions have the same error.
+    and all positions have a common error.
     """
     width, given = found.width[np.isfinite(found.width)], settings.detection.psf_sigma
     if solution.fix is None or given is None or not len(width):
@@ -432,13 +435,13 @@ def _identify(
     if found.status is MatchStatus.NO_MATCH and settings.uncalibrated_lens and scale[0] != scale[1]:
         found = identify(star_field(seen, flux, scale, _UNCALIBRATED_SIGMA_PX), sky, options)
     if found.mirrored:
-        # The mirrored positions are fitted, and the original positions are reported.
+        # The attitude is fitted to the mirrored positions, and the original positions are reported.
         return _mirrored(replace(_with_attitude(_mirrored(seen), found, sky, settings), mirrored=True))
     return _with_attitude(seen, found, sky, settings)
 
 
 def _mirrored(seen: FrameSolution) -> FrameSolution:
-    """Return the solution `seen` with its positions mirrored left to right about the optical axis."""
+    """Return the solution `seen` with its star positions mirrored left to right about the optical axis."""
     axis = np.array([2.0 * seen.camera.centre[0], 0.0])
     turned = np.array([-1.0, 1.0])
     return replace(
@@ -453,7 +456,7 @@ def _mirrored(seen: FrameSolution) -> FrameSolution:
 def star_field(
     seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float], least: float = _LEAST_SIGMA_PX
 ) -> StarField:
-    """Return the points of a frame as directions, with standard deviations of at least `least` px."""
+    """Return the points of a frame as a `StarField`, with standard deviations of at least `least` px."""
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
     pixels = np.sqrt(0.5 * np.trace(seen.covariance, axis1=1, axis2=2) + least**2)
@@ -477,7 +480,7 @@ def _with_attitude(
     reference = sky.stars.direction[found.star[chosen]]
     if settings.velocity is not None:
         reference = apparent(reference, settings.velocity)
-    # `known` is the prior information about the lens errors; it is empty if no lens errors are fitted.
+    # The array `known` is the prior information about lens errors; it is empty if they are not fitted.
     known = np.zeros(0)
     if free_lens:
         known = usual_bend(camera)
@@ -498,7 +501,7 @@ def _with_attitude(
     if found.from_lens is not None:
         fix = replace(fix, covariance=fix.covariance + found.from_lens)
     if free_lens:
-        # An uncalibrated lens adds this covariance to the attitude.
+        # The errors of an uncalibrated lens add this covariance to the attitude.
         across, about = 1.0 / camera.focal_length, 2.0 / max(camera.columns, camera.rows)
         floor = np.diag((_UNCALIBRATED_LENS_PX * np.array([across, across, about])) ** 2)
         fix = replace(fix, covariance=fix.covariance + floor)
@@ -525,7 +528,7 @@ def _camera_found(camera: CameraModel, found: StarMatch) -> CameraModel:
     camera = camera.rescaled(1.0 / found.scale)
     if found.distortion == 0.0 or not isinstance(camera, Pinhole):
         return camera
-    # The coefficient `distortion` is for tangents relative to the corner's tangent, unlike k1.
+    # The coefficient `distortion` refers to tangents relative to the corner's tangent, unlike k1.
     corner = 0.5 * math.hypot(camera.columns, camera.rows) / camera.focal_length
     try:
         return replace(Lens.of(camera), k1=found.distortion / corner**2)

@@ -1,17 +1,18 @@
 """Verification of a candidate attitude against the whole field, and tracking with a prior attitude.
 
 The guide stars predicted in the field are compared with the observed stars. Attitude and scale are refined
-from the stars that match, and the comparison is repeated until the set of matched stars no longer changes.
-The significance of a match is an upper bound of the expected number of attitudes, among the searched
-attitudes, at which random stars would match at least as well. If the bound is far below one, it also bounds
-the probability of a false match. The bound does not depend on how a candidate was found. The bound is
-multiplied by the number of alternatives among gates, brightness limits and tests (Bonferroni).
+with the matched stars, and the comparison is repeated until the set of matched stars no longer changes. The
+significance of a match is an upper bound of the expected number of attitudes, among the searched attitudes,
+at which random stars would match at least as well. If this bound is far below one, it is also an upper bound
+of the probability of a false match. This bound does not depend on how a candidate attitude was found. The
+bound is multiplied by the number of alternatives among which gate, brightness limit and test are chosen
+(Bonferroni).
 
 `track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error displaces
 all predicted stars by nearly the same vector. Pairs of an observed and a predicted star are formed if their
-distance is within the uncertainty of the prior. The largest set of pairs with a common displacement refines
-the attitude. The attitude is then verified with the whole field as in lost in space, except that only
-attitudes near the prior count as searched.
+distance is within the uncertainty of the prior. The largest set of pairs with a common displacement is used
+to refine the attitude. The refined attitude is then verified with the whole field as in lost in space, except
+that only attitudes near the prior count as searched.
 """
 
 from __future__ import annotations
@@ -49,12 +50,12 @@ class Chance:
 
     Attributes:
         observed: number of observed stars.
-        spread: variance of a star's direction along one axis, divided by the area of the field.
+        spread: variance of a star's direction along one axis, divided by the solid angle of the field.
         fields: area of the searched part of the sky, divided by the area of the field.
-        scales: natural logarithm of the ratio of the highest to the lowest scale.
-        choices: number of gates among which the matching selects.
-        least: minimum number of matched stars.
-        enough: log10 of the significance below which the exact value is not needed.
+        scales: natural logarithm of the ratio of the highest to the lowest image scale.
+        choices: number of gate widths among which the matching selects.
+        least: minimum number of matched stars for an identification.
+        enough: log10 of the bound of chance matches below which its exact value is not needed.
     """
 
     observed: int
@@ -66,15 +67,15 @@ class Chance:
     enough: float
 
     def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
-        """Return log10 of the bound of the number of chance matches that are as good as a given match.
+        """Return log10 of an upper bound of the number of chance matches that are as good as a given match.
 
-        The matching also selects the faintest star that is compared. For this reason, the bound is multiplied
-        by j^2 pi^2/6, where j - 1 is the number of brighter expected stars without a match.
+        The matching also selects the faintest expected star that is compared. For this reason, the bound is
+        multiplied by j^2 pi^2/6, where j - 1 is the number of brighter expected stars without a match.
 
         Args:
             gate: half-width within which a star matches, in standard deviations.
             observed: indices of the matched observed stars in order of brightness.
-            ranks: indices of the expected stars that they match, in order of brightness.
+            ranks: indices of the expected stars that these stars match, in order of brightness.
         """
         pairs = sorted(zip(ranks, observed, strict=True))
         best = math.inf
@@ -93,12 +94,11 @@ class Chance:
         """Return log10 of the expected number of chance matches of at least `matched` of `expected` stars.
 
         The first matched star may be any star of the sky. The second matched star lies in a ring around the
-        first star. The ring's radius is the distance of the two stars, and its width follows from the range
-        of the scale and from the gate. Each other matched star lies within the gate of an expected star. The
-        probability is multiplied by the number of selections of the matched stars from the observed stars.
-        Because the fit reduces the distances of the matched stars, the distance of each star is increased by
-        the factor 1/(1
-        - leverage).
+        first star. The radius of this ring is the distance of the two stars, and its width follows from the
+        range of the scale and from the gate. Every further matched star lies within the gate of an expected
+        star. The probability is multiplied by the number of selections of the matched stars from the observed
+        stars. Because the fit reduces the distances of the matched stars, the distance of each star is
+        increased by the factor 1/(1 - leverage).
         """
         leverage = 2.0 / matched if matched > 2 else 0.5
         chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)
@@ -109,7 +109,7 @@ class Chance:
         lost = self.observed - matched
         ways = math.lgamma(self.observed + 1) - math.lgamma(matched + 1) - math.lgamma(lost + 1)
         rest = (matched - 2) * math.log(chance) + lost * math.log1p(-chance)
-        # The terms for more matched stars decrease faster than a geometric series (Feller, section VI.3).
+        # The probabilities of more matches decrease faster than a geometric series (Feller, section VI.3).
         ratio = lost / (matched + 1.0) * chance / (1.0 - chance)
         return (ways + rest - math.log1p(-ratio) + math.log(self.fields * expected * ring)) / math.log(10.0)
 
@@ -136,13 +136,13 @@ class VerificationSettings:
 
     Attributes:
         log10_false_alarm: log10 of the largest accepted expected number of chance matches.
-        gates: half-widths within which a star matches, in standard deviations; the gate with the most
+        gates: trial half-widths within which a star matches, in standard deviations; the gate with the most
             significant match is used. The wide gates are for a lens with distortion, or for standard
             deviations that are too small.
         least_matches: minimum number of matched stars.
         rounds: maximum number of rounds of matching and refinement.
-        most: number of observed stars, the brightest first, from which the acceptance is decided. After the
-            acceptance, all stars are matched.
+        most: number of observed stars, the brightest first, from which it is decided whether a candidate is
+            accepted. After a candidate is accepted, all stars are matched.
     """
 
     log10_false_alarm: float = -4.5
@@ -154,20 +154,20 @@ class VerificationSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matching:
-    """Indices of matched observed stars (k,) and of their guide stars (k,), and log10 of significance."""
+    """Indices of matched observed stars (k,) and of their guide stars (k,), and log10 of chance matches."""
 
     observed: IntArray
     star: IntArray
     log10_chance: float
 
 
-# Fraction of bright expected stars that match, below which the distortion of the lens is fitted.
+# Fraction of bright expected stars that match, below which the distortion of the lens is also fitted.
 _FEW_MISSED = 0.8
 # Maximum fraction of bright expected stars that have an unmatched star nearby instead of a match.
-# The radius within which a star is nearby is relative to the corner's tangent.
-# A larger fraction indicates a wrong fit of the lens, because a foreground hides stars but adds none nearby.
+# Stars are nearby within a radius that is relative to the tangent of the image corner.
+# A larger fraction of displaced stars indicates a wrong lens fit, because a foreground only hides stars.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
-# Excess of log10 of the significance over its limit above which a candidate is rejected without refinement.
+# Excess of log10 of chance matches over its limit above which a candidate is rejected without refinement.
 _HOPELESS = 7.0
 
 
@@ -185,8 +185,9 @@ def verify(
         field: observed points of the frame.
         sky: index of the guide stars.
         matrix: attitude matrix of the candidate (3, 3), ICRS to camera, accurate enough for stars to match.
-        scale: scale of the candidate.
-        searched: fraction of all attitudes that the search for candidates covers; 1 for lost in space.
+        scale: image scale of the candidate attitude.
+        searched: fraction of all attitudes covered by the search that found the candidate; 1 for lost in
+            space.
         settings: settings of the verification.
     """
     expected = _expected_in(field, sky, matrix, scale)
@@ -214,7 +215,7 @@ def verify(
 
 
 def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> StarMatch:
-    """Return the identification with the distortion fitted, or NO_MATCH if bright stars are displaced."""
+    """Return the identification with fitted distortion, or NO_MATCH if bright stars are displaced."""
     expected = _expected_in(field, sky, refined.matrix, refined.scale)
     found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
     if found is None or _share_displaced(field, sky, expected, found) > _MOST_DISPLACED:
@@ -227,7 +228,7 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
 def _bright_matched(
     expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]
 ) -> npt.NDArray[np.bool_]:
-    """Return which expected stars match, of those that are at least as bright as the median matched star."""
+    """Return which expected stars match, among those at least as bright as the median matched star."""
     matched = np.isin(expected, star)
     places = np.flatnonzero(matched)
     return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]
@@ -238,7 +239,7 @@ def _share_displaced(
 ) -> float:
     """Return the fraction of bright expected stars that have an unmatched star nearby instead of a match.
 
-    The fraction that is expected by chance is subtracted.
+    The fraction that is expected by chance is subtracted from the result.
     """
     matched = _bright_matched(expected, found.star)
     missed = sky.stars.direction[expected[: len(matched)][~matched]]
@@ -264,8 +265,8 @@ def expected_stars(
     """Return the indices of the `count` brightest guide stars in the field, the brightest first."""
     across, down = half_width
     cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
-    # The search covers twice the number of stars that gives `count` stars in an average field.
-    # The factor of two is needed because the density of stars is lower near the galactic poles.
+    # The search covers twice as many stars of the sky as needed for `count` stars in an average field.
+    # The factor of two is needed because stars are less dense near the galactic poles.
     brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
     near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse[:, :brightest] > cosine)
     x, y, z = matrix @ sky.stars.direction[near].T
@@ -289,8 +290,7 @@ def _settle(
 ) -> tuple[_Matching, Refinement] | None:
     """Return the matched stars and the attitude after repeated matching and refinement.
 
-    Matching and refinement are repeated until the matched stars no longer change. Returns None if the
-    refinement diverges.
+    Both steps are repeated until the matched stars no longer change. Returns None if the refinement diverges.
     """
     refined, previous = start, None
     for _ in range(settings.rounds):
@@ -312,7 +312,7 @@ def _settle(
         )
         if found is None:
             return None
-        # The fitted scale must lie within five standard deviations of the range of the lens.
+        # The fitted scale must lie within five standard deviations of the range of possible scales.
         lowest, highest = field.scale
         slack = math.exp(5.0 * found.scale_sigma)
         if lowest != highest and not lowest / slack <= found.scale <= highest * slack:
@@ -379,7 +379,7 @@ PRIOR_SIGMAS = 4.0
 """Largest error of a prior attitude that the search near it covers, in standard deviations."""
 _BRIGHTEST = 16
 # Maximum number of pairs of an observed and a predicted star.
-# With more pairs, the comparison is ambiguous and takes longer than a search of the whole sky.
+# With more pairs of stars, the comparison is ambiguous and takes longer than a search of the whole sky.
 _MOST_PAIRS = 400
 _DEFAULT = VerificationSettings()
 
@@ -413,7 +413,7 @@ def track(
         )
         if found is not None:
             matrix, scale = found.matrix, found.scale
-    # The searched fraction is the volume of rotations near the prior, relative to that of all, 8 pi^2.
+    # The searched fraction of attitudes is the volume of rotations near the prior, divided by 8 pi^2.
     searched = min((PRIOR_SIGMAS * sigma) ** 3 / (6.0 * math.pi), 1.0)
     return verify(field, sky, matrix, scale, searched, settings)
 
@@ -423,7 +423,8 @@ def _same_shift(
 ) -> tuple[IntArray, npt.NDArray[np.intp]]:
     """Return the indices of observed stars (k,) and guide stars (k,) that have a common displacement.
 
-    These stars are the largest set of pairs for which one displacement explains the error of the prior.
+    The returned stars form the largest set of pairs for which one displacement explains the error of the
+    prior.
     """
     reach = PRIOR_SIGMAS * sigma
     across, down = (scale * width for width in field.half_width)
@@ -447,7 +448,7 @@ def _same_shift(
     apart = shifts[:, None, :] - shifts
     tolerance = 4.0 * star_sigma + (PRIOR_SIGMAS * sigma + stretch) * radius
     agree = np.einsum("ijk,ijk->ij", apart, apart) <= tolerance**2
-    # Two pairs that share an observed star or a guide star do not support each other.
+    # Two pairs of stars that share an observed star or a guide star do not support each other.
     agree &= (one[:, None] != one) & (two[:, None] != two)
     best = int(agree.sum(axis=1).argmax())
     members = np.append(np.flatnonzero(agree[best]), best)

@@ -1,7 +1,8 @@
 """Detection of the stars of a frame, in the whole frame or near predicted positions.
 
-`detect` searches a whole frame: it measures the local maxima of the areas above the noise, and flags sources
-that are not stars. `measure_near` reads only small windows around predicted positions, for tracking.
+`detect` searches a whole frame: the function measures the local maxima of the areas above the noise, and
+flags sources that are not stars. `measure_near` reads only small windows around predicted positions, for
+tracking.
 """
 
 from __future__ import annotations
@@ -53,12 +54,12 @@ REFUSED = int(Quality.HOT | Quality.EXTENDED | Quality.STREAK | Quality.CLUTTER)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """The sources of one frame, the brightest first.
+    """The n sources detected in one frame, the brightest first.
 
     Attributes:
         points: positions (x, y) of the sources (n, 2), px.
         sigma: standard deviation of the positions along one axis (n,), px.
-        covariance: covariances of the positions (n, 2, 2), px^2.
+        covariance: covariances of the positions (x, y) of the sources (n, 2, 2), px^2.
         flux: counts above the background of each source (n,).
         background: sky background at each source (n,), counts per pixel.
         signal_to_noise: flux of each source divided by its standard deviation (n,).
@@ -99,7 +100,7 @@ class Detections:
 
     @property
     def is_star(self) -> BoolArray:
-        """Which sources (n,) may be stars, because they are not hot, extended, streaks or clutter."""
+        """Mask of the sources (n,) that may be stars and are not hot, extended, streaks or clutter."""
         return np.asarray((self.quality & REFUSED) == 0)
 
     def select(self, chosen: BoolArray | IntArray) -> Detections:
@@ -111,7 +112,7 @@ class Detections:
         return self.select(np.argsort(-self.flux, kind="stable"))
 
     def scaled(self, unit: float) -> Detections:
-        """Return the sources with flux and background multiplied by `unit`."""
+        """Return the sources with all fluxes and backgrounds multiplied by `unit`."""
         return replace(self, flux=self.flux * unit, background=self.background * unit)
 
     def stars(self) -> Detections:
@@ -122,7 +123,7 @@ class Detections:
         return len(self.flux)
 
 
-# The wings of a bright star at the distance d are at most share (1 + (d / scale)^2)^-power of its peak.
+# At the distance d, a bright star's wings are at most share (1 + (d / scale)^2)^-power of its peak.
 _WING_SCALE, _WING_POWER, _WING_SHARE = 2.0, 2.0, 0.7
 _WINGS_END = 60.0
 _CELLS = 4
@@ -154,7 +155,7 @@ class Peaks:
 
 
 def find_peaks(areas: Areas) -> Peaks:
-    """Return the local maxima of the areas; a saturated disc has a single maximum, at its centre."""
+    """Return the local maxima of the bright areas; a saturated disc has a single maximum, at its centre."""
     top = areas.peak
     place = np.stack([areas.column[top], areas.row[top]], axis=-1)
     peaks = Peaks(place, areas.smooth[top], areas.owner[top], np.zeros(len(place)))
@@ -167,13 +168,13 @@ def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], m
     """Return the indices (k,) of the peaks to measure, the highest first.
 
     Local maxima on the wings of brighter stars are excluded. At most `most` peaks in the open sky are
-    selected, and at most a quarter of `most` in each sixteenth of the frame, so that a bright cloud does not
-    exclude the stars beside it. The same number of peaks outside the open sky is selected too, in order to
-    measure the shape of foreground sources.
+    selected, and at most a quarter of `most` in each sixteenth of the frame's area, so that a bright cloud
+    does not exclude the stars beside it. The same number of peaks outside the open sky is selected too, in
+    order to measure the shape of foreground sources.
 
     Args:
         peaks: local maxima of the frame, the highest first.
-        open_sky: which peaks are in the open sky (p,).
+        open_sky: mask of the peaks that are in the open sky (p,).
         shape: rows and columns of the frame.
         most: maximum number of peaks in the open sky.
     """
@@ -186,9 +187,9 @@ def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], m
 
 
 def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return the indices of the first `most` peaks, with a limit in each sixteenth of the frame.
+    """Return the indices of the first `most` peaks, with a limit for each sixteenth of the frame's area.
 
-    Each sixteenth of the frame contributes at most a quarter of `most` peaks.
+    Each sixteenth of the frame's area contributes at most a quarter of `most` peaks.
     """
     row, column = (peaks.place[:, k] * _CELLS // shape[1 - k] for k in (1, 0))
     cell = row * _CELLS + column
@@ -202,7 +203,7 @@ def on_wings(peaks: Peaks) -> BoolArray:
     """Return which peaks (p,) may be local maxima on the wings of a brighter star."""
     x, y = peaks.place.T.astype(np.float32)
     square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
-    # Only pairs closer than 60 px are compared, because the wings fall to a millionth of the peak at 60 px.
+    # Only peaks closer than 60 px are compared, because the wings fall to a millionth of the peak there.
     lower, higher = np.nonzero(np.tri(len(x), k=-1, dtype=bool) & (square < _WINGS_END**2))
     # The wings of a saturated disc begin at the rim of the disc.
     apart = np.maximum(np.sqrt(square[lower, higher]) - peaks.core[higher], 0.0)
@@ -212,7 +213,7 @@ def on_wings(peaks: Peaks) -> BoolArray:
 
 
 def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
-    """Return the peaks with a single peak for each saturated disc, at the centre of the disc."""
+    """Return the peaks, with a single peak for each saturated disc, at the centre of the disc."""
     row, column = areas.row[areas.saturated], areas.column[areas.saturated]
     owner, count = label_pixels(row * areas.shape[1] + column, areas.shape[1])
     size = np.bincount(owner, minlength=count)
@@ -232,10 +233,10 @@ def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
     )
 
 
-# Number of measured peaks per requested star; some peaks are found not to be stars.
+# Number of peaks that are measured per requested star; some peaks turn out not to be stars.
 _MEASURED_FOR_ONE = 1.5
 _CLUTTERED_SHARE = 0.25
-# Noise of a block, relative to the median of the frame, above which the block counts as foreground.
+# Noise of a block of pixels, relative to the median over the frame, above which it counts as foreground.
 _RESTLESS = 2.5
 # Radius (px) of a saturated disc above which it is a planet, the Moon or a lamp instead of a star.
 _WIDEST_CORE = 7.0
@@ -295,7 +296,7 @@ def measure_areas(seen: Survey) -> Detections:
 
 
 def quality_of(found: MeasuredStars, shapes: Shapes, spread: FrameSpread, targets: StarTargets) -> IntArray:
-    """Return the quality flags (n,) that follow from the pixels of each source."""
+    """Return the quality flags (n,) that are derived from the pixels of each source."""
     sure = _SURE * shapes.error
     alone = (targets.core == 0.0) & ~found.blended
     hot = alone & (shapes.hot | (shapes.width + sure < _SHARPER * spread.psf_sigma))
@@ -316,7 +317,7 @@ def quality_of(found: MeasuredStars, shapes: Shapes, spread: FrameSpread, target
 def plain_ones(sound: BoolArray, targets: StarTargets) -> BoolArray:
     """Return which of the `sound` stars (n,) determine the PSF.
 
-    These are the stars that are not saturated, or all stars if all are saturated.
+    The PSF is determined by the stars that are not saturated, or by all stars if all are saturated.
     """
     plain = sound & (targets.core == 0.0)
     return plain if plain.any() else sound
@@ -354,7 +355,7 @@ def assemble(
     spread: FrameSpread,
     prediction: IntArray,
 ) -> Detections:
-    """Return the measured sources as detections, in the order of the targets."""
+    """Return the measured sources as `Detections`, in the order of the targets."""
     return Detections(
         found.points,
         np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2)),
@@ -370,13 +371,13 @@ def assemble(
 
 
 def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
-    """Return the quality flags STREAK and CLUTTER (p,) of peaks, which follow from the areas."""
+    """Return quality flags STREAK and CLUTTER (p,) of peaks, which are derived from the bright areas."""
     noise = sky.smooth_noise
     restless = noise.at(*peaks.place.T) > _RESTLESS * np.median(noise.values)
     clutter = restless | cluttered(areas, peaks.place, _CLUTTERED_SHARE)
     long = is_streak(areas)[peaks.area]
     if frame_shape(areas).kind is not FrameKind.STREAKS:
-        # A row of stars is also long, but has several peaks. A bright star in a corner has a tail.
+        # A row of stars is also a long area, but has several peaks. A bright star in a corner has a tail.
         long &= np.bincount(peaks.area, minlength=len(areas))[peaks.area] == 1
         long &= (areas.length[peaks.area] > _LONGER_THAN_COMA) & (peaks.core == 0.0)
     return np.asarray(Quality.CLUTTER * clutter | Quality.STREAK * long)
@@ -441,7 +442,7 @@ def measure_near(
 def _peaks_near(
     pixels: Image, windows: StarWindows, predicted: FloatArray, ceiling: float, settings: DetectionSettings
 ) -> tuple[StarTargets, IntArray]:
-    """Return the highest peak near each prediction, if it exceeds the threshold, and its prediction (k,)."""
+    """Return the highest peak near each prediction, if above the threshold, and its prediction (k,)."""
     level, noise, tail, correlation = _sky_of(windows, settings.search_radius)
     light = np.where(windows.good, windows.light - level[:, None, None], 0.0)
     smooth = smoothed(light)
@@ -472,14 +473,14 @@ def _peaks_near(
 def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return background (n,), noise of single pixels (n,), noise of smoothed pixels (n,), and correlation.
 
-    Background and noise are measured in the rims of the windows. The noise of smoothed pixels includes faint
-    stars, because the detection threshold depends on it. The correlation is the ratio of the noise of a sum
-    of pixels to that of a sum of independent pixels.
+    Background and noise are measured in the rims of the windows around the predicted positions. The noise of
+    smoothed pixels includes faint stars, because the detection threshold depends on it. The correlation is
+    the ratio of the noise of a sum of pixels to that of a sum of independent pixels.
     """
     step = np.abs(np.arange(-windows.half, windows.half + 1))
     rim = np.maximum(step[:, None], step) > radius + 1.0
     mean, variance = _clipped(np.where(windows.good, windows.light, np.inf)[:, rim])
-    # All windows use their median noise, because other stars or low counts falsify the noise of one window.
+    # All windows use the median noise, because other stars or low counts falsify that of a single window.
     common = float(np.sqrt(np.median(variance) + _ROUNDING**2))
     light = np.where(windows.good, windows.light - mean[:, None, None], 0.0)
     smooth = smoothed(light)[:, 1:-1, 1:-1][:, rim[1:-1, 1:-1]]

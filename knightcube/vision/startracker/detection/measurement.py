@@ -2,7 +2,7 @@
 
 `first_look` fits each star alone with a free width, and `frame_spread` derives the PSF and the noise of the
 frame from these fits. `measure` then fits each star with the PSF of the frame, or computes a centroid in a
-window whose border is subtracted (Michalski, eq. (12) to (21)). A window with sides of a pixels ends at
+window whose border is subtracted (Michalski, eq. (12) to (21)). A window with a side of a pixels ends at
 column x_start + a - 1. In Michalski, eq. (14) and (15), the window ends one pixel later, which contradicts
 eq. (16e), where the border has 4 (a - 1) pixels. Michalski, eq. (20), repeats x_CM instead of y_CM, and is
 corrected here (errata).
@@ -44,10 +44,10 @@ FIRST_WIDTH = 1.0
 _HALF_OF_FIRST = 4
 LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
-"""Half-width of a window, in standard deviations of the PSF, within `LEAST_HALF` and `MOST_HALF` px."""
+"""Half-width of a star's window, in PSF standard deviations, within `LEAST_HALF` and `MOST_HALF` px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
 # Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the star's counts.
-# This mismatch is smaller than in the first fit, so that more than the wings of bright stars are used.
+# This mismatch is smaller than in the first fit, so that not only the wings of bright stars are used.
 _NEXT_MISMATCH = 0.02
 # Mismatch between PSF and Gaussian that is assumed if no star determines it.
 _UNKNOWN_MISMATCH = 0.02
@@ -55,7 +55,7 @@ _MOST_OF_CELL = 4
 # Minimum number of stars for which the measured width of the PSF replaces a given width.
 _MANY = 8
 _LEAST_LONE = 3
-# Minimum height of a hot pixel, in standard deviations of a pixel's noise.
+# Minimum counts of a hot pixel above the sky, in standard deviations of a pixel's noise.
 _LEAST_HOT = 10.0
 # Minimum distance (px) between two stars whose windows in the first fit do not overlap.
 _APART = 2 * _HALF_OF_FIRST + 1
@@ -63,13 +63,13 @@ _APART = 2 * _HALF_OF_FIRST + 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shapes:
-    """The first fits of n stars, each with a free width.
+    """The first fits of n stars, each with a free width of its Gaussian.
 
     Attributes:
         width: standard deviation of the Gaussian fitted to each star (n,), px.
         error: standard deviation of each fitted width (n,), px.
-        hot: which stars are hot pixels (n,).
-        fitted: results of the fits.
+        hot: mask of the sources that are hot pixels instead of stars (n,).
+        fitted: results of the fits to the stars.
         windows: windows in which the stars were fitted.
     """
 
@@ -103,7 +103,7 @@ def first_look(targets: StarTargets, gain: float | None = None) -> Shapes:
     if gain is not None:
         noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
         fitted = fit(windows, fitted.offset, fitted.flux, width, noise, free_width=True, steps=1)
-    # The errors of the widths include the deviations from a Gaussian that the first noise model allows.
+    # The errors of the widths include the deviations from a Gaussian that the first noise model allows for.
     return Shapes(width, error, single_pixels(windows), fitted, windows)
 
 
@@ -176,10 +176,10 @@ def crowded(middle: IntArray) -> BoolArray:
 
 
 def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return at most four of the `chosen` stars in each sixteenth of their area, and weights of these stars.
+    """Return at most four of the `chosen` stars in each sixteenth of the frame area, and their weights.
 
-    Each sixteenth has the same total weight, because stars are everywhere, but foreground sources, such as
-    the leaves of a tree, are in one part of the frame.
+    Each sixteenth of the area has the same total weight, because stars are everywhere, but foreground
+    sources, such as the leaves of a tree, are in one part of the frame.
     """
     place = middle[chosen] - middle.min(axis=0)
     column, row = (place * 4 // (np.ptp(middle, axis=0) + 1)).T
@@ -201,15 +201,15 @@ Centroid = tuple[FloatArray, FloatArray]
 
 _ROUNDS = 12
 _STANDS_OUT = 3.0
-"""Minimum counts of a pixel whose logarithm is fitted, in standard deviations."""
+"""Minimum counts of a pixel whose logarithm is fitted, in standard deviations of its noise."""
 _LEAST = 6
-"""Minimum number of pixels for a parabola with four unknowns."""
+"""Minimum number of pixels for the fit of a parabola with four unknowns."""
 _INSIDE = 1.5
 """Maximum distance (px) of the vertex of the parabola from the centre of mass."""
 
 
 def weighted(clean: FloatArray, _: FloatArray, start: Centroid, __: float) -> Centroid:
-    """Return the centroids of the squared counts of windows `clean` (n, m, m)."""
+    """Return the centroids (n, 2) of the squared counts in windows `clean` (n, m, m)."""
     light = np.maximum(clean, 0.0)
     total = np.maximum(np.sum(light * light, axis=(1, 2)), 1e-30)
     places, slopes = [], []
@@ -228,7 +228,7 @@ def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: floa
         off = steps - place[:, :, None, None]
         window = np.exp(-0.5 * np.sum(off * off, axis=1) / psf_sigma**2)
         seen = (window * clean)[:, None]
-        # `gain` is the derivative of the weighted sum by the position of the weight, about half of the sum.
+        # The derivative of the weighted sum by the weight's position, about half of the sum, is `gain`.
         gain = np.sum(seen * (1.0 - off * off / psf_sigma**2), axis=(2, 3))
         half = 0.5 * np.sum(seen, axis=(2, 3))
         gain = np.maximum(gain, np.maximum(0.5 * half, 1e-30))
@@ -250,7 +250,7 @@ def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float)
     columns = np.stack([np.ones_like(x), x, y, -(x * x + y * y)], axis=1).reshape(len(clean), 4, -1)
     weighed = columns * weight.reshape(len(clean), 1, -1)
     normal = weighed @ columns.transpose(0, 2, 1) + 1e-12 * np.eye(4)
-    # `moved` contains the derivatives of the four unknowns with respect to the logarithm of each pixel.
+    # The array `moved` contains the derivatives of the four unknowns by the logarithm of each pixel.
     moved = np.linalg.solve(normal, weighed)
     found = np.sum(moved * np.log(light).reshape(len(clean), 1, -1), axis=2)
     bend = np.where(found[:, 3] > 0.0, found[:, 3], np.inf)
@@ -281,7 +281,7 @@ def _steps(clean: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 _PHASES = np.linspace(-0.45, 0.45, 10)
 _FAINTEST = 1e-3
-"""Noise of a pixel, as a fraction of the star's flux, in the simulation of the systematic error."""
+"""Noise of a pixel in the simulation of the systematic error, as a fraction of the star's flux."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -317,7 +317,7 @@ def centre_of_mass(
     variance = noise.variance(inner - sky[:, None, None], windows.noise)
     offset, slopes = _places(windows.light, variance, psf_sigma, method)
     both = 0.5 * np.sum(variance[:, None] * slopes**2, axis=(1, 2, 3))
-    # The noise of the border's mean changes the sky level, and therefore the centroid.
+    # The noise of the mean over the window's border changes the sky level, and therefore the centroid.
     border = windows.noise**2 / (8.0 * half)
     area = float(inner[0].size) if len(inner) else 1.0
     both += 0.5 * np.sum(slopes.sum(axis=(2, 3)) ** 2, axis=1) * border
@@ -379,7 +379,7 @@ class MeasuredStars:
         covariance: covariances of the positions (n, 2, 2), px^2.
         flux, flux_sigma: flux and its standard deviation (n,), counts.
         sky: residual sky level at each star (n,), counts per pixel.
-        blended: which stars overlap with the image of another star (n,).
+        blended: mask of the stars that overlap with the image of another star (n,).
     """
 
     points: FloatArray
@@ -445,7 +445,7 @@ def _fitted(
     freedom = np.maximum(found.used - found.covariance.shape[1], 1)
     excess = found.chi2 / freedom
     excess = np.where(excess > 1.0 + 3.0 * np.sqrt(2.0 / freedom), excess, 1.0) * targets.correlation**2
-    # Overlapping stars share the information in their pixels, so a larger overlap increases the covariance.
+    # Overlapping stars share the information of their pixels, so that overlap increases the covariance.
     excess = excess / (1.0 - pairs.overlap) ** 2
     covariance = found.covariance[:, :2, :2] * excess[:, None, None] + _FLOOR**2 * np.eye(2)
     flux_sigma = _flux_sigma(found, windows, spread.noise) * targets.correlation
@@ -465,8 +465,8 @@ def _shared(
 ) -> PsfFit:
     """Return the fits with blended stars fitted again, each after the light of its neighbours is subtracted.
 
-    The fits start from `begin`, which contains offsets (n, 2), px, and fluxes (n,), counts, because a fit of
-    two stars as one is a bad start.
+    The fits start from the offsets (n, 2), px, and fluxes (n,), counts, in `begin`, because a fit of two
+    stars as one is a bad start.
     """
     some = np.unique(pairs.first)
     own = windows.select(some)

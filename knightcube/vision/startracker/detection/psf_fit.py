@@ -1,16 +1,16 @@
 """Fit of a Gaussian point spread function (PSF) to the pixels of all stars of a frame at once.
 
-For each star, position, flux, residual sky level and optionally the width are fitted in a square window. A
+In a square window around each star, position, flux, residual sky level and optionally the width are fitted. A
 star that moves during the exposure is modelled as a mean of Gaussians along its path (Gauss-Legendre
 quadrature). The weights of the Gauss-Newton fit are computed from the fitted model, not from the counts.
-Weights from the counts would favour pixels that are low by chance, and the flux would be too low. The normal
-equations of all stars, 4 x 4 or 5 x 5 each, are solved together.
+Weights computed from the counts would favour pixels that are low by chance, and the fitted flux would be too
+low. The normal equations of all stars, 4 x 4 or 5 x 5 each, are solved together.
 
 The variance of a pixel is noise^2 + light / gain + (mismatch x light)^2, where light is the star's counts in
-the pixel. The three terms are the sky noise, the photon noise, and the difference between the PSF and a
-Gaussian. If the gain is unknown, gain and mismatch are measured from the residuals of the stars. Gain and
-mismatch can be distinguished because the variance of photon noise is proportional to the light, and that of
-the mismatch to the square of the light.
+the pixel. The three terms of this variance are the sky noise, the photon noise, and the difference between
+the PSF and a Gaussian. If the gain is unknown, gain and mismatch are measured from the residuals of the
+stars. Gain and mismatch can be distinguished because the variance of photon noise is proportional to the
+light, and that of the mismatch to the square of the light.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class StarWindows:
     Attributes:
         middle: column and row of the middle pixel of each window (n, 2).
         half: half-width of the windows, px.
-        light: counts above the sky, including saturated pixels (n, k, k); 0 outside the frame.
-        good: which pixels are inside the frame and not saturated (n, k, k).
+        light: counts of each pixel above the sky, including saturated pixels (n, k, k); 0 outside the frame.
+        good: mask of the pixels that are inside the frame and not saturated (n, k, k).
         noise: standard deviation of a background pixel in each window (n,), counts.
         trail: displacement of each star from the beginning to the end of the exposure (n, 2), px.
     """
@@ -44,11 +44,11 @@ class StarWindows:
     trail: FloatArray
 
     def select(self, chosen: BoolArray | IntArray) -> StarWindows:
-        """Return some of the windows, selected by a mask (n,) or by indices (`chosen`)."""
+        """Return the windows that a mask (n,) or indices (`chosen`) select."""
         return select(self, chosen, "half")
 
     def without(self, light: FloatArray) -> StarWindows:
-        """Return the windows with `light` (n, k, k) subtracted."""
+        """Return the windows with the counts `light` (n, k, k) subtracted."""
         return replace(self, light=self.light - light)
 
     def __len__(self) -> int:
@@ -105,7 +105,7 @@ class StarTargets:
         ceiling: counts at which pixels saturate.
         core: radius of the saturated disc of each star (n,), px; 0 if the star is not saturated.
         trail: displacement of each star from the beginning to the end of the exposure (n, 2), px.
-        correlation: ratio of the noise of a sum of pixels to that of a sum of independent pixels.
+        correlation: ratio of the noise of a sum of pixels to the noise of a sum of independent pixels.
     """
 
     pixels: Image
@@ -123,14 +123,14 @@ class StarTargets:
         return cut(self.pixels, about, half, self.level, self.noise, self.ceiling, self.trail)
 
     def select(self, chosen: BoolArray | IntArray) -> StarTargets:
-        """Return some of the targets, selected by a mask (n,) or by indices (`chosen`)."""
+        """Return the targets that a mask (n,) or indices (`chosen`) select."""
         return select(self, chosen, "pixels", "ceiling", "correlation")
 
     def __len__(self) -> int:
         return len(self.middle)
 
 
-# Length (px) below which a path counts as a point; such a path widens a PSF of 1 px by 0.2 %.
+# Length (px) below which a star's path counts as a point; such a path widens a PSF of 1 px by 0.2 %.
 _SHORTEST = 0.2
 # Number of quadrature nodes, which are accurate to 0.1 % of the flux for paths of four PSF widths.
 _NODES = 4
@@ -140,9 +140,9 @@ _BELL = 1.0 / math.sqrt(2.0 * math.pi)
 def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the fraction (n, k) of a star's flux in each of k = 2 half + 1 pixels along one axis.
 
-    The second and third value are the derivatives of the fraction (n, k), 1/px, by `offset` and by `sigma`.
-    `offset` (n,) is the position of the star relative to the centre of the middle pixel, px, and `sigma` (n,)
-    is the standard deviation of the PSF, px.
+    The second and third returned arrays are the derivatives of the fraction (n, k), 1/px, by `offset` and by
+    `sigma`. The position of the star relative to the centre of the middle pixel is `offset` (n,), px, and the
+    standard deviation of the PSF is `sigma` (n,), px.
     """
     from scipy.special import ndtr  # noqa: PLC0415 - see `regions.label_pixels`
 
@@ -158,8 +158,8 @@ def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArra
 def path(trail: FloatArray) -> list[tuple[FloatArray, float]]:
     """Return the nodes of a quadrature along the paths of n stars, with their weights.
 
-    Each node is the displacement of the stars from the middles of their paths (n, 2), px. The paths have the
-    lengths and directions of `trail` (n, 2), px.
+    Each node is the displacement of the stars from the middles of their paths (n, 2), px. The lengths and
+    directions of the paths are those of `trail` (n, 2), px.
     """
     if not len(trail) or float(np.abs(trail).max()) < _SHORTEST:
         return [(np.zeros_like(trail), 1.0)]
@@ -184,7 +184,7 @@ def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | 
     return out
 
 
-# Residual that a wrong PSF may cause, as a fraction of the star's counts in the pixel.
+# Residual that a wrong PSF may cause in a pixel, as a fraction of the star's counts in this pixel.
 _TOLERATED = 0.25
 _LEAST_PIXELS = 40
 _ROUNDS = 3
@@ -216,10 +216,11 @@ def measure_noise(
     noise: FloatArray,
     gain: float | None,
 ) -> NoiseModel:
-    """Return the noise model from the residuals of a fit of stars; if the gain is given, it is kept.
+    """Return the noise model from the residuals of a fit of stars; a given gain is kept.
 
-    A non-negative least-squares fit models residual^2 - noise^2 as a sum of multiples of light and light^2.
-    The weights of this fit are the reciprocal variances of the square of a normal residual.
+    In this model, residual^2 - noise^2 is a sum of non-negative multiples of light and light^2, found by
+    least squares. The weights of the least-squares fit are the reciprocal variances of the square of a normal
+    residual.
 
     Args:
         residual: residuals of the fit (n, k, k), counts.
@@ -258,8 +259,8 @@ def _shared_mismatch(
 ) -> float:
     """Return the mismatch between PSF and Gaussian, for known photon noise, as a weighted median over stars.
 
-    The median is used because a wrong PSF affects all stars, but the light of neighbouring stars affects only
-    a few.
+    The median over stars is used, because a wrong PSF affects all stars, but the light of neighbouring stars
+    only a few.
     """
     m = np.where(used, light, 0.0)
     floor = np.broadcast_to((noise**2)[:, None, None], light.shape)
@@ -295,13 +296,13 @@ def _non_negative(m: FloatArray, excess: FloatArray, weight: FloatArray) -> tupl
 
 X, Y, FLUX, SKY, WIDTH = range(5)
 NARROWEST, WIDEST = 0.25, 6.0
-# Maximum steps of position and of width (px), which keep fits from diverging if the start is 1 px off.
+# Maximum steps of position and width (px), which keep a fit from diverging if it starts 1 px off.
 _LONGEST_STEP = 0.7
 _WIDEST_STEP = 0.35
-# Residual (standard deviations) above which a pixel is excluded in the final steps, and their number.
+# Residual (standard deviations) above which a pixel is excluded in the last steps, and number of these steps.
 _CLIP = 6.0
 _CLIP_FROM_END = 1
-# Regularisation of the scaled normal matrix, so that a star without information keeps its position.
+# Regularisation of the scaled normal matrix, with which a star without information keeps its position.
 _RIDGE = 1e-9
 
 
@@ -339,7 +340,7 @@ class PsfFit:
         return select(self, chosen)
 
     def replaced(self, chosen: IntArray, part: PsfFit) -> PsfFit:
-        """Return the fits with those of the stars `chosen` (k,) replaced by the fits in `part`."""
+        """Return the fits, in which the fits of the stars `chosen` (k,) are replaced by `part`."""
         out = {item.name: getattr(self, item.name).copy() for item in fields(self)}
         for name, values in out.items():
             values[chosen] = getattr(part, name)
@@ -374,7 +375,7 @@ def fit(
         variance = noise.variance(star, windows.noise)
         good = windows.good
         if step >= steps - _CLIP_FROM_END:
-            # The limit of the residuals tolerates PSFs that are not Gaussian.
+            # The limit above which pixels are excluded tolerates PSFs that are not Gaussian.
             good = good & ~(residual * residual > _CLIP**2 * (variance + (_TOLERATED * star) ** 2))
         weight = (good / variance).reshape(len(values), -1)
         weighted = jacobian * weight[:, None, :]
@@ -437,7 +438,7 @@ def _inverse(normal: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(normal / outer + _RIDGE * np.eye(normal.shape[1])) / outer)
 
 
-# Distance of a star from a window's edge, in PSF standard deviations, beyond which its light is neglected.
+# Distance of a star from a window's edge, in PSF standard deviations, above which its light is neglected.
 _BEYOND = 3.0
 _MOST_OVERLAP = 0.8
 _LEAST_OVERLAP = 0.01

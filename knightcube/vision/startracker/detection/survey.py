@@ -1,4 +1,4 @@
-"""The survey of a frame: the sky background, the areas above the noise, and whether they are streaks.
+"""The survey of a frame: the sky background, the areas above the noise, and whether the areas are streaks.
 
 `survey` smooths the frame, finds the pixels above the noise and joins them into connected areas. The shapes
 of the brightest areas distinguish a frame of points from a frame of streaks.
@@ -31,7 +31,7 @@ from knightcube.vision.frame import (
 )
 
 KERNEL_NORM = 6.0
-"""Noise of the smoothed frame if each pixel has a white noise of 1 count; root sum square of the kernel."""
+"""Noise of the smoothed frame for a white noise of 1 count per pixel; root sum square of the kernel."""
 LEAST_SIDE = 16
 # Noise (counts) to which a floating-point frame is scaled.
 _FLOATING_NOISE = 16.0
@@ -39,7 +39,7 @@ _BAND = 32
 _SKY_BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
 TAIL_PART = 0.97725
 """Fraction of a normal distribution that lies below the mean plus two standard deviations."""
-# Ratio of the noise of pixel sums to uncorrelated noise below which pixels count as uncorrelated.
+# Ratio of the noise of pixel sums to that for uncorrelated noise below which pixels count as uncorrelated.
 _CORRELATED = 1.05
 # Ratio of the noise's lower tail to two standard deviations below which the noise counts as clipped at zero.
 _CUT_OFF = 0.8
@@ -53,7 +53,7 @@ class Surface:
     """A bilinear surface over a frame.
 
     Attributes:
-        values: values at the centres of the blocks of the frame (down, across).
+        values: values at the centres of the blocks of pixels of the frame (down, across).
         shape: rows and columns of the frame.
     """
 
@@ -145,14 +145,14 @@ def measure_sky(pixels: Image) -> SkyBackground:
     row, column = np.arange(2, shape[0] - 1, _STRIDE), np.arange(2, shape[1] - 1, _STRIDE)
     sample = _smoothed_at(pixels, row, column)
     smooth = estimate_background(sample, _SKY_BLOCK // _STRIDE, 1)
-    # Rounding to whole counts causes noise even if the sky is zero everywhere.
+    # Rounding to whole counts causes noise even if all counts of the sky are zero.
     smooth_noise = np.maximum(smooth.noise, KERNEL_NORM * _ROUNDING)
     lone = pixels[2::_STRIDE, 2::_STRIDE].astype(np.float32)
     tail, cut_off = _tails(lone, single.level, single.noise)
     smooth_tail, _ = _tails(sample, smooth.level, smooth_noise)
     noise, smooth_noise_up = single.noise * tail, smooth_noise * smooth_tail
     # Faint stars widen the upper tail of the noise, but do not add noise to the positions of stars.
-    # The upper tail determines the noise of a pixel only if the lower tail is clipped at zero.
+    # The upper tail of the noise is used only if the lower tail is clipped at zero counts.
     own, own_smooth = np.where(cut_off, noise, single.noise), np.where(cut_off, smooth_noise_up, smooth_noise)
     return SkyBackground(
         level,
@@ -225,7 +225,7 @@ def find_bright(pixels: Image, sky: SkyBackground, sigmas: float) -> BrightPixel
         np.matmul(down[first : first + count], across, out=bound)
         above = np.flatnonzero(smooth > bound)
         row, column = np.divmod(above, columns - 2)
-        # The last band may overlap the previous band.
+        # The last band of rows may overlap the previous band.
         place = (row + first) * columns + column + 1
         new = slice(0, None) if not places or not len(places[-1]) else place > places[-1][-1]
         places.append(place[new])
@@ -251,9 +251,9 @@ def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[
 
     In a normal distribution, 2.3 % of the pixels of a block exceed the mean by more than two standard
     deviations, and 2.3 % fall below it by more than two. If a sky is clipped at zero counts, its moments
-    underestimate the noise. Each block uses the median of the 3 x 3 blocks around it, because a textured
-    foreground has a long tail while the sky beside it has not, and a few stars hardly change the median. The
-    relative tail is at least 1.
+    underestimate the noise. For each block, the median over the 3 x 3 blocks around it is used, because a
+    textured foreground has a long tail while the sky beside it has not, and a few stars hardly change the
+    median. The relative tail is at least 1.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
@@ -285,13 +285,13 @@ class DetectionSettings:
         method: `psf` fits the point spread function (PSF), `window` computes the centre of mass (Michalski,
             eq. (12) to (21)), and the other methods weight the pixels of the window (`measurement`).
         threshold_sigmas: minimum height of a peak in the smoothed frame, in standard deviations of its noise.
-        most_stars: maximum number of stars, the brightest first. Each sixteenth of the frame contributes at
-            most a quarter of this number.
-        psf_sigma: standard deviation of the PSF, px. None means that the PSF is measured in the frame, which
-            needs several stars. State the width of the PSF for tracking windows with few stars.
+        most_stars: maximum number of stars, the brightest first. Each sixteenth of the frame's area
+            contributes at most a quarter of `most_stars`.
+        psf_sigma: standard deviation of the PSF, px. With None, the PSF is measured in the frame, which needs
+            several stars. For tracking windows with few stars, the width of the PSF should be stated.
         gain: electrons per count, or None to measure the gain from the residuals of the stars.
-        saturation: counts at which a pixel saturates. None means the highest count of the frame if several
-            pixels have it, otherwise the maximum of the integer type.
+        saturation: counts at which a pixel saturates. With None, the frame saturates at its highest count if
+            several pixels have it, otherwise at the maximum of the integer type.
         window: side length of the centroid window, px, an odd number (a_ROI in Michalski, eq. (12) to (15)).
         search_radius: radius around a predicted position in which `measure_near` searches, px.
     """
@@ -357,15 +357,16 @@ class Areas:
         row, column: row and column of each pixel (m,).
         owner: index of the area of each pixel (m,).
         smooth: counts of the smoothed frame above the background at each pixel (m,).
-        peak: which pixels are local maxima of the smoothed frame (m,).
-        saturated: which pixels are saturated (m,).
+        peak: mask of the pixels that are local maxima of the smoothed frame (m,).
+        saturated: mask of the saturated pixels (m,).
         ceiling: counts at which pixels saturate; infinite if unknown.
         pixels: number of pixels of each area (n,).
         flux: sum of the counts above the background of each area (n,).
         centre: centroid of each area (n, 2), px.
-        length: length of the uniform line with the same moments as each area, without the PSF (n,), px.
-        thickness: rms width of each area across its line (n,), px.
-        direction: angle between the line of each area and the rows (n,), rad.
+        length: length of the uniform line with the same second moments as each area, without the widening by
+            the PSF (n,), px.
+        thickness: rms width of each area across its long axis (n,), px.
+        direction: angle between the long axis of each area and the rows (n,), rad.
         shape: rows and columns of the frame.
     """
 
@@ -415,9 +416,9 @@ def find_areas(pixels: Image, sky: SkyBackground, bright: BrightPixels, saturati
 
 
 def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
-    """Return which pixels `place` (p, 2) are in a block of 32 x 32 px with a large fraction of bright pixels.
+    """Return which pixels `place` (p, 2) are in a block of 32 x 32 px with many bright pixels.
 
-    The fraction of bright pixels is large if it exceeds `share`. Blocks that are displaced by half a block
+    Such a block has a fraction of bright pixels above `share`. Blocks that are displaced by half a block
     along rows and columns are tested too, so that the result does not depend on where the blocks begin.
     """
     down, across = areas.shape[0] // _BLOCK + 2, areas.shape[1] // _BLOCK + 2
@@ -434,9 +435,9 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
 def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArray:
     """Return which bright pixels (m,) are local maxima; of equal neighbours, only the last pixel is one.
 
-    `index` (m,) contains the increasing indices of the pixels in the flattened frame. Pixels that are not in
-    `index` are below the noise threshold and never exceed a bright pixel. The outermost columns never contain
-    bright pixels, so pixels at opposite borders of the frame are never compared.
+    The array `index` (m,) contains the increasing indices of the bright pixels in the flattened frame. Pixels
+    that are not in `index` are below the noise threshold and never exceed a bright pixel. The outermost
+    columns never contain bright pixels, so pixels at opposite borders of the frame are never compared.
     """
     pairs = []
     for step in (1, columns - 1, columns, columns + 1):
@@ -460,7 +461,7 @@ _LEAST_STREAKS = 4
 _STREAKED_PART = 0.4
 _ROUND = 3.0
 _THICKEST = 6.0
-# Maximum median sine of the angle between streaks and the flow of one rotation; foreground lines exceed it.
+# Maximum median sine of the angle between streaks and image flow of one rotation; foreground lines exceed it.
 _CROOKED = 0.12
 
 
@@ -493,11 +494,11 @@ def frame_shape(areas: Areas) -> FrameShape:
 
 
 def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
-    """Return whether lines follow one rotation, from `centre` (n, 2), px, and `direction` (n,), rad.
+    """Return whether lines in the image follow one rotation, from `centre` (n, 2), px, and `direction` (n,).
 
     Near the boresight, a rotation displaces the image at (x, y) by t + w (-y, x), with a vector t and a
-    number w. The flow has no component along the normal of a line that follows it. The best t and w follow
-    from a singular value decomposition of the normal components.
+    number w. If a line follows this flow, the flow has no component along the line's normal. The best t and w
+    follow from a singular value decomposition of the normal components.
     """
     middle = centre.mean(axis=0)
     scale = float(np.abs(centre - middle).max()) or 1.0

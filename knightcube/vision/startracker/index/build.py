@@ -38,12 +38,13 @@ class IndexSettings:
 
     Attributes:
         faintest: V magnitude of the faintest guide star.
-        epoch: Julian year of the directions; `SkyIndex.at` changes the epoch.
+        epoch: Julian year of the directions; the method `SkyIndex.at` changes the epoch.
         resolution: angle below which two stars are merged, rad.
-        smallest, largest: range of the longest sides of the triangles, rad.
-        density: number of stars around a triangle of 2.5 deg that count as bright. For larger triangles the
-            number is larger, so that every octave of size has about the same number of triangles.
-        few: number of the brightest stars of any circle whose triangles are always included.
+        smallest, largest: limits of the longest side of a triangle, rad.
+        density: number of stars that count as bright around a triangle whose longest side is 2.5 deg. For
+            larger triangles, more stars count as bright, so that every octave of size has about the same
+            number of triangles.
+        few: number of the brightest stars of each circle on the sky whose triangles are always included.
     """
 
     faintest: float = 8.5
@@ -68,9 +69,9 @@ class IndexSettings:
 
 
 _NARROWEST, _WIDEST = float(np.deg2rad(2.0)), float(np.deg2rad(120.0))
-# Ratio of the smallest to the largest triangle for a given field of view.
+# Ratio of the smallest to the largest triangle in the index for a given field of view.
 _SMALLEST_SHARE = 0.2
-# Minimum distance (px) of two stars that an image resolves.
+# Minimum distance (px) of two stars that are resolved in an image.
 _RESOLVED_PIXELS = 2.5
 _MOST_STARS = 1 << 16
 DEFAULT = IndexSettings()
@@ -131,7 +132,7 @@ def default_index() -> SkyIndex:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Build and store the sky index. Return 0 if it was stored, or 2 after an error."""
+    """Build and store the sky index. Return 0 if the index was stored, or 2 after an error."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=PATH, help="file (default %(default)s)")
     parser.add_argument(

@@ -2,28 +2,30 @@
 
 The file begins with a header, which contains 8 magic bytes that identify the kind of table, the version
 (uint32), the CRC-32 of everything after the header (uint32), and the length of the table of contents
-(uint32). The table of contents is JSON and is followed by the columns, which are little-endian and begin at
-multiples of 64 bytes. A file with the same columns always has the same bytes.
+(uint32). The table of contents is in JSON format and is followed by the columns, which are little-endian and
+begin at multiples of 64 bytes. A file with the same columns always has the same bytes.
 
 Guide stars are the stars of the catalogue as a given lens images them (Michalski, section 3.3). Proper motion
-is applied up to the epoch of observation. Stars that the image cannot resolve are merged into one star at
+is applied up to the epoch of observation. Stars that an image cannot resolve are merged into one star at
 their centroid, with their joint magnitude. Aberration is not included in the index, because it depends on the
 velocity of the camera; it is applied to the matched directions on board.
 
-The index contains only triangles whose stars are bright relative to the size of the triangle. The reach of a
-star is its distance from the `rank`-th nearest of the stars that are brighter than the star itself. A star is
-among the `rank` brightest stars of every circle around the star whose radius is below its reach. The index
+The index contains only triangles of stars that are bright relative to the size of the triangle. The reach of
+a star is its distance from the `rank`-th nearest of all stars that are brighter than the star itself. A star
+is among the `rank` brightest stars of every circle around the star whose radius is below its reach. The index
 contains a triangle if its longest side is at most the reach of each of its stars. The index does not depend
-on the field of view: frames of any field of view find about the same number of triangles of their brightest
-stars. Every part of the sky has about the same number of stars with a given reach, so dense regions do not
-add triangles. Near a cluster of bright stars, no star has a long reach. To cover such regions, the index also
-contains the triangles of the `few` brightest stars of circles of several radii that cover the sky.
+on the field of view: in frames of any field of view, about the same number of triangles of their brightest
+stars are found. Every part of the sky has about the same number of stars with a given reach, so dense regions
+do not add triangles. Near a cluster of bright stars, no star has a long reach. To cover the neighbourhood of
+such clusters, the index also contains the triangles of the `few` brightest stars of circles of several radii
+that cover the sky.
 
 The sides of a triangle are chords of the unit sphere. The key of a triangle consists of three parts. The
-first part of a key is the orientation of the corners in the order of the lengths of the opposite sides (left
-or right). The second part of a key is the ratios of the shortest and of the middle side to the longest side,
-in cells of `CELL`. The third part of a key is the longest side. In the sorted keys, the triangles of one cell
-within limits of size are contiguous.
+first part of a key is the orientation (left or right) of the triangle's corners, ordered by the lengths of
+the opposite sides. The second part of a key is the ratios of the shortest and of the middle side to the
+longest side, rounded down to cells of width `CELL`. The third part of a key is the length of the longest
+side. In the sorted list of keys, the triangles with the same first and second part and with a longest side
+between two limits are contiguous.
 
 `python -m knightcube.vision.startracker.index.build` builds the index. The same stars and settings give a
 file with the same bytes.
@@ -55,7 +57,7 @@ Facts = dict[str, float]
 _HEADER = struct.Struct("<8sIII")
 _ALIGNMENT = 64
 _UNFIT = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, SyntaxError)
-"""Exceptions that invalid contents of a file with a correct checksum may raise."""
+"""Exceptions that reading a file with invalid contents but a correct checksum may raise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +67,8 @@ class TableKind:
     Attributes:
         magic: first 8 bytes of a file of this kind.
         version: version of the columns.
-        name: name of the kind in messages.
-        cure: advice in messages about a file that cannot be used.
+        name: name of this kind of table in messages.
+        cure: advice that is added to messages about a file that cannot be used.
     """
 
     magic: bytes
@@ -181,7 +183,7 @@ def choose_guide_stars(
     centre = np.stack(
         [np.bincount(group, light * axis, minlength=len(catalogue)) for axis in direction.T], axis=-1
     )
-    # A group is numbered by its first member, which is its brightest star, as the catalogue is sorted.
+    # A group has the number of its first member, the brightest star, because the catalogue is sorted.
     first = np.flatnonzero(group == np.arange(len(catalogue)))
     magnitude = -2.5 * np.log10(joint[first])
     seen = np.flatnonzero(magnitude < faintest)
@@ -192,7 +194,7 @@ def choose_guide_stars(
 
 
 def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return the lowest index in each star's connected group (count,); `pairs` (p, 2) are the connections."""
+    """Return the lowest star index (count,) of each star's group; groups are connected by `pairs` (p, 2)."""
     group = np.arange(count)
     while True:
         lowest = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
@@ -205,22 +207,22 @@ def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
 
 CELLS = 80
 CELL = 1.0 / CELLS
-"""Width of the cells into which side ratios from 0 to 1 are divided."""
+"""Width of the cells into which the ratios of a triangle's sides, from 0 to 1, are divided."""
 FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
-"""Resolution of the longest side in a key; the side is a chord below 1."""
+"""Resolution of the longest side in a triangle's key; the side is a chord below 1."""
 RUN_BITS = 12
-"""Binary logarithm of the number of size units in a run of keys; a run contains about one key."""
+"""Binary logarithm of the number of size units that share an entry of `TriangleIndex.below`."""
 TIE = 1e-9
-"""Relative tolerance of the comparison of a side with a limit, because a side may equal the limit."""
+"""Relative tolerance in the comparison of a triangle's side with a limit, because both may be equal."""
 LEAST_RATIO = 0.1
-"""Minimum ratio of the shortest to the longest side; a flatter triangle is hardly better than a pair."""
+"""Minimum ratio of the shortest to the longest side of a triangle; a flatter one is no better than a pair."""
 
 
-# Distance between the centres of neighbouring circles that cover the sky, relative to their radius.
+# Distance between the centres of neighbouring circles that together cover the sky, relative to their radius.
 _CIRCLES_APART = 0.7
-# Mean number of stars per circle in the first search, relative to the number of stars needed.
+# Mean number of stars per circle in the first search of a circle, relative to the number of stars needed.
 _ENOUGH = 4.0
 
 
@@ -229,10 +231,11 @@ class TriangleIndex:
     """Triangles of guide stars, sorted by their keys.
 
     Attributes:
-        key: orientation, cell of the side ratios, and longest side of each triangle (m,), uint32.
+        key: key of each triangle (m,), uint32, from its orientation, the cell of its side ratios, and its
+            longest side.
         corners: indices of the guide stars opposite the shortest, the middle and the longest side (m, 3),
             uint16.
-        shape: positions of the two side ratios within their cells (m, 2), uint8.
+        shape: positions of each triangle's two side ratios within their cells (m, 2), uint8.
     """
 
     key: npt.NDArray[np.uint32]
@@ -244,14 +247,14 @@ class TriangleIndex:
 
     @cached_property
     def below(self) -> npt.NDArray[np.int32]:
-        """The number of keys below each multiple of 2^RUN_BITS (f,); it locates keys without a search."""
+        """The number of keys below each multiple of 2^RUN_BITS (f,), for finding keys without a search."""
         run = self.key >> np.uint32(RUN_BITS)
         count = np.bincount(run, minlength=2 * CELLS * CELLS << (SIZE_BITS - RUN_BITS))
         return np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
 
 
 def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
-    """Return the reach of each star (n,), which is the chord to its `rank`-th nearest brighter star.
+    """Return the reach of each star (n,): the chord to its `rank`-th nearest brighter star.
 
     The reach is at most `farthest`, which is also the reach of a star with fewer than `rank` brighter stars.
     The unit vectors `direction` (n, 3) are in order of brightness, the brightest first.
@@ -284,9 +287,9 @@ def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, f
     Args:
         direction: unit vectors to the stars (n, 3), the brightest first.
         sizes: limits of the longest sides of b bands of triangles (b + 1,), as chords.
-        ranks: rank that defines the reach of the stars in each band (b,).
-        few: number of the brightest stars of a circle whose triangles are added. The circles cover the sky
-            and have the radii `sizes`.
+        ranks: rank of the brighter star that defines a star's reach, for each band (b,).
+        few: number of the brightest stars of a circle on the sky whose triangles are added. The circles on
+            the sky have the radii `sizes` and cover the sky.
     """
     bands = zip(sizes[:-1], sizes[1:], ranks, strict=True)
     found = [np.sort(_band(direction, *band), axis=1) for band in bands]
@@ -298,12 +301,13 @@ def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, f
 def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int) -> IntArray:
     """Return the triangles (m, 3) of the `few` brightest stars of each of the circles that cover the sky.
 
-    The circles have the radius `radius`. The longest side of a triangle is at least `smallest`.
+    The circles that cover the sky have the radius `radius`. The longest side of a triangle is at least
+    `smallest`.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     centres = evenly_spread(math.ceil(4.0 * math.pi / (_CIRCLES_APART * radius) ** 2))
-    # Most circles contain enough of the brightest stars of the sky; all stars are searched for other circles.
+    # Most circles contain enough of the sky's brightest stars; for other circles all stars are searched.
     brightest = min(math.ceil(_ENOUGH * few * 4.0 / radius**2), len(direction))
     chosen = np.full((len(centres), few), len(direction))
     for count in sorted({brightest, len(direction)}):
@@ -331,9 +335,9 @@ def evenly_spread(count: int) -> FloatArray:
 
 
 def _band(direction: FloatArray, smallest: float, largest: float, rank: int) -> IntArray:
-    """Return the triangles (m, 3) whose longest side is between `smallest` and `largest`.
+    """Return the triangles (m, 3) with a longest side between `smallest` and `largest`.
 
-    The reach of each star of a triangle, for `rank`, is at least the longest side.
+    For the given `rank`, the reach of each star of a triangle is at least the longest side.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
@@ -387,14 +391,14 @@ def _indexed(direction: FloatArray, corners: IntArray) -> TriangleIndex:
 
 
 def cell(ratio: FloatArray) -> IntArray:
-    """Return the indices of the cells that contain given side ratios."""
+    """Return the indices of the cells into which given side ratios of triangles fall."""
     return np.clip(np.floor(ratio * CELLS), 0, CELLS - 1).astype(np.int64)
 
 
 def keys(
     short: IntArray, middle: IntArray, left: npt.NDArray[np.bool_], size: FloatArray
 ) -> npt.NDArray[np.uint32]:
-    """Return the keys of triangles from cells of the side ratios, the orientation and the longest side."""
+    """Return the keys of triangles from the cells of their side ratios, orientation and longest side."""
     form = ((left * CELLS + short) * CELLS + middle).astype(np.int64)
     step = np.clip(size / SIZE_UNIT, 0, (1 << SIZE_BITS) - 1).astype(np.int64)
     return ((form << SIZE_BITS) | step).astype(np.uint32)
@@ -415,7 +419,7 @@ PATH = (
 
 @dataclass(frozen=True, eq=False)
 class SkyIndex:
-    """Guide stars, and triangles of those guide stars that are bright in their surroundings.
+    """Guide stars, and triangles of guide stars that are bright relative to the stars around them.
 
     Attributes:
         stars: guide stars at the epoch of the index.
