@@ -178,7 +178,7 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
     Regions are 8-connected and numbered in the order of their first pixels. The algorithm connects runs of
     adjacent pixels in a row, because there are far fewer runs than pixels. Each run of pixels is linked to an
     earlier run of its region, and the links are shortened until all runs of a region share one root (Shiloach
-    and Vishkin 1982). An implementation with scipy.sparse would need 12 MiB more memory.
+    and Vishkin 1982). The same connection of regions with scipy.sparse would need 12 MiB more memory.
     """
     # An empty column is added, so that no run of pixels continues in the next row.
     pixel, columns = pixel + pixel // columns, columns + 1
@@ -353,7 +353,7 @@ def saturation_level(pixels: Image, given: float | None) -> float:
 def saturation_count(pixels: Image) -> float:
     """Return the saturation count: the highest count if several pixels have it, or else the type's maximum.
 
-    This function is for frames of streaks, in which bright stars cover many pixels.
+    For frames of streaks, in which bright stars cover many pixels, this function finds the saturation.
     """
     highest = pixels.max()
     # A frame with only one value is dead, unless the value is the maximum of its type.
@@ -365,9 +365,9 @@ def saturation_count(pixels: Image) -> float:
 def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None) -> float:
     """Return the saturation count: `given`, or the highest of `counts` (m,) if frequent, or the maximum.
 
-    This function is for frames of point stars from any camera. In a dim frame, the highest counts are due to
-    noise, and the higher a count, the fewer pixels have it. In a saturated frame, more pixels have the
-    highest count than the counts just below.
+    For frames of point stars from any camera, this function finds the saturation. In a dim frame, the highest
+    counts are due to noise, and the higher a count, the fewer pixels have it. In a saturated frame, more
+    pixels have the highest count than the counts just below.
     """
     top = saturation_level(pixels, given)
     highest = counts.max(initial=-np.inf)

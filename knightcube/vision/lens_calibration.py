@@ -596,7 +596,7 @@ class CalibrationImage:
     def reason(self) -> str:
         """The reason why the image is not used for the calibration.
 
-        The reason is empty for an image that is used.
+        For an image that is used, the reason is empty.
         """
         return self.excluded or ("" if self.solution.fix is not None else self.solution.reason)
 

@@ -5,8 +5,9 @@ same current. The current of a string is proportional to the cosine of the angle
 string's normal, and zero if the Sun is behind the string. The Earth also illuminates the solar strings, at
 most a third as strongly as the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of the light
 from the half of the sky that is centred on nadir e. Light from the Earth correlates the errors of the
-strings. This correlation can be computed if nadir is known; otherwise the mean correlation over all nadir
-directions is used. The covariance of the Sun direction includes this correlation by light from the Earth.
+strings. The correlation of the errors can be computed if nadir is known; otherwise the mean correlation over
+all nadir directions is used. The covariance of the Sun direction includes this correlation by light from the
+Earth.
 
 The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if any
 one string fails in any way. The magnetic field does not determine the rotation about the field direction. All
@@ -34,7 +35,7 @@ _MOST_STEPS = 15
 _SOFT = 0.05
 """Range of the cosine of the incidence angle in which a string's current rises smoothly from zero.
 
-This smooth rise gives a slope if the Sun is normal to a face, where adjacent faces have zero current.
+The smooth rise gives a nonzero slope if the Sun is normal to a face and adjacent faces have zero current.
 """
 _RARE = 3.09
 """Number of standard deviations that one normal reading in a thousand exceeds."""
@@ -153,7 +154,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
         weighted = slopes.T @ information
         inverse = np.linalg.inv(weighted @ slopes + 1e-6 * np.eye(2))
         step = inverse @ (weighted @ (readings - modelled))
-        # Each step is limited to half a radian, because the linear model is poor far from the solution.
+        # Each step is limited to half a radian, because the linear model is poor far from the Sun direction.
         step *= min(1.0, 0.5 / max(float(np.hypot(*step)), 1e-12))
         direction = direction + step @ basis
         direction = direction / np.linalg.norm(direction)
@@ -161,7 +162,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
             break
     left = readings - _sunlight(normals @ direction)[0]
     square, freedom = float(left @ information @ left), len(shares) - 2
-    # This limit is the chi-square that one reading in a thousand exceeds (Wilson and Hilferty 1931).
+    # The limit of chi-square is the value that one reading in a thousand exceeds (Wilson and Hilferty 1931).
     ninth = 2.0 / (9.0 * freedom)
     if square > float(freedom * (1.0 - ninth + _RARE * np.sqrt(ninth)) ** 3):
         reason = f"no Sun direction explains the currents: chi-square {square:.0f} of {freedom}"
@@ -276,8 +277,7 @@ class FieldAndStrings:
     ) -> StringFix | None:
         """Return the attitude from one reading, or None if the possible rotations do not determine it.
 
-        The result is None if no rotation is possible, or if the possible rotations span more than half a
-        circle.
+        Returns None if no rotation is possible, or if the possible rotations span more than half a circle.
 
         Args:
             currents: currents (n,) of the strings, A.
@@ -321,7 +321,7 @@ class FieldAndStrings:
         return StringFix(attitude, about**2 * along + across**2 * (np.eye(3) - along), axis, about)
 
     def _aligned(self, axis: FloatArray, known: FloatArray) -> FloatArray:
-        """Return the base attitude (4,), rotated by the shortest way from the `known` field to `axis`."""
+        """Return an attitude (4,) that rotates the inertial field direction `known` onto the body `axis`."""
         base = np.array([0.0, 0.0, 0.0, 1.0]) if self._base is None else self._base
         shown = attitude_matrix(base) @ known
         if float(shown @ axis) < -0.99:

@@ -542,7 +542,7 @@ class CameraChoice:
 
 
 def cameras_by_sun(sun: CoarseSun, cameras: Sequence[MountedCamera]) -> list[CameraChoice]:
-    """Return the cameras in the order in which they are read for the Sun, or no camera if it is dark.
+    """Return the cameras in the order in which they are read for the Sun, or none if the Sun is not visible.
 
     Cameras with the coarse Sun direction in their field of view come first, followed by cameras that may have
     the Sun in their field of view. Each group of cameras is sorted by the angle between boresight and coarse

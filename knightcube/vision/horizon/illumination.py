@@ -6,16 +6,17 @@ limb does not agree with the image. Meller et al., section 3.3, do not state how
 the terminator.
 
 If no image shows a limb, the Earth fills the field of one camera and the other cameras are dark (Meller et
-al., section 4.1). In this case, `coarse_nadir` tries nadir directions that cover the sphere. For each trial
-nadir, the function predicts which samples of the images are bright, namely samples on the sunlit part of the
-Earth's disc. The coarse nadir is the mean of the trial directions, weighted by their likelihood given the
-samples, and the covariance of the nadir is the spread of the weighted directions. If the direction of the Sun
-is unknown, any sample on the Earth's disc may be dark.
+al., section 4.1). If the Earth fills the field of one camera, `coarse_nadir` tries nadir directions that
+cover the sphere. For each trial nadir, the function predicts which samples of the images are bright, namely
+samples on the sunlit part of the Earth's disc. The coarse nadir is the mean of the trial directions, weighted
+by their likelihood given the samples, and the covariance of the nadir is the spread of the weighted
+directions. If the direction of the Sun is unknown, any sample on the Earth's disc may be dark.
 
 The function `why_false` compares an image with the view from a known attitude. An image contradicts the
-attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be.
-Such an image is taken by a camera that is dead, blinded, mounted upside down or sends random data. The
-surroundings of the limb, the twilight zone and the surroundings of the Sun are excluded from this comparison.
+attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be. An
+image that contradicts the attitude is taken by a camera that is dead, blinded, mounted upside down or sends
+random data. The surroundings of the limb, the twilight zone and the surroundings of the Sun are excluded from
+this comparison.
 """
 
 from __future__ import annotations

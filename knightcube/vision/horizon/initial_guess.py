@@ -163,7 +163,7 @@ def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tole
     cones are given by their axes `directions` (k, 3) and the cosines (k,) of their half-angles.
     """
     sines = np.sqrt(np.maximum(1.0 - cosines**2, 1e-6))
-    # Near a cone of half-angle rho, the distance times sin(rho) is cos(angle from the axis) - cos(rho).
+    # A ray at the angle a from a cone's axis lies about (cos(a) - cos(rho)) / sin(rho) inside the cone rho.
     off = directions @ edges.rays.T
     off -= cosines[:, None]
     near = np.abs(off, out=off) <= sines[:, None] * (tolerance * edges.pixel)

@@ -62,7 +62,7 @@ class Ellipsoid:
         return self._along_axes(1.0 / (self.equatorial + height), 1.0 / (self.polar + height))
 
     def shape(self, height: float = 0.0) -> FloatArray:
-        """Return the inverse (3, 3) of `stretching`, which transforms the unit sphere into the ellipsoid."""
+        """Return the inverse (3, 3) of `stretching`: it transforms the unit sphere into the ellipsoid, m."""
         return self._along_axes(self.equatorial + height, self.polar + height)
 
     def stretching_by_height(self, height: float = 0.0) -> FloatArray:

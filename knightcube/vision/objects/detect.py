@@ -141,7 +141,7 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 # Distance of the rotation centre from the boresight, in focal lengths, above which the centre is not used.
-# This distance is computed from the rotation axis, because errors move a least-squares centre nearer.
+# The distance of the centre is computed from the rotation axis, because errors move a fitted centre nearer.
 _FARTHEST_CENTRE = 3.0
 
 
@@ -460,9 +460,9 @@ class Judge:
     def _among_stars(self, ends: FloatArray) -> tuple[float, FloatArray]:
         """Return the rate, rad/s, and the image direction (2,) of a motion relative to the stars.
 
-        The object moves from the first of the `ends` (2, 2), px, to the second. Both ends are rotated to
-        mid-exposure as if they belonged to stars; the remaining difference is the motion relative to the
-        stars.
+        The object moves from the first of the `ends` (2, 2), px, to the second. Both ends of a streak are
+        rotated to mid-exposure as if they belonged to stars; the remaining difference is the motion relative
+        to the stars.
         """
         middle = at_mid_exposure(self.pinhole.unit_vectors(ends), self.rotation)
         angle = np.arctan2(np.linalg.norm(np.cross(middle[0], middle[1])), middle[0] @ middle[1])

@@ -12,9 +12,9 @@ the path of any star, or that ends where a star would continue, is not explained
 A star's streak has the same brightness from end to end. Therefore the brightness of a star is at most the
 minimum brightness of the image along the star's path. An erosion of the image with the path as structuring
 element gives this minimum for every position of the star. Objects that cross the streaks of stars, and points
-on these streaks, nearly vanish in the eroded image. Stars are removed one by one, the brightest first. The
-positions and brightnesses of all stars found are fitted together, without pixels that are brighter than these
-stars. The brightest remaining light is then fitted as a point or a line.
+on these streaks, nearly vanish in the eroded image. In a region, stars are subtracted one by one, the
+brightest first. The positions and brightnesses of all stars found are fitted together, without pixels that
+are brighter than these stars. The brightest remaining light is then fitted as a point or a line.
 """
 
 from __future__ import annotations
@@ -272,7 +272,8 @@ def spread_with_slopes(
     """Return the image of a streak from `spread_over`, and its derivatives, 1/px, by shifts of the path.
 
     Each of the k displacements moves each of the m points of the path by the given fraction `shares` (k, m)
-    of a displacement. For each displacement, the derivatives in x and in y are returned.
+    of a displacement. For each displacement of the path, the derivatives for a displacement along x and along
+    y are returned.
     """
     x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
     dx, dy = _within_pixels(columns, path[:, 0], sigma, True), _within_pixels(rows, path[:, 1], sigma, True)

@@ -1,11 +1,11 @@
 """Bright regions of a frame, and the two ends of each region that is a streak (Sease 2013, chapter 3).
 
 A pixel is bright if the sum of the 3 x 3 pixels around it, without background, exceeds a given number of
-standard deviations of the sum. This sum is nearly the matched filter of a star image one pixel wide. The
-Harris response of the structure tensor (cornerness) is computed for each connected region of bright pixels. A
-streak has exactly two peaks of the Harris response, and each peak is located by its centre of intensity. The
-equations are those of Sease, with the corrections of the errata to eq. (3.5), (3.15), (3.17) and (3.18).
-Images have the shape (rows, columns), and points are (x, y) in px.
+standard deviations of the sum. The sum of 3 x 3 pixels is nearly the matched filter of a star image one pixel
+wide. The Harris response of the structure tensor (cornerness) is computed for each connected region of bright
+pixels. A streak has exactly two peaks of the Harris response, and each peak is located by its centre of
+intensity. The equations are those of Sease, with the corrections of the errata to eq. (3.5), (3.15), (3.17)
+and (3.18). Images have the shape (rows, columns), and points are (x, y) in px.
 
 The Gaussian kernels displace the peaks of the Harris response along the streak by a constant that depends on
 the point spread function. The function `extend` compensates this displacement of the measured streak ends.

@@ -2,7 +2,7 @@
 
 If the stars are points, the package `detection` measures their positions. If the stars are streaks, their
 fitted positions at mid-exposure are used instead. Identification first searches near a prior attitude, if
-there is one, and then in the whole sky. The result is the attitude at mid-exposure.
+there is one, and then in the whole sky. The resulting attitude is that at mid-exposure.
 
 During an exposure at a constant rate, the middle of a streak is the position of the star at mid-exposure.
 During an exposure of length T, an angular acceleration a displaces the centroid of a point by a T^2 / 24, and
@@ -343,8 +343,8 @@ def points_near(
 ) -> Detections:
     """Return the stars detected near the predicted positions of the brightest guide stars.
 
-    If the prior is too uncertain, no stars are returned. The argument `trails` describes the motion of the
-    stars during the exposure, if this motion is known and at most a few pixels.
+    If the prior attitude is too uncertain, no stars are returned. The argument `trails` describes the motion
+    of the stars during the exposure, if this motion is known and at most a few pixels.
     """
     radius = PRIOR_SIGMAS * prior.sigma * camera.focal_length + _LEAST_RADIUS_PX
     if radius > _MOST_RADIUS_PX:

@@ -4,9 +4,9 @@ The guide stars predicted in the field are compared with the observed stars. Att
 with the matched stars, and the comparison is repeated until the set of matched stars no longer changes. The
 significance of a match is an upper bound of the expected number of attitudes, among the searched attitudes,
 at which random stars would match at least as well. If this bound is far below one, it is also an upper bound
-of the probability of a false match. This bound does not depend on how a candidate attitude was found. The
-bound is multiplied by the number of alternatives among which gate, brightness limit and test are chosen
-(Bonferroni).
+of the probability of a false match. The bound of chance matches does not depend on how a candidate attitude
+was found. The bound is multiplied by the number of alternatives among which gate, brightness limit and test
+are chosen (Bonferroni).
 
 `track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error displaces
 all predicted stars by nearly the same vector. Pairs of an observed and a predicted star are formed if their
@@ -69,8 +69,9 @@ class Chance:
     def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
         """Return log10 of an upper bound of the number of chance matches that are as good as a given match.
 
-        The matching also selects the faintest expected star that is compared. For this reason, the bound is
-        multiplied by j^2 pi^2/6, where j - 1 is the number of brighter expected stars without a match.
+        The matching also selects the faintest expected star that is compared. Because of this selection of
+        the faintest star, the bound is multiplied by j^2 pi^2/6, where j - 1 is the number of brighter
+        expected stars without a match.
 
         Args:
             gate: half-width within which a star matches, in standard deviations.
@@ -290,7 +291,8 @@ def _settle(
 ) -> tuple[_Matching, Refinement] | None:
     """Return the matched stars and the attitude after repeated matching and refinement.
 
-    Both steps are repeated until the matched stars no longer change. Returns None if the refinement diverges.
+    Matching and refinement of the attitude alternate until the matched stars no longer change. Returns None
+    if the refinement diverges.
     """
     refined, previous = start, None
     for _ in range(settings.rounds):

@@ -1,11 +1,11 @@
 """Estimation of the camera's motion during one exposure from all pixels of all star streaks.
 
 The bright regions of the frame give initial guesses of the motion, and each guess is fitted to the brightest
-stars. A matched filter along each fitted motion detects faint stars. The result is a joint fit of the motion
-and the bright stars, in which the flux of the faint stars is modelled. A final check verifies that each
-modelled streak matches one complete streak in the frame. If the fitted rotation is too small, one streak is
-modelled as several segments; if it is too large, several streaks are modelled as one. All functions of this
-module are pure and deterministic.
+stars. A matched filter along each fitted motion detects faint stars. The final estimate is a joint fit of the
+motion and the bright stars, in which the flux of the faint stars is modelled. A final check verifies that
+each modelled streak matches one complete streak in the frame. If the fitted rotation is too small, one streak
+is modelled as several segments; if it is too large, several streaks are modelled as one. All functions of
+this module are pure and deterministic.
 
 With a rolling shutter, a star that moves in the readout direction is exposed longer than a star that moves
 against it. With a rolling shutter, a motion and its time reversal produce streaks of different lengths. A
@@ -119,7 +119,7 @@ _MOST_RESIDUAL = 0.01
 # Upper limit of a star's significance (standard deviations) in the sum of explained chi-squares.
 _ENOUGH = 200.0
 # Weight of the flux in regions longer than the guessed streak, when guesses are compared.
-# This weight is below 1, because a long region may be a blend of two streaks.
+# The weight of overlong regions is below 1, because a long region may be a blend of two streaks.
 _CONTRADICTION = 0.6
 # Last step of the fit (standard deviations) below which a preliminary fit counts as converged.
 _CALM = 2.0
@@ -375,7 +375,7 @@ def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
 _SAME_STAR = 3.0
 # Minimum difference of chi-square between the two signs of the rotation from which the sign is decided.
 _LEAST_MARGIN = 50.0
-# Minimum ratio of this sign's chi-square difference to its scatter over the stars, for a decision.
+# Minimum ratio of the chi-square difference between both signs to its scatter over the stars, for a decision.
 _LEAST_AGREEMENT = 3.0
 # Upper limit of a single star's chi-square difference in the decision on the sign of the rotation.
 _MOST_DIFFERENCE = 50.0

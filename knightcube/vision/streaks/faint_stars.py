@@ -171,7 +171,7 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slic
 
 Int32Array = npt.NDArray[np.int32]
 
-# Side (px) of the square of pixels that is summed for one sample.
+# Side (px) of the square of pixels whose sum is one sample of the polar grid.
 _BOX = 3.0
 # Largest cumulative sum of samples that can be represented, in units of the rounding step.
 _HIGHEST = 2.0**30
@@ -477,9 +477,9 @@ def _found_stars(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return fractional grid rows, columns and heights of the peaks that reproduce the response `held`.
 
-    Each pass finds peaks in the residual response, solves for the heights of all stars, and subtracts these
-    stars. The array `noise` holds the noise of a running sum by the number of its samples. All passes search
-    only those samples whose initial response is significant.
+    Each pass of the search finds peaks in the residual response, solves for the heights of all stars, and
+    subtracts these stars. The array `noise` holds the noise of a running sum by the number of its samples.
+    All passes search only those samples whose initial response is significant.
     """
     flat = held.light.reshape(-1)
     place = np.flatnonzero(flat > sigmas * noise.min())

@@ -236,7 +236,7 @@ def sensitivities_and_velocity(
     there = v[:2] / v[2]
     out = np.zeros((2, 8, len(time)))
     # A change of the rate rotates the camera by a small vector psi, which moves the direction v by v x psi.
-    # This vector psi at the time t is the integral over t' of the rotation from t' to t.
+    # The vector psi at the time t is the integral over t' of the rotation from t' to t.
     flow = _flow(pinhole, there)
     # The rotation in psi is that at the mean rate since mid-exposure, with an error of higher order.
     mean = motion.rate[:, None] + 0.5 * time * motion.acceleration[:, None]
@@ -462,7 +462,7 @@ def exposure_bounds(
     if shutter.delay_per_row == 0.0:
         return times
     # The row in which a streak ends depends on the end time, which is found by fixed-point iteration.
-    # This iteration converges, because a star crosses few rows during the delay of one row.
+    # The iteration for the end time converges, because a star crosses few rows during the delay of one row.
     for _ in range(4):
         for end, nominal in enumerate((-0.5, 0.5)):
             row = positions(pinhole, motion, stars, times[:, end])[:, 1]

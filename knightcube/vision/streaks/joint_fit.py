@@ -401,8 +401,8 @@ def _end_motions(
 def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
     """Return an array (k,) with 1 for stars whose streaks have no gaps, and 0 for all other tested stars.
 
-    Only the part of a path on the detector is tested. Stars with very short or very faint streaks are
-    omitted.
+    Only the part of a star's path that is on the detector is tested for gaps. Stars with very short or very
+    faint streaks are omitted.
     """
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
     long = length > _WITHIN * _LEAST_STRETCH

@@ -66,7 +66,7 @@ class BlockPixels:
         slot: index of each pixel in the list of all fitted pixels, in which every pixel of the frame occurs
             once. Where two stars share a pixel, both of its copies have the same `slot`. A pixel outside the
             frame has the number of fitted pixels as its `slot`.
-        inside: mask of the pixels of the blocks that are fitted.
+        inside: mask of the fitted pixels of each block.
         signal: counts of each pixel above the background.
         floor: noise variance of each pixel without a star, counts^2.
         ceiling: counts above the background from which each pixel is saturated.

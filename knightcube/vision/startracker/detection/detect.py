@@ -498,7 +498,7 @@ def _reach(values: FloatArray) -> float:
 
 
 def _clipped(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the clipped mean (n,) and variance (n,) of each row of `values` (n, k); infinity is ignored."""
+    """Return the clipped mean (n,) and variance (n,) of the finite values in each row of `values` (n, k)."""
     level = _median(values)
     apart = np.abs(values - level[:, None])
     kept = apart <= 3.0 * np.maximum(MAD_TO_SIGMA * _median(apart), 0.5)[:, None]
@@ -509,6 +509,6 @@ def _clipped(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _median(values: FloatArray) -> FloatArray:
-    """Return the lower median (n,) of each row of `values` (n, k); infinity is ignored."""
+    """Return the lower median (n,) of the finite values in each row of `values` (n, k)."""
     count = np.maximum(np.isfinite(values).sum(axis=1), 1)
     return np.asarray(np.sort(values, axis=1)[np.arange(len(values)), (count - 1) // 2])

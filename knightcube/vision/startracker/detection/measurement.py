@@ -10,8 +10,8 @@ corrected here (errata).
 Three other centroid methods start from the centre of mass and weight the pixels. `weighted` weights each
 pixel with its own counts (Michalski, reference [22]; most CubeSat star trackers use this method). `iterative`
 uses a Gaussian weight that follows the centroid (Stone 1989, Astronomical Journal 97, 1227, and the windowed
-positions of SExtractor). `gaussian` fits a parabola to the logarithm of the counts. Each method also returns
-the derivatives of the centroid with respect to the pixels, from which the variance of the centroid is
+positions of SExtractor). `gaussian` fits a parabola to the logarithm of the counts. Each centroid method also
+returns the derivatives of the centroid with respect to the pixels, from which the variance of the centroid is
 computed.
 """
 
@@ -47,7 +47,7 @@ REACH = 2.7
 """Half-width of a star's window, in PSF standard deviations, within `LEAST_HALF` and `MOST_HALF` px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
 # Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the star's counts.
-# This mismatch is smaller than in the first fit, so that not only the wings of bright stars are used.
+# The mismatch is smaller than in the first fit, so that not only the wings of bright stars are used.
 _NEXT_MISMATCH = 0.02
 # Mismatch between PSF and Gaussian that is assumed if no star determines it.
 _UNKNOWN_MISMATCH = 0.02
@@ -241,7 +241,7 @@ def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: floa
 def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float) -> Centroid:
     """Return the vertices of parabolas fitted to the logarithm of the counts.
 
-    If too few pixels exceed the noise, the initial centroid is returned.
+    If too few pixels exceed the noise, the initial centroid of the star is returned.
     """
     x, y = (np.broadcast_to(step, clean.shape) for step in _steps(clean))
     used: BoolArray = clean > _STANDS_OUT * np.sqrt(variance)

@@ -158,8 +158,8 @@ def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArra
 def path(trail: FloatArray) -> list[tuple[FloatArray, float]]:
     """Return the nodes of a quadrature along the paths of n stars, with their weights.
 
-    Each node is the displacement of the stars from the middles of their paths (n, 2), px. The lengths and
-    directions of the paths are those of `trail` (n, 2), px.
+    Each quadrature node is a displacement of the stars from the midpoints of their paths (n, 2), px. The
+    lengths and directions of the paths are those of `trail` (n, 2), px.
     """
     if not len(trail) or float(np.abs(trail).max()) < _SHORTEST:
         return [(np.zeros_like(trail), 1.0)]
@@ -218,9 +218,9 @@ def measure_noise(
 ) -> NoiseModel:
     """Return the noise model from the residuals of a fit of stars; a given gain is kept.
 
-    In this model, residual^2 - noise^2 is a sum of non-negative multiples of light and light^2, found by
-    least squares. The weights of the least-squares fit are the reciprocal variances of the square of a normal
-    residual.
+    The squared residual minus the squared sky noise is modelled as a sum of non-negative multiples of light
+    and light^2, found by least squares. The weights of the least-squares fit are the reciprocal variances of
+    the square of a normal residual.
 
     Args:
         residual: residuals of the fit (n, k, k), counts.

@@ -418,8 +418,8 @@ def find_areas(pixels: Image, sky: SkyBackground, bright: BrightPixels, saturati
 def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
     """Return which pixels `place` (p, 2) are in a block of 32 x 32 px with many bright pixels.
 
-    Such a block has a fraction of bright pixels above `share`. Blocks that are displaced by half a block
-    along rows and columns are tested too, so that the result does not depend on where the blocks begin.
+    A block has many bright pixels if their fraction exceeds `share`. Blocks that are displaced by half a
+    block along rows and columns are tested too, so that the result does not depend on where the blocks begin.
     """
     down, across = areas.shape[0] // _BLOCK + 2, areas.shape[1] // _BLOCK + 2
     found = np.zeros(len(place), dtype=bool)

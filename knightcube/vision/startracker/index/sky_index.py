@@ -217,7 +217,7 @@ RUN_BITS = 12
 TIE = 1e-9
 """Relative tolerance in the comparison of a triangle's side with a limit, because both may be equal."""
 LEAST_RATIO = 0.1
-"""Minimum ratio of the shortest to the longest side of a triangle; a flatter one is no better than a pair."""
+"""Minimum ratio of the shortest to the longest side of a triangle; flatter triangles resemble pairs."""
 
 
 # Distance between the centres of neighbouring circles that together cover the sky, relative to their radius.
