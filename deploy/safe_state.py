@@ -83,7 +83,7 @@ class SafeState:
             return None
         obeyed, text = True, ""
         if data in self._seen:
-            obeyed, text = False, "the very same packet has come before"
+            obeyed, text = False, "an identical packet was received before"
         elif name == "mode":
             self.due = now
         elif name == "safe":

@@ -59,7 +59,7 @@ def test_files_come_down_and_go_up_by_the_command(
     [
         (["get", "log/none"], "no such file"),
         (["get", "../keys"], "not an allowed name"),
-        (["delete", LOG], "no received file"),
+        (["delete", LOG], "use the name of a received file"),
         (["cancel", "1", "7"], "no transfer 7"),
     ],
 )
