@@ -39,8 +39,8 @@ def smoothed(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the states (n, 6) of the orbit that fits measured positions best.
 
-    The covariance (6, 6) of the state at the instant `middle` is returned too. `sigma` (n,) m is the standard
-    deviation per axis of each position. The velocities of `states` are only the initial guess.
+    The covariance (6, 6) of the state at the instant `middle` is returned too. The standard deviation of each
+    position is `sigma` (n,), m, along each axis. The velocities of `states` are only the initial guess.
     """
     state = states[middle]
     covariance = np.eye(6)

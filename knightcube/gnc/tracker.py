@@ -149,7 +149,7 @@ def predict(
 ) -> LineOfSightState:
     """Return the line of sight propagated to a later time. Raises ValueError for an earlier time.
 
-    `tide` (3, 3) 1/s^2 is the gravity gradient, None if unknown.
+    The gravity gradient is `tide` (3, 3), 1/s^2, or None if unknown.
     """
     step = (time_ns - state.time_ns) * 1e-9
     if step == 0.0:
@@ -207,7 +207,7 @@ def _at_unit_range(
 def _noise(state: LineOfSightState, step: float, motion: MotionModel, known: bool) -> FloatArray:
     """Return the covariance (6, 6) that white accelerations add to the state within `step` seconds.
 
-    `known` is true if the gravity gradient is known.
+    The flag `known` states whether the gravity gradient is known.
     """
     along = np.outer(state.direction, state.direction)
     rate = float(np.linalg.norm(state.rate))

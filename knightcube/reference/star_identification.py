@@ -698,7 +698,7 @@ def _agrees(direction: FloatArray, motion: StarMotion, rate: FloatArray, covaria
     """Return for each point (n,) whether the motion of the point agrees with `rate` within the errors."""
     residual = motion.velocity - np.cross(direction, rate)
     residual -= np.sum(residual * direction, axis=-1, keepdims=True) * direction
-    # The error of the rate adds at most this variance perpendicular to the line of sight.
+    # The largest eigenvalues of the covariance of the rate give an upper bound of the error it causes.
     spread = motion.sigma**2 + float(np.linalg.eigvalsh(covariance)[-1]) * (1.0 - direction[:, 2] ** 2)
     spread = spread + float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     return np.asarray(np.sum(residual**2, axis=-1) <= _CHI_SQUARE * spread)

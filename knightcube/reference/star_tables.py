@@ -445,7 +445,8 @@ def _triangles(pairs: PairTable, chosen: BoolArray, widest: float) -> IntArray:
 
 GRID_CELLS = 40
 BUFFER = 0.15
-"""Minimum distance of the aligning star in pattern radii. The direction to a closer star is inaccurate."""
+"""Minimum distance of the aligning star in pattern radii. The direction to a closer star would not align the
+pattern accurately."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -81,10 +81,9 @@ def momentum_plan(
 ) -> MomentumPlan:
     """Return the plan that reduces `momentum` (3,) N m s to `rest` N m s in minimum time.
 
-    `field` (n, 3) T is the predicted field at `times` (n,) s from now on, in the inertial axes of the
-    momentum, and `limit` is the limit of each coil in A m^2. If the prediction ends too early, the plan
-    removes as much momentum as possible until the end of the prediction. Raises UsageError for fewer than
-    three times.
+    The predicted field after `times` (n,), s, is `field` (n, 3), T, in the inertial axes of the momentum. The
+    dipole limit of each coil is `limit`, A m^2. If the prediction ends too early, the plan removes as much
+    momentum as possible until the end of the prediction. Raises UsageError for fewer than three times.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
@@ -122,10 +121,11 @@ def without_speed_up(
 ) -> FloatArray:
     """Return the dipole moment (3,) without the part whose torque increases the rate.
 
-    `rate` (3,) is the body rate (rad/s) and `inverse` (3, 3) the inverse inertia tensor in body axes. No
-    component of the result is larger than the same component of the given dipole moment.
+    The arguments `rate` (3,), rad/s, and `inverse` (3, 3) are the body rate and the inverse inertia tensor,
+    both in body axes. No component of the result is larger than the same component of the given dipole
+    moment.
     """
-    # `grows` is the derivative of d(|rate|^2 / 2)/dt with respect to the dipole moment.
+    # The vector `grows` is the derivative of d(|rate|^2 / 2)/dt with respect to the dipole moment.
     grows = cross_product(field, inverse @ rate)
     gained, square = float(dipole @ grows), float(grows @ grows)
     if gained <= 0.0 or square == 0.0:
@@ -138,8 +138,8 @@ def without_speed_up(
 def rotating_field(field: FloatArray, change: FloatArray, times: FloatArray) -> FloatArray:
     """Return the predicted field (n, 3), T, after `times` (n,), s, if the field rotates at its present rate.
 
-    `field` (3,) T and its time derivative `change` (3,) T/s are in inertial axes. The field strength is
-    assumed to be constant.
+    The field (3,), T, and the time derivative `change` (3,), T/s, of the field are in inertial axes. The
+    field strength is assumed to be constant.
     """
     strength = math.sqrt(float(field @ field))
     along = field / strength
@@ -276,8 +276,8 @@ class FieldDetumbler:
     ) -> None:
         """Create a detumbler whose rate filter has not started.
 
-        `expected` predicts the field (n, 3) T at the times `braking.instants` after a given time, in the body
-        axes of the given time. It returns None while attitude or orbit are unknown.
+        The function `expected` predicts the field (n, 3), T, at `braking.instants` after a given time, in the
+        body axes at that time. The function returns None while attitude or orbit are unknown.
         """
         self._schedule = schedule
         self._braking = braking
@@ -314,8 +314,8 @@ class FieldDetumbler:
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
         """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled.
 
-        `rate` (3,) rad/s is measured by a gyro at the same time. The sample may be older than the last
-        command.
+        The rate (3,), rad/s, is measured by a gyro at the same time as the field. The sample may be older
+        than the last command.
         """
         age_ns = self._time_ns - time_ns
         if not self.listens(time_ns) or age_ns > OLDEST_NS:

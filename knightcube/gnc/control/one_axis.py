@@ -130,8 +130,8 @@ class LqTracker:
 
         The gains follow from the Riccati equation (Sease, eqs. (5.28) to (5.32)). The error bound
         `largest_error` (rad) must be below pi/2. The current is zero while |cos(theta)| is below
-        `minimum_authority`. `as_in_thesis` switches off the disturbance feedforward and the limited
-        deceleration. Raises UsageError if a value is outside its range.
+        `minimum_authority`. The option `as_in_thesis` switches off the disturbance feedforward and the
+        limited deceleration. Raises UsageError if a value is outside its range.
         """
         for name, value in (("Q", state_weight), ("R", input_weight)):
             if not (math.isfinite(value) and value > 0.0):
@@ -192,9 +192,9 @@ class LqTracker:
 def lq_gains(state_weight: float, input_weight: float) -> tuple[float, float]:
     """Return the gains K_e' (1/s) and K_e (1/s^2) for Q = state_weight I and R = input_weight.
 
-    The plant e'' = v is a double integrator. Its Riccati equation (Sease, eqs. (5.28) to (5.32)) has the
-    solution K_e = sqrt(w) and K_e' = sqrt(w + 2 K_e) with w = Q / R. A general solver would take 0.2 s at the
-    start.
+    The plant e'' = v is a double integrator. The Riccati equation of this plant (Sease, eqs. (5.28) to
+    (5.32)) has the solution K_e = sqrt(w) and K_e' = sqrt(w + 2 K_e) with w = Q / R. A general solver would
+    take 0.2 s at the start.
     """
     weight = state_weight / input_weight
     error_gain = math.sqrt(weight)
@@ -282,8 +282,8 @@ class ExcitationController:
     ) -> CurrentCommand:
         """Return the command for an estimated angle (rad), rate (rad/s) and disturbance (rad/s^2).
 
-        `wanted` is the angle at which the body rests between manoeuvres. Raises UsageError if an input is not
-        finite.
+        The motion `wanted` contains the angle at which the body rests between manoeuvres. Raises UsageError
+        if an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
         if self._phase is _Phase.GIVEN_UP:

@@ -180,8 +180,8 @@ def slew_table(
 
     A step of this table is a fifth of a step of `begin.times`.
 
-    `residual` (3,) A m^2 is the residual dipole moment with which the path was planned. Only the environment
-    of `expected` is used, at the times of `begin`.
+    The path was planned with the residual dipole moment `residual` (3,), A m^2. Only the environment of
+    `expected` is used, at the times of `begin`.
     """
     step, first = float(begin.times[1] - begin.times[0]) / FINE, float(begin.times[0])
     law = law_of(target, axes, path.quaternion[-1], ahead, first + path.horizon)
@@ -290,7 +290,8 @@ does not depend on this duration."""
 class ObjectDirection:
     """The direction (3,) of an object, ICRS, at the time `since` (s after a job's origin).
 
-    `velocity` (3,) 1/s is the relative velocity divided by the distance; zero for a fixed direction.
+    The relative velocity of the object divided by the distance is `velocity` (3,), 1/s, and zero for a fixed
+    direction.
     """
 
     direction: FloatArray

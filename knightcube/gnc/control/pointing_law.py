@@ -79,9 +79,9 @@ class PointingLaw:
     ) -> PointingCommand:
         """Return the command at a time (s) for an estimated attitude (4,) and rate (3,) rad/s.
 
-        `field` (3,) T is in body axes. The estimated residual dipole moment `residual_dipole` (3,) A m^2 is
-        cancelled directly. The effects of disturbance torques of the estimated `sizes` (n,) are reduced as
-        far as the field allows.
+        The magnetic field `field` (3,), T, is in body axes. The estimated residual dipole moment
+        `residual_dipole` (3,) A m^2 is cancelled directly. The effects of disturbance torques of the
+        estimated `sizes` (n,) are reduced as far as the field allows.
         """
         wanted = self.reference(time)
         rotation = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
@@ -148,6 +148,6 @@ class PathRecovery:
 def damping_dipole(inertia: FloatArray, rate: FloatArray, field: FloatArray) -> FloatArray:
     """Return the dipole (3,) A m^2 that damps a rate (3,) rad/s in a field (3,) T, body axes.
 
-    `inertia` (3,) kg m^2 are the moments of inertia about the body axes.
+    The moments of inertia about the body axes are `inertia` (3,), kg m^2.
     """
     return np.asarray(cross_product(field, -2.0 * DAMPING * inertia * rate) / float(field @ field))

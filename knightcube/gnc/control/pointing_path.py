@@ -101,10 +101,10 @@ def linearised(
 ) -> LinearErrorModel:
     """Return the linear model of the errors relative to a reference motion.
 
-    `field` (n, 3) T and `position` (n, 3) m are in ICRS axes. The dipole moment `dipole` (n, 3), A m^2, is
-    fixed in body axes, so the torque of this dipole depends on the rotation error. Each element of `pressed`
-    is a torque by air or sunlight, as a vector (3,) in body axes (N m) and a direction (n, 3) in ICRS axes
-    whose cross product is the torque.
+    The magnetic field (n, 3), T, and the position (n, 3), m, are in ICRS axes. The dipole moment `dipole` (n,
+    3), A m^2, is fixed in body axes, so the torque of this dipole depends on the rotation error. Each element
+    of `pressed` is a torque by air or sunlight, as a vector (3,) in body axes (N m) and a direction (n, 3) in
+    ICRS axes whose cross product is the torque.
     """
     rate, inverse = references.rate, np.linalg.inv(inertia)
     slopes, shown, up = acceleration_slopes(
@@ -177,7 +177,7 @@ def sweep(
 def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the gravity gradient torque (n, 3) and its derivatives (n, 3, 3) by a rotation of the body.
 
-    `up` (n, 3) m is the position in body axes.
+    The position relative to the Earth's centre is `up` (n, 3), m, in body axes.
     """
     radius = np.linalg.norm(up, axis=1)
     down = -up / radius[:, None]

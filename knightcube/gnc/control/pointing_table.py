@@ -4,12 +4,12 @@ The motion is found by multiple shooting with linear-quadratic steps. Each step 
 improves a merit function, the cost plus the weighted defects (Nocedal & Wright 2006, Numerical Optimization,
 algorithm 18.3). In contrast to the sweeps of `pointing_path`, intermediate motions need not be feasible. The
 defect of a time step is the difference between the propagated state at the end of the step and the state at
-the next instant. The iterations remove all defects (Bock & Plitt 1984, IFAC 9th World Congress). Multiple
-shooting prevents errors from growing along a revolution. Errors could otherwise grow, because coils cause no
-torque about the field and the body may rotate far about the pointing axis. An iteration takes 0.07 ms per
-instant. The motion is propagated by the midpoint rule, and derivatives are computed of this discrete rule.
-With derivatives of the continuous motion, the iteration would stall for bodies that rotate by degrees per
-time step.
+the next instant. All defects vanish in the course of the iterations (Bock & Plitt 1984, IFAC 9th World
+Congress). Multiple shooting prevents errors from growing along a revolution. Errors could otherwise grow,
+because coils cause no torque about the field and the body may rotate far about the pointing axis. An
+iteration takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and derivatives are
+computed of this discrete rule. With derivatives of the continuous motion, the iteration would stall for
+bodies that rotate by degrees per time step.
 
 If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
 the module `pointing_path` instead. The cost of an error at the end of this path follows from a sweep along
@@ -168,10 +168,10 @@ def best_course(
 ) -> tuple[PlannedMotion, MotionGains] | None:
     """Return the best motion over all instants from the first state of `initial`, with feedback gains.
 
-    The initial guess `initial` (n + 1,) ends at the law and covers the part that will be flown. `state` (6,
-    6) and `dipole` are the costs of a step (`step_costs`). Returns None if no motion is found within `STEPS`
-    iterations or if the motion exceeds the limit of the coils. Returns None also if the body rotates faster
-    than `fastest` (rad/s) in the part that will be flown.
+    The initial guess `initial` (n + 1,) ends at the law and covers the part that will be flown. The weights
+    `state` (6, 6) of the errors and `dipole` of the dipole moment are computed by `step_costs`. Returns None
+    if no motion is found within `STEPS` iterations or if the motion exceeds the limit of the coils. The
+    result is also None if the body rotates faster than `fastest` (rad/s) in the part that will be flown.
     """
     count, first = len(expected.field) - 1, len(initial.times)
     quaternion = np.concatenate([initial.quaternion, expected.wanted.quaternion[first:]])
@@ -201,8 +201,8 @@ def best_course(
 class _Merit:
     """The merit function by which motions are compared: the cost plus the weighted defects.
 
-    `state` (6, 6) and `dipole` weight the errors and the dipole moment of a step. `dear` (6,) weights the
-    defects.
+    The weights `state` (6, 6) and `dipole` are for the errors and the dipole moment of a step. The weights
+    `dear` (6,) are for the defects of a step.
     """
 
     expected: PathConditions
@@ -388,8 +388,9 @@ def pointing_table(
 ) -> PointingTable:
     """Return the pointing table for the instants of `ahead.initial`.
 
-    `inertia` (3, 3) is in kg m^2, and `limit` is the dipole limit of each coil in A m^2. The preview after
-    the table should cover one revolution. Raises UsageError for times that are not equally spaced.
+    The inertia tensor `inertia` (3, 3) is in kg m^2, and `limit` is the dipole limit of each coil in A m^2.
+    The preview after the table should cover one revolution. Raises UsageError for times that are not equally
+    spaced.
     """
     steps = np.diff(ahead.wanted.times)
     count = len(ahead.initial.times) - 1

@@ -97,7 +97,10 @@ class ResidualDipole:
     """
 
     def __init__(self, inertia: FloatArray, bound: float) -> None:
-        """Create an observer for moments of inertia (3,) kg m^2; `bound` (A m^2) limits each component."""
+        """Create an observer for moments of inertia (3,) kg m^2.
+
+        Each component of the estimated dipole moment is limited to +-`bound`, A m^2.
+        """
         self._inertia, self._bound = inertia, bound
         self._rate: FloatArray | None = None
         self.dipole: FloatArray = np.zeros(3)
@@ -110,7 +113,8 @@ class ResidualDipole:
     def follow(self, seconds: float, rate: FloatArray, field: FloatArray, coils: FloatArray) -> None:
         """Accept a rate (3,) rad/s measured `seconds` after the previous rate.
 
-        `coils` (3,) A m^2 is the dipole moment of the coils in that interval, and `field` (3,) T the field.
+        In this interval the dipole moment of the coils was `coils` (3,), A m^2, and the magnetic field
+        `field` (3,), T.
         """
         square = float(field @ field)
         if self._rate is None or seconds > LONGEST_INTERVAL or square == 0.0:

@@ -65,7 +65,10 @@ class AcceptanceRules:
 
 @dataclass(frozen=True, slots=True)
 class PlanVerdict:
-    """Whether a plan was accepted; `reason` is the reason for a rejection and empty otherwise."""
+    """Whether a plan was accepted.
+
+    The text `reason` is the reason for a rejection, and empty for an accepted plan.
+    """
 
     accepted: bool
     reason: str = ""

@@ -374,8 +374,7 @@ class PolynomialPath:
         if elapsed >= self.horizon:
             return self._coast(elapsed - self.horizon)
         s = 2.0 * max(elapsed, 0.0) / self.horizon - 1.0
-        # Clenshaw's recurrence is computed with floats, which are faster than numpy arrays of twenty
-        # elements.
+        # Clenshaw's recurrence uses Python floats, which are faster than numpy arrays of twenty elements.
         twice = 2.0 * s
         a1 = a2 = b1 = b2 = c1 = c2 = 0.0
         for a, b, c in self.series[:-1]:

@@ -6,10 +6,10 @@ horizon (duration) keeps the limits, the horizon is stretched to the shortest fe
 has the status STRETCHED. With a time cost, the horizon is optimised as well. Energy is the integral of R I^2
 in J, without the factor 1/2 of Sease, eq. (5.1).
 
-All three searches for a horizon minimise energy plus a time cost between a shortest and a longest horizon. If
-the time cost is far above the power of the coil and the requested horizon is the lower bound, the solution
-has the requested horizon if this horizon is feasible, and otherwise the shortest feasible horizon. No
-infeasible nonlinear program therefore has to be solved.
+All three searches for a horizon minimise energy plus a time cost between a shortest and a longest horizon. A
+time cost far above the power of the coil, with the requested horizon as lower bound, gives the requested
+horizon if it is feasible, and otherwise the shortest feasible horizon. No infeasible nonlinear program
+therefore has to be solved.
 
 The planner is deterministic, so that the same arguments give the same plan in any process.
 """
@@ -82,7 +82,7 @@ class HorizonSearch:
     Attributes:
         program_at: function that returns the nonlinear program for a horizon, s.
         warm: difference (N,) on the nodes between an earlier path and the prey path of the earlier problem,
-            for a warm start; None to start from the prey path.
+            for a warm start, or None for a start from the prey path.
         evaluations: number of evaluations of the cost so far.
     """
 
@@ -272,7 +272,7 @@ class StepPlan:
         status: whether the requested horizon was kept or stretched to the shortest feasible horizon.
         horizon_asked, horizon: requested and planned duration, s; equal with a time cost.
         energy: integral of R I^2 along the path, J.
-        supplied: integral of V |I| along the path, J.
+        supplied: energy taken from the supply, which is the integral of V |I| along the path, J.
         peak_current: largest absolute coil current along the path, A.
         evaluations: number of evaluations of the cost.
         target_q2: q2 at the end.
@@ -318,15 +318,15 @@ def plan(
 ) -> StepPlan:
     """Return the minimum-energy path between two states in `horizon` s, or in the shortest feasible time.
 
-    Rates are body rates in rad/s. `reference` is the reference point q_r of Sease, eq. (5.10), which must lie
-    beyond the range of q2. `q2_limit` is the upper bound of |q2|. The horizon is stretched to at most
-    `max_stretch` times the requested horizon. A stretched horizon is about 0.3 % longer than the shortest
-    feasible horizon on `nodes` nodes, and at most 1.5 % longer than the bang-bang time.
+    Rates are body rates in rad/s. The argument `reference` is the reference point q_r of Sease, eq. (5.10),
+    which must lie beyond the range of q2, and `q2_limit` is the upper bound of |q2|. The horizon is stretched
+    to at most `max_stretch` times the requested horizon. A stretched horizon is about 0.3 % longer than the
+    shortest feasible horizon on `nodes` nodes, and at most 1.5 % longer than the bang-bang time.
 
     With `time_cost` in W the path minimises energy plus time cost, over horizons from SHORTEST_WITH_TIME_COST
     s to `max_stretch` times `horizon`; `horizon` is then the initial guess. The path followed until now is
     `last`, with an origin relative to the start of the new path. The remainder of this path is the initial
-    guess. `cost` selects the energy that is minimised.
+    guess. The argument `cost` selects which energy is minimised.
 
     Raises PlanningError if an argument is not finite or outside its limits, or if no allowed horizon is
     feasible.

@@ -369,7 +369,7 @@ class PathProgram:
         if converged:
             return trial
         # If the start is the optimum, NLopt reports that rounding limits progress, which is not a failure.
-        # At the optimum, the energy that can still be saved, half the squared whitened gradient, is small.
+        # At an optimum, half the squared whitened gradient, which estimates the possible saving, is small.
         _, gradient, _ = self.energy(trial)
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 

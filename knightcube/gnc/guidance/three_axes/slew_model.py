@@ -269,7 +269,7 @@ class HermiteCubic:
         return np.asarray(mean + (1.0 - s) * (1.0 - 3.0 * s) * out + s * (3.0 * s - 2.0) * into)
 
     def _parts(self, times: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the span of each time: fraction passed, length, start value, step and slopes."""
+        """Return the passed fraction of the span of each time, and the span's length, values and slopes."""
         at = np.asarray(times, dtype=float)
         before = np.clip(np.searchsorted(self.times, at, side="right") - 1, 0, len(self.times) - 2)
         span = (self.times[before + 1] - self.times[before])[:, None]

@@ -543,8 +543,7 @@ class SlewProgram:
             change = size * step.change
             for correction in range(_CORRECTIONS + 1 if attempt < _CORRECTED else 1):
                 if correction:
-                    # The second-order correction removes residuals due to curvature with the factored Newton
-                    # matrix.
+                    # The second-order correction reduces the residuals that remain because of curvature.
                     back = np.zeros(len(change))
                     back[equal] = (1.0 - size) * missed - left
                     change = change + step.factors.solve(back)
