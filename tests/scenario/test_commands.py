@@ -61,7 +61,7 @@ def test_rubbish_and_repetitions_are_refused_with_the_reason_and_change_nothing(
     assert "no command begins with" in reasons[0]
     assert "CRC" in reasons[1]
     assert "0 bytes are too short for a packet" in reasons[2]
-    assert "has come before" in reasons[4]
+    assert "an identical packet was received before" in reasons[4]
     assert modes_of(run)[2:] == [Mode.HOLD]
     assert len(channel.answers) == 2, "only commands are answered"
     assert "command-socket" in event_names(run)
