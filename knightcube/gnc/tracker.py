@@ -3,10 +3,10 @@
 The filter uses measured directions only, without ranges. The filter state consists of the relative position y
 (a unit vector) and the relative velocity z, both divided by the present range. Without forces z is constant
 and y moves on a straight line. The motion is therefore linear at any angular rate, and only the measurement
-is nonlinear. After each step the state is divided by the length of y, so that y is a unit vector again. This
-is the vector form of the modified polar coordinates of Aidala and Hammel (1983, IEEE Transactions on
-Automatic Control 28). The component of z across the line of sight is the angular rate v. The component of z
-along the line of sight is s = (range rate) / range. The angular acceleration is -2 s v.
+is nonlinear. After each step the state is divided by the length of y, so that y is a unit vector again. The
+filter state is the vector form of the modified polar coordinates of Aidala and Hammel (1983, IEEE
+Transactions on Automatic Control 28). The component of z across the line of sight is the angular rate v. The
+component of z along the line of sight is s = (range rate) / range. The angular acceleration is -2 s v.
 
 Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
 gradient gives the relative acceleration of object and observer, to first order in the distance divided by the

@@ -69,11 +69,13 @@ class LinearErrorModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepCost:
-    """The step costs x^T state x / 2 + state_slope^T x + control u^2 / 2 + control_slope^T u of n steps.
+    """The costs of n steps: x^T state x / 2 + state_slope^T x + control u^2 / 2 + control_slope^T u.
+
+    The vector x contains the attitude and rate errors, and u the controls.
 
     Attributes:
-        state: (n, 6, 6).
-        control: (n, controls).
+        state: quadratic weights (n, 6, 6) of the errors.
+        control: quadratic weights (n, controls) of the controls.
         state_slope, control_slope: linear weights (n, 6, columns) and (n, controls, columns).
     """
 
@@ -204,17 +206,17 @@ RISES = (4.0, 2.0, 10.0)
 """Ratios between successive costs of a torque along the field. The ratios are tried in turn until a path
 settles, because different ratios lead to different optima."""
 DEAR, PROHIBITIVE = 1e4, 1e6
-"""Costs of a torque along the field, relative to the cost of the same torque across the field. The increase
-of the cost ends at DEAR, and the last sweeps use the cost PROHIBITIVE."""
+"""Costs of a torque along the field, relative to the cost of the same torque across the field. The cost is
+increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
 SETTLED = math.radians(20.0)
 """Angle (rad) between the attitude of the body and the attitude law that a settled path does not exceed in
 the second half."""
 SWEEPS = 8
-"""Largest number of sweeps at one cost of a torque along the field. The best motion is used even if the
-sweeps have not converged."""
+"""Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. The
+best motion is used even if the sweeps have not converged."""
 SAVED = (0.05, 2e-3)
-"""Relative improvement below which the sweeps at one cost of a torque along the field end. The second value
-is used at the last (largest) cost of this torque."""
+"""Relative improvement by a sweep below which the cost of a torque along the field is increased, and relative
+improvement below which the sweeps at the largest cost end."""
 NEAR = math.radians(10.0)
 """Angle (rad) from the attitude law up to which the first sweeps do not need a torque along the field."""
 EXCESS = 3e-5

@@ -274,7 +274,7 @@ are computed by central differences."""
 WINDOW_RANGE = (0.0, 2e4)
 """Permitted range of the window of start times, s."""
 _BEGINS = 12
-"""Number of equal parts of a window of start times, at whose ends slews are planned and compared."""
+"""Number of equal intervals between the compared start times in a window."""
 _COARSE = 12
 """Number of collocation intervals of the coarse plans by which start times are compared."""
 _NO_ROLL: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
