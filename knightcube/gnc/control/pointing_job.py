@@ -119,7 +119,7 @@ def slew(
     ahead: Ephemeris,
     fastest: float,
 ) -> SlewPath | None:
-    """Return a slew into the attitude law of a target that is slower than `fastest` rad/s, or None.
+    """Return a slew, slower than `fastest` rad/s, into the attitude law of a target, or None.
 
     The slew avoids the exclusion cones, unless the body is already inside a cone or no such slew is found.
     """
@@ -283,7 +283,7 @@ FAR = math.radians(15.0)
 """Angle (rad) from the attitude law above which the body slews to the law, if slews are configured."""
 WAY = 4.0
 """Duration of the initial guess of the approach, in time constants of the pointing law. The optimised path
-does not depend on this duration."""
+does not depend on the duration of the initial guess."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -342,7 +342,7 @@ def prepare() -> None:
 
 
 def run(job: PointingJob) -> PointingTable:
-    """Return the table, whose times are in seconds after the job's origin.
+    """Return the pointing table, whose times are in s after the origin of the job.
 
     The computation takes about one second, or two seconds with a slew. Raises FlightError if the magnetic
     field is unknown, and UsageError if the law does not define an attitude.

@@ -193,7 +193,7 @@ def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArr
 def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
     """Return the transition matrices exp(F dt) (n, 6, 6) and the rate columns (n, 6, 3) of their integrals.
 
-    Both are computed to third order in dt.
+    Transition matrices and integrals are computed to third order in dt.
     """
     first = flow * dt
     second = first @ first

@@ -1,12 +1,12 @@
 """The search for the path of a slew, from guesses on a coarse grid to a path on a fine grid.
 
 An initial guess is a curve of the angular momentum over time. Coils cause no torque along the magnetic field,
-so the derivative of the inertial angular momentum is always normal to the field. This condition is linear, so
-every momentum curve that reaches the end is the sum of a fixed curve and weighted modes. The attitude follows
-from the momentum by integration. A least-squares fit of about a dozen mode amplitudes finds curves that end
-at the target, stay outside the cones and need little heat. The fit is started from many random amplitudes at
-once. Gravity gradient and other disturbance torques are neglected in the guesses. The random starts are the
-same in every call.
+so the derivative of the inertial angular momentum is always normal to the field. This constraint on the
+torque is linear, so every momentum curve that reaches the end is the sum of a fixed curve and weighted modes.
+The attitude follows from the momentum by integration. A least-squares fit of about a dozen mode amplitudes
+finds curves that end at the target, stay outside the cones and need little heat. The fit is started from many
+random amplitudes at once. Gravity gradient and other disturbance torques are neglected in the guesses. The
+random starts are the same in every call.
 
 Without the dipole limit, most guesses converge in a dozen Newton steps to a path outside the exclusion cones
 (a relaxed path). The heat of a relaxed path is a lower bound of the heat of a path within the dipole limit. A
@@ -224,7 +224,7 @@ _END, _CONE, _HEAT = 4.0, 2.0, 0.05
 """Weights in the momentum fit: of the end error (per rad), of the depth inside a cone (per unit of cosine),
 and of the mode amplitudes."""
 _ROOM = 0.03
-"""Margin of a guess to an exclusion cone, as a difference of cosines."""
+"""Margin between a guess and an exclusion cone, as a difference of cosines."""
 _DAMPED = 1.0
 _LONGEST_STEP = 4.0
 """Largest step of the mode amplitudes in an iteration of the momentum fit."""
