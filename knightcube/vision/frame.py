@@ -250,8 +250,9 @@ the noise, and a maximum fraction of the hot pixel.
 _PAIR, _PAIR_NOISE = 20.0, 1.0
 """Limits (standard deviations) for the recognition of two adjacent hot pixels.
 
-The first of these limits is the minimum brightness of both pixels. The second of these limits is the number
-of standard deviations by which noise may raise the third brightest pixel.
+For two adjacent hot pixels, the first limit is the minimum brightness of both pixels. For two adjacent hot
+pixels, the second limit is the number of standard deviations by which noise may raise the third brightest
+pixel.
 """
 _REPAIR_SIGMAS, _HOT_SIGMAS = 10.0, 8.0
 """Minimum brightness (standard deviations) of hot pixels that are replaced, and of those excluded."""

@@ -458,7 +458,7 @@ class OmittedTerm:
     Attributes:
         values: last fitted values: one for k1 and k2, or x and y for the centre.
         sigmas: standard deviations of the fitted values.
-        assumed: values of this term in the calibrated lens, instead of the fitted values.
+        assumed: values of the lens term in the calibrated lens, instead of the fitted values.
     """
 
     values: tuple[float, ...]
@@ -631,9 +631,9 @@ def calibrate_lens(
 ) -> LensCalibration:
     """Return the lens of a camera from images of the night sky: focal length, axis and radial distortion.
 
-    All images must be taken by one camera at one focus setting. Images that do not fit the common lens are
-    excluded. Ten images with stars in the corners give a better calibration than a hundred without. Lens
-    terms that the stars do not determine are omitted.
+    All images must be taken by one camera at one focus setting. Images that do not fit the lens of the other
+    images are excluded. Ten images with stars in the corners give a better calibration than a hundred
+    without. Lens terms that the stars do not determine are omitted.
 
     Args:
         images: arrays (rows, columns) of counts, all of one shape.

@@ -6,8 +6,8 @@ string's normal, and zero if the Sun is behind the string. The Earth also illumi
 most a third as strongly as the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of the light
 from the half of the sky that is centred on nadir e. Light from the Earth correlates the errors of the
 strings. The correlation of the errors can be computed if nadir is known; otherwise the mean correlation over
-all nadir directions is used. The covariance of the Sun direction includes this correlation by light from the
-Earth.
+all nadir directions is used. The covariance of the Sun direction includes the correlation of the strings'
+errors by light from the Earth.
 
 The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if any
 one string fails in any way. The magnetic field does not determine the rotation about the field direction. All

@@ -316,7 +316,7 @@ def _disc(
         aside = float(np.linalg.norm(circle.centre))
         if aside > settings.greatest_radius:
             return None
-        # The tracing is not repeated if the radius of the disc is wrong.
+        # The rim is not traced again if the radius of the disc is wrong.
         wrong = not 0.5 * settings.least_radius < circle.radius < 2.0 * settings.greatest_radius
         if wrong or aside * disc.pixels_per_radian < _NEAR:
             break
@@ -444,7 +444,7 @@ class Circle:
 
 
 def fit_circle(points: FloatArray, scale: float) -> Circle | None:
-    """Return the circle through `points` (n, 2), which are in order around it; None if there is none.
+    """Return the circle through rim `points` (n, 2), which are in order around it; None if there is none.
 
     The argument `scale` is the standard deviation of a good point, in the unit of the points.
     """
@@ -605,7 +605,7 @@ def sun_of_cameras(
         settings: settings of the search for the Sun.
 
     Raises:
-        ValueError: for the same reasons as `find_sun`.
+        ValueError: if an image does not have the size of its camera, or has non-finite pixels.
     """
     order = cameras_by_sun(strings, cameras)
     each: dict[int, SunSolution] = {}

@@ -76,7 +76,7 @@ class ScanLines:
 
     Attributes:
         columns, rows: indices of the columns and of the rows.
-        column_bright, row_bright: whether each pixel of these columns and of these rows is bright after the
+        column_bright, row_bright: whether each pixel of the columns and of the rows is bright after the
             majority filter (n, m).
         space: distance between neighbouring columns, and between neighbouring rows, px.
         levels: brightness levels of dark and bright pixels.
@@ -146,7 +146,7 @@ def find_edges(
 ) -> tuple[ScanEdges, ScanLines]:
     """Return edges on evenly spaced columns and rows of an image (rows, columns), and the lines searched.
 
-    If `part` is given, only lines that cross this part of the image are searched.
+    If a `part` of the image is given, only scan lines that cross this part are searched.
     """
     places = []
     for axis, size in enumerate((image.shape[1], image.shape[0])):

@@ -195,7 +195,7 @@ def log10_chance(
         pieces = min(lines, limb.length / (2.0 * math.sqrt(2.0 * gate * _ROUND * size)))
         chance = min(2.0 * gate * density, 0.5)
         cones = math.log10(len(_GATES)) + unknowns * math.log10(size / gate)
-        # Chernoff's bound (log10) of the probability that chance edges hit this many segments is `tail`.
+        # Chernoff's bound (log10) of the probability that chance edges hit the fraction `share` of segments.
         tail = 0.0
         if share > chance:
             rest = 0.0 if share >= 1.0 else (1.0 - share) * math.log((1.0 - share) / (1.0 - chance))

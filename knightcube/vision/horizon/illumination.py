@@ -15,8 +15,8 @@ directions. If the direction of the Sun is unknown, any sample on the Earth's di
 The function `why_false` compares an image with the view from a known attitude. An image contradicts the
 attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be. An
 image that contradicts the attitude is taken by a camera that is dead, blinded, mounted upside down or sends
-random data. The surroundings of the limb, the twilight zone and the surroundings of the Sun are excluded from
-this comparison.
+random data. The comparison excludes the surroundings of the limb, the twilight zone and the surroundings of
+the Sun.
 """
 
 from __future__ import annotations

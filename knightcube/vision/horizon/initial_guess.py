@@ -10,9 +10,10 @@ clouds gives a separate cone. The search is a sample consensus (Fischler & Bolle
 selection.
 
 A horizon does not determine the rotation about nadir. The rotation about nadir is needed because the Earth's
-flattening depends on the direction of the pole, and the illumination depends on the direction of the Sun. A
-rough attitude, the coarse direction of the Sun or the magnetic field gives this rotation. The angles between
-nadir and these known directions are also known, so that a nadir at a different angle is rejected.
+flattening depends on the direction of the pole, and the illumination depends on the direction of the Sun. The
+rotation about nadir is derived from a rough attitude, the coarse direction of the Sun or the magnetic field.
+The angles between nadir and these known directions are also known, so that a nadir at a different angle is
+rejected.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def left_free(edges: EdgeRays, free: BoolArray, cone: ConeCandidate, tolerance: 
 
 @lru_cache(maxsize=64)
 def _pairs(count: int, tries: int) -> tuple[IntArray, IntArray]:
-    """Return the indices of all pairs of `count` items, or of `tries` of them, evenly selected."""
+    """Return the indices of all pairs of `count` items, or of at most `tries` evenly selected pairs."""
     first, second = np.triu_indices(count, 1)
     if len(first) > tries:
         chosen = np.linspace(0, len(first) - 1, tries).astype(int)

@@ -141,7 +141,7 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 # Distance of the rotation centre from the boresight, in focal lengths, above which the centre is not used.
-# The distance of the centre is computed from the rotation axis, because errors move a fitted centre nearer.
+# The centre's distance is computed from the rotation axis, because errors move a fitted centre nearer.
 _FARTHEST_CENTRE = 3.0
 
 

@@ -155,7 +155,7 @@ def _fit_object(
         misfit = float(np.sum(weight * off**2)) / spare
         if np.abs(step[:2]).max() < _CONVERGED:
             break
-    # The covariance is increased only if chi-square exceeds its mean by three standard deviations.
+    # The covariance of an object's fit is increased only if chi-square exceeds its mean by three sigma.
     excess = misfit if misfit > 1.0 + 3.0 * (2.0 / spare) ** 0.5 else 1.0
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64) * excess
     away = np.abs(unknowns[:2] - middle).max()

@@ -78,8 +78,9 @@ class ObjectSettings:
         most_streaks: maximum number of regions that are examined as streaks.
         most_points: maximum number of short regions that are examined as points.
         most_merged: maximum number of regions that are searched again after their stars are removed.
-        least_share: minimum flux of an object found beside stars, as a fraction of the flux of the region. A
-            rotation error of 2 % leaves this fraction of the flux of a bright star at the end of its streak.
+        least_share: minimum flux of an object found beside stars, as a fraction of the flux of the region.
+            The default is the fraction that remains at the end of a bright star's streak if the rotation has
+            an error of 2 %.
         most_corners: number of corners (peaks of the Harris response) above which a region is not examined.
         point_significance: minimum flux of a short region, in standard deviations.
         improvement: minimum decrease of chi-square when an object is added to a model of stars.

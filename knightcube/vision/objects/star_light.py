@@ -2,7 +2,7 @@
 
 The test compares two hypotheses by chi-square: that the light of the region comes from stars only, or from
 stars and one object. Stars and object are modelled as streaks of constant brightness with the camera's point
-spread function (PSF). Stars follow the paths that the camera's rotation determines. The object moves
+spread function (PSF). Stars follow the paths that are determined by the camera's rotation. The object moves
 uniformly from one end of its streak to the other, on a line that is straight either in the image or relative
 to the stars. The straight line in the image and that relative to the stars differ if the camera rotates about
 the boresight. The brightnesses of stars and object are fitted by non-negative least squares. Two stars whose
@@ -10,11 +10,12 @@ streaks overlap or touch, and a segment of a faint star's streak, are explained 
 the path of any star, or that ends where a star would continue, is not explained by stars.
 
 A star's streak has the same brightness from end to end. Therefore the brightness of a star is at most the
-minimum brightness of the image along the star's path. An erosion of the image with the path as structuring
-element gives this minimum for every position of the star. Objects that cross the streaks of stars, and points
-on these streaks, nearly vanish in the eroded image. In a region, stars are subtracted one by one, the
-brightest first. The positions and brightnesses of all stars found are fitted together, without pixels that
-are brighter than these stars. The brightest remaining light is then fitted as a point or a line.
+minimum brightness of the image along the star's path. An erosion of the image, with the path as structuring
+element, gives the minimum brightness along the path for every position of the star. Objects that cross the
+streaks of stars, and points on these streaks, nearly vanish in the eroded image. In a region, stars are
+subtracted one by one, the brightest first. The positions and brightnesses of all stars found are fitted
+together, without pixels that are brighter than these stars. The brightest remaining light is then fitted as a
+point or a line.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class Explanation:
 class StarLight:
     """The pixels around one bright region, and the star streaks that best explain these pixels.
 
-    The pixels used are those near any trial star path or near any line between two corners of the region. The
+    Only pixels near a trial star path, or near a line between two corners of the region, are used. The
     corners of a region are the peaks of the corner detector. A trial star path begins or ends at a corner of
     the region, or passes the midpoint of all its corners.
 
@@ -212,7 +213,7 @@ def at_mid_exposure(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> list[FloatArray]:
-    """Return trial star paths: those that begin or end at each corner, and those along the whole region."""
+    """Return trial star paths: paths that begin or end at a corner, and paths along the whole region."""
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     extent = float(np.linalg.norm(np.ptp(corners, axis=0)))
     one = star_path(pinhole.unit_vectors(middle[None])[0], rotation, 0.5, pinhole)
@@ -286,7 +287,7 @@ def spread_with_slopes(
 def _within_pixels(count: int, centres: FloatArray, sigma: float, slope: bool = False) -> FloatArray:
     """Return integrals of normal densities centred on `centres` (m,), px, over `count` pixels, as (m, count).
 
-    If `slope` is true, the derivatives of these integrals with respect to the centres, 1/px, are returned
+    If `slope` is true, the derivatives of the integrals with respect to the centres, 1/px, are returned
     instead.
     """
     reach = int(np.ceil(_FARTHEST * sigma))
@@ -452,7 +453,7 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
 
     Args:
         patch: rectangle of the frame around the examined region.
-        left: counts of this rectangle after its stars are subtracted (rows, columns).
+        left: counts of the rectangle after its stars are subtracted (rows, columns).
     """
     lit = np.maximum(patch.signal, 0.0)
     error = np.hypot(patch.smoothed_noise, SHAPE_ERROR * patch.smoothed(lit))

@@ -8,7 +8,8 @@ intensity. The equations are those of Sease, with the corrections of the errata 
 and (3.18). Images have the shape (rows, columns), and points are (x, y) in px.
 
 The Gaussian kernels displace the peaks of the Harris response along the streak by a constant that depends on
-the point spread function. The function `extend` compensates this displacement of the measured streak ends.
+the point spread function. The function `extend` compensates the displacement of measured streak ends by the
+corner detector.
 """
 
 from __future__ import annotations
@@ -255,8 +256,8 @@ def tensor_of(image: FloatArray, settings: EndpointSettings) -> StructureTensor:
 def structure_tensor(image: Image, derivative_sigma: float, window_sigma: float) -> StructureTensor:
     """Return the structure tensor: gradient products summed under a Gaussian window of `window_sigma` px.
 
-    Source: Sease, eq. (3.5), with the Gaussian window that the printed equation lacks. Without this window,
-    the structure tensor has rank 1 and one eigenvalue is zero.
+    Source: Sease, eq. (3.5), with the Gaussian window that the printed equation lacks. Without the Gaussian
+    window, the structure tensor has rank 1 and one eigenvalue is zero.
     """
     gx, gy = gradient(image, derivative_sigma)
     window = gaussian_kernel(window_sigma, kernel_radius(window_sigma))
@@ -296,8 +297,8 @@ def gaussian_kernel(sigma: float, radius: int) -> FloatArray:
 def gaussian_derivative_kernel(sigma: float, radius: int) -> FloatArray:
     """Return the correlation kernel (2 radius + 1,) of the derivative of an image smoothed by `sigma` px.
 
-    The outer product of this kernel and `gaussian_kernel` is the kernel of Sease, eq. (3.4), mirrored from
-    convolution to correlation.
+    The outer product of the returned kernel and `gaussian_kernel` is the kernel of Sease, eq. (3.4), mirrored
+    from convolution to correlation.
     """
     x = np.arange(-radius, radius + 1)
     return np.asarray(x / sigma**2 * gaussian_kernel(sigma, radius))

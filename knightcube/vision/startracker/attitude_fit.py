@@ -122,7 +122,7 @@ _CROSS = np.array(
 _SETTLED = 1e-4
 _MOST_STEPS = 6
 # Minimum reciprocal condition number of the normal equations.
-# The condition number reaches this minimum if all stars lie within 1e-6 rad of one direction.
+# The reciprocal condition number reaches its minimum if all stars lie within 1e-6 rad of one direction.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -182,8 +182,8 @@ def inflation(squares: FloatArray, parameters: float) -> float:
     """Return the factor by which variances must be increased to agree with the residuals of a fit.
 
     Each of the values `squares` (n,) is the chi-square of one star, which has two components. The sum of the
-    squares has a chi-square distribution with 2n - `parameters` degrees of freedom. The factor is 1 if this
-    sum exceeds its mean by less than three standard deviations.
+    squares has a chi-square distribution with 2n - `parameters` degrees of freedom. The returned factor is 1
+    if the sum of the squares exceeds its mean by less than three standard deviations.
     """
     freedom = 2 * len(squares) - parameters
     if freedom <= 0:
@@ -231,7 +231,7 @@ def refine(
             return None
         step = -(covariance @ (residual @ flat))
         longest = float(np.abs(step).max())
-        # The largest element of the matrix times that of its inverse approximates the condition number.
+        # The largest element of a matrix times the largest of its inverse approximates the condition number.
         condition = float(normal.max()) * float(covariance.max()) * _LEAST_INFORMATION
         if not 0.0 < condition < 1.0 or not longest < 1.0:
             return None

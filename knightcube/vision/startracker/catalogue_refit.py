@@ -265,7 +265,7 @@ def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known
 
 
 def _without(camera: FitProblem, hidden: StreakScene) -> ReducedFrame:
-    """Return the frame without the light of `hidden` stars, whose uncertainty is added to the noise."""
+    """Return the frame after `hidden` stars are subtracted and their uncertainty is added to the noise."""
     frame = camera.frame
     if not len(hidden.light):
         return frame

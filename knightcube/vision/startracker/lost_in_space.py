@@ -5,9 +5,9 @@ guide stars. Each match of an observed triangle with a triangle of the index vot
 observed star and a guide star. Correct pairs occur in many triangles, and chance pairs in only one. The
 matches with the most votes are verified against the whole field until one match is accepted. If no match is
 accepted, triangles of all observed stars, and not only of the brightest, are looked up. Even if most observed
-points are not stars, enough of a thousand such triangles consist of true stars. If no match is accepted, the
-mirrored field is tried. Finally, image scales outside the given range are tried if this range is narrow,
-because it may be wrong.
+points are not stars, enough of a thousand triangles of all points consist of true stars. If no match is
+accepted, the mirrored field is tried. Finally, image scales outside the given range are tried if this range
+is narrow, because it may be wrong.
 
 The shape of a triangle on the sphere depends slightly on the scale of the image. A wide range of image scales
 is divided into steps that are so narrow that the side ratios stay within the tolerance.
@@ -269,7 +269,7 @@ def look_up(
 def _places(
     ratio: FloatArray, slack: FloatArray, cells: IntArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest position within a cell that agrees with each side ratio, and the number of others.
+    """Return the lowest position within a cell that agrees with each ratio, and the number of further ones.
 
     A position agrees with a side ratio if they differ by at most `slack`.
     """
@@ -448,7 +448,7 @@ def _candidates(
 def _frame(corners: FloatArray) -> FloatArray:
     """Return the axes, as rows (3, 3), of a coordinate frame fixed to a triangle of unit vectors (3, 3).
 
-    The first axis of this frame points to the centre of the triangle.
+    The first axis of the coordinate frame points to the centre of the triangle.
     """
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners.tolist()
     mx, my, mz = ax + bx + cx, ay + by + cy, az + bz + cz

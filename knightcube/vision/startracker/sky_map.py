@@ -66,8 +66,8 @@ def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
     """Return the reciprocal prior variances (6,) of the lens errors of a lens of known accuracy.
 
     For an exact lens, an empty array (0,) is returned. An error of the optical axis in the image acts as a
-    tilt of the lens. The rotation that is common to all stars in this error counts as an error of the
-    camera's mounting, not of the lens.
+    tilt of the lens. The common rotation of all stars by an error of the optical axis counts as an error of
+    the camera's mounting, not of the lens.
     """
     if lens.centre == lens.distortion == 0.0:
         return np.zeros(0)

@@ -171,7 +171,8 @@ def timing_covariance(motion: MotionResult) -> FloatArray:
 
     If the rate changes, only the brightness along a streak determines the star's position at mid-exposure. An
     error of the acceleration displaces all stars along their paths by the same time, an error that does not
-    average out over the stars. The uncertainty of the most accurate star along its path bounds this error.
+    average out over the stars. The error that all streaks share is at most the uncertainty of the most
+    accurate star along its path.
     """
     if motion.acceleration is None or motion.rate is None:
         return np.zeros((3, 3))
@@ -194,8 +195,8 @@ _SHAPE_DOUBT = 0.05
 # The first attempt to identify the stars assumes smaller errors, so that fewer stars agree by chance.
 _UNCALIBRATED_SIGMA_PX = 0.3
 # Attitude error (px) from an uncalibrated lens and from refraction that remains after the fit of the lens.
-# For the rotation about the boresight, this attitude error is measured in px at the image edge.
-# This attitude error is the difference between the attitudes of one photograph from different solvers.
+# For the rotation about the boresight, an attitude error in px is measured at the image edge.
+# The value is the difference between the attitudes of one photograph from different solvers.
 _UNCALIBRATED_LENS_PX = 0.25
 # Minimum flux of a streak used for identification, in standard deviations of the flux.
 _LEAST_SIGNIFICANCE = 5.0
@@ -501,7 +502,7 @@ def _with_attitude(
     if found.from_lens is not None:
         fix = replace(fix, covariance=fix.covariance + found.from_lens)
     if free_lens:
-        # The errors of an uncalibrated lens add this covariance to the attitude.
+        # An uncalibrated lens adds the attitude error `_UNCALIBRATED_LENS_PX` to the covariance.
         across, about = 1.0 / camera.focal_length, 2.0 / max(camera.columns, camera.rows)
         floor = np.diag((_UNCALIBRATED_LENS_PX * np.array([across, across, about])) ** 2)
         fix = replace(fix, covariance=fix.covariance + floor)

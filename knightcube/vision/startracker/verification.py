@@ -3,10 +3,10 @@
 The guide stars predicted in the field are compared with the observed stars. Attitude and scale are refined
 with the matched stars, and the comparison is repeated until the set of matched stars no longer changes. The
 significance of a match is an upper bound of the expected number of attitudes, among the searched attitudes,
-at which random stars would match at least as well. If this bound is far below one, it is also an upper bound
-of the probability of a false match. The bound of chance matches does not depend on how a candidate attitude
-was found. The bound is multiplied by the number of alternatives among which gate, brightness limit and test
-are chosen (Bonferroni).
+at which random stars would match at least as well. If the expected number of chance matches is far below one,
+it is also an upper bound of the probability of a false match. The bound of chance matches does not depend on
+how a candidate attitude was found. The bound is multiplied by the number of alternatives among which gate,
+brightness limit and test are chosen (Bonferroni).
 
 `track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error displaces
 all predicted stars by nearly the same vector. Pairs of an observed and a predicted star are formed if their
@@ -51,7 +51,7 @@ class Chance:
     Attributes:
         observed: number of observed stars.
         spread: variance of a star's direction along one axis, divided by the solid angle of the field.
-        fields: area of the searched part of the sky, divided by the area of the field.
+        fields: solid angle of the searched part of the sky, divided by the solid angle of the field.
         scales: natural logarithm of the ratio of the highest to the lowest image scale.
         choices: number of gate widths among which the matching selects.
         least: minimum number of matched stars for an identification.
@@ -95,11 +95,11 @@ class Chance:
         """Return log10 of the expected number of chance matches of at least `matched` of `expected` stars.
 
         The first matched star may be any star of the sky. The second matched star lies in a ring around the
-        first star. The radius of this ring is the distance of the two stars, and its width follows from the
-        range of the scale and from the gate. Every further matched star lies within the gate of an expected
-        star. The probability is multiplied by the number of selections of the matched stars from the observed
-        stars. Because the fit reduces the distances of the matched stars, the distance of each star is
-        increased by the factor 1/(1 - leverage).
+        first star. The radius of the ring is the distance of the first two matched stars, and its width
+        follows from the range of the scale and from the gate. Every further matched star lies within the gate
+        of an expected star. The probability is multiplied by the number of selections of the matched stars
+        from the observed stars. Because the fit reduces the distances of the matched stars, the distance of
+        each star is increased by the factor 1/(1 - leverage).
         """
         leverage = 2.0 / matched if matched > 2 else 0.5
         chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)

@@ -436,7 +436,7 @@ def _rolling_result(
         return None
     known = [found for found in both if found.result.rate is not None]
     if len(known) < 2:
-        # If the fit for one sign of the rotation fails, this sign may still be the true one.
+        # The true rotation may have the sign for which the fit fails.
         return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
     one, other = known
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)

@@ -249,7 +249,7 @@ def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Fl
     return out
 
 
-# Minimum fraction of a streak that must lie on the detector for its detection.
+# Minimum fraction of a faint star's streak that must lie on the detector.
 _LEAST_SEEN = 0.35
 # Number of grid circles between two stars at which their profiles no longer overlap.
 _FARTHEST = 5
@@ -303,7 +303,7 @@ def sharp_peaks(
     """Return grid rows and columns of bright stars, found by the second difference of the filter response.
 
     The peaks of the second difference are narrow, so that stars close to each other on one circle are
-    separated. The flat indices `place` (p,) are those of high filter responses, whose noise is `deviation`
+    separated. The flat indices `place` (p,) are those of high filter responses, with the noise `deviation`
     (p,).
     """
     step = _SHARP_STEP

@@ -222,13 +222,13 @@ _LEAST_LENGTH = 3.5
 _LENGTH_ERROR = 1.0
 # Part of the standard error of a region's length that is proportional to the length.
 _LENGTH_SHARE = 0.015
-# Maximum number of rotation angles taken from each ranking, with and without the contradicting regions.
+# Maximum number of rotation angles from each ranking of votes, with and without contradicting regions.
 _MOST_HYPOTHESES = 3
 # Largest distance (px) across the circles between two fragments of one star.
 _SAME_CIRCLE = 2.0
 # Largest relative difference between a region's length and the expected streak length.
 _LIKELY_LENGTH = 0.2
-# Number of instants at which a known motion is sampled.
+# Number of instants of the exposure at which a known motion is sampled.
 _INSTANTS = 65
 # Minimum number of complete regions for an estimate of the angular acceleration.
 _LEAST_GROWING = 3

@@ -160,7 +160,7 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
 
 # Minimum mean width (px) of a limb or a reflection, which is twice the width of the brightest stars.
 _BROAD = 25.0
-# Minimum length (px) by which the area of a region is divided to obtain the mean width.
+# Minimum length (px) in the mean width of a region, which is the region's area divided by its length.
 _LEAST_LENGTH = 40.0
 # Side (px) of a square that fits into a limb or a reflection, but not into a star.
 _SOLID = 31
@@ -208,7 +208,7 @@ _UNEVEN_SIGMAS = 8.0
 # Ratio of the interquartile range of a normal distribution to its standard deviation.
 _QUARTILES = 1.35
 MEDIAN_ERROR = 1.25
-"""Standard error of the median of normal values, relative to the standard error of their mean."""
+"""Ratio of the standard error of the median of normal values to that of their mean."""
 
 
 def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:

@@ -200,7 +200,7 @@ def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: Float
 
 
 def positions(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the positions (m, 2), px, of the points from `paths`, faster than `paths`."""
+    """Return only the positions (m, 2), px, of the points that `paths` returns, in less time."""
     v = _rotated(_rotation_until(motion, time), _directions(pinhole, stars))
     points = _pixels(pinhole, v[:2] / v[2])
     return pinhole.distorted(points) if isinstance(pinhole, DistortedPinhole) else points
@@ -227,9 +227,9 @@ def sensitivities_and_velocity(
     """Return derivatives (m, 2, 8) of star positions at `time` (m,), and velocities (m, 2), px per exposure.
 
     The derivatives are with respect to rate (3), acceleration (3) and the star's position at mid-exposure
-    (2). The derivatives with respect to the rate and the star's position are exact. The derivatives with
-    respect to the acceleration have an error of second order in the rotation angle, and are zero unless the
-    acceleration is fitted (`growing`).
+    (2). Derivatives of a star's position with respect to the rate and the star's position at mid-exposure are
+    exact. The derivatives with respect to the acceleration have an error of second order in the rotation
+    angle, and are zero unless the acceleration is fitted (`growing`).
     """
     turned = _rotation_until(motion, time)
     v = _rotated(turned, _directions(pinhole, stars))
@@ -265,8 +265,8 @@ def sensitivities_and_velocity(
     return change, pace
 
 
-# The functions below this line use arrays of m vectors (..., 3, m), whose components are contiguous.
-# The public functions above this line return transposed views of such arrays (..., 3, m).
+# From here on, functions use arrays of m vectors (..., 3, m), whose components are contiguous.
+# The public functions above this line return transposed views of arrays of m vectors (..., 3, m).
 
 
 def _flow(pinhole: Pinhole, there: FloatArray) -> FloatArray:
@@ -369,7 +369,7 @@ _UNEVEN = 0.05
 _INSTANTS = 65
 # Largest uncertainty (px per exposure) of the navigation filter's motion that the fit accepts.
 _MOST_VAGUE = 3.0
-# Ratio of the error of the mean rate, from a fit with this motion, to the error of the filter's rate.
+# Ratio of the error of a fitted mean rate to the error of the navigation filter's rate.
 _COURSE_SHARE = 0.15
 
 
@@ -393,7 +393,7 @@ class Course:
     def of_rates(cls, rates: FloatArray, exposure: float, sigma: float) -> Course:
         """Return the rotation during the exposure for `rates` (n, 3), rad/s, at n equidistant times.
 
-        The exposure is in s, and `sigma` is the standard deviation of the rates, rad/s. rad/s.
+        The exposure is in s, and `sigma` is the standard deviation of the rates, rad/s.
         """
         times = np.linspace(-0.5, 0.5, len(rates))[:, None]
         powers = np.arange(_COURSE_TERMS)
@@ -409,7 +409,7 @@ class Course:
         return motion if np.ptp(uneven) > _UNEVEN and self.sigma * focal_length < _MOST_VAGUE else None
 
     def covariance(self, exposure: float) -> FloatArray:
-        """Return the covariance (3, 3), rad^2/s^2, of a fitted mean rate due to errors of this motion."""
+        """Return the covariance (3, 3), rad^2/s^2, of a fitted mean rate due to errors of this rotation."""
         return np.eye(3) * (_COURSE_SHARE * self.sigma / exposure) ** 2
 
 
@@ -423,8 +423,8 @@ class StreakScene:
         stars: positions of the n stars at mid-exposure (n, 2), px.
         light: flux of each star over the exposure (n,), counts.
         sky: sky level around each star relative to the frame's background (n,), counts per pixel.
-        trusted: whether each star contributes to motion and point spread (n,). Of a star that is not trusted,
-            only flux, position and sky level are fitted.
+        trusted: whether each star contributes to motion and point spread (n,). For a star that is not
+            trusted, only flux, position and sky level are fitted.
     """
 
     motion: CameraMotion

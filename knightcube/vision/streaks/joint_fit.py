@@ -86,7 +86,7 @@ _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
 # Displacement (px) of an untrusted star in the first iteration after which the fit's pixels are reselected.
-# Later iterations ignore displacements of untrusted stars, because some of these are poorly determined.
+# Later iterations ignore displacements of untrusted stars, because some are poorly determined.
 _FAINT_DRIFT = 3.2
 # Change of the acceleration, relative to the rotation, after which the fit's pixels are reselected.
 _GROWN = 0.1
@@ -569,7 +569,7 @@ _LEAST_BRIGHTEST = 10
 # Minimum significance (standard deviations) of faint stars on the pixels of bright streaks.
 # Undetected faint stars would shift the ends of the bright streaks.
 _HIDDEN_SIGMAS = 4.5
-# Number of stars subtracted at once, which limits the memory.
+# Number of stars subtracted from the frame in one batch, which limits the memory.
 _AT_ONCE = 16
 
 

@@ -155,8 +155,8 @@ class FitWindows:
 def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:
     """Return the approximate number of pixels (n,) within `reach` point-spread widths of each star's path.
 
-    All strips of pixels are assumed to be as wide, in pixels, as that along the path most oblique to rows and
-    columns.
+    For all stars, the strip of pixels is assumed to have the width of the widest strip, whose path is the
+    most oblique to rows and columns.
     """
     n, room = len(scene.stars), reach * scene.width
     if n == 0:
@@ -833,8 +833,8 @@ def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | N
 def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float) -> BoolArray:
     """Return which stars' estimates lie within `sigmas` standard deviations of the weighted median, (n,).
 
-    An estimate must agree in all k parameters. The model errors `floors` (k,) are added in quadrature to the
-    standard deviations.
+    A star is accepted only if its estimates of all k parameters lie within this limit. The model errors
+    `floors` (k,) are added in quadrature to the standard deviations.
     """
     agree = np.ones(len(estimates.change), dtype=np.bool_)
     for change, deviation, floor in zip(estimates.change.T, estimates.deviation.T, floors, strict=True):

@@ -428,7 +428,7 @@ def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatAr
 
 
 IMAGES = 7
-"""Number of basis images: m, (n/w^2) m, first moment of m along the path, e0, e1, dm/dw, and a constant."""
+"""Number of basis images of a block of pixels, from which its counts and derivatives are combined."""
 
 # Number of blocks computed at once, small enough for their pixels to fit into the processor's cache.
 _AT_ONCE = 256

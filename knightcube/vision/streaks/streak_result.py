@@ -162,8 +162,8 @@ class MotionResult(FrameMotion):
     def line_time_displacement(self, chosen: IntArray, middle_row: float) -> FloatArray:
         """Return the displacements (m, 2), px, of the stars `chosen` (m,) by a line time error of one sigma.
 
-        The delay of a star is proportional to the distance of its row from `middle_row`. An exactly known
-        line time gives an empty array (0, 2).
+        The delay of a star is proportional to the distance of its row from `middle_row`. If the line time is
+        exactly known, an empty array (0, 2) is returned.
         """
         if not self.line_time_sigma:
             return np.empty((0, 2))

@@ -471,7 +471,7 @@ def _path_light(
     apart = np.sum((points[:, None] - path) ** 2, axis=2)
     nearest = np.argmin(apart, axis=1)
     apart = apart[np.arange(len(index)), nearest]
-    # Pixels that are nearest to the first or the last sampled point may lie beyond the path.
+    # Pixels that are nearest to the first or the last sampled point of a path may lie beyond the path.
     kept = (apart < _ASIDE**2) & (nearest > 0) & (nearest < len(places) - 1)
     index, apart, nearest = index[kept], apart[kept], nearest[kept]
     data = frame.signal[index].astype(float)
@@ -490,7 +490,7 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
     """Return the chi-square (s, l) of a streak for reversing motions.
 
     The array `shares` (s,) holds ratios of the durations before and after the reversal, and `lengths` (l,)
-    the path lengths, px. The flux of the star and the sky level are fitted to the pixels.
+    the path lengths, px. Flux of the star and sky level are fitted to the pixels for each trial motion.
     """
     edges = np.append(one.places, one.places[-1] + _STEP) - 0.5 * _STEP
     # The variable `before` is the flux up to each boundary between the samples along the path.
@@ -506,7 +506,7 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
     return np.asarray(second - explained)
 
 
-# Maximum number of conjugate-gradient iterations for the covariance.
+# Maximum number of conjugate-gradient iterations in the computation of the covariance.
 _CONJUGATE = 12
 # Number of stars up to which no consistency test is possible, and factor on the variance of such a fit.
 _UNCHECKED = (2, 4.0)
@@ -567,7 +567,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     if brightest is not None:
         lens = _lens_effect(camera, brightest, result.exposure, lens.counted)
     rotation = scene.motion.rotation + lens.step
-    # The cause of the rejected stars may also affect the accepted stars to a smaller degree.
+    # The error that led to the rejection of stars may also affect the accepted stars to a smaller degree.
     agreed = int(np.count_nonzero(scene.trusted))
     judged = int(np.count_nonzero(scene.light >= scene.light[scene.trusted].min(initial=np.inf)))
     spread = max(result.misfit, lens.spread, 1.0) * max(judged / max(agreed, 1), 1.0)

@@ -7,9 +7,9 @@ Weights computed from the counts would favour pixels that are low by chance, and
 low. The normal equations of all stars, 4 x 4 or 5 x 5 each, are solved together.
 
 The variance of a pixel is noise^2 + light / gain + (mismatch x light)^2, where light is the star's counts in
-the pixel. The three terms of this variance are the sky noise, the photon noise, and the difference between
-the PSF and a Gaussian. If the gain is unknown, gain and mismatch are measured from the residuals of the
-stars. Gain and mismatch can be distinguished because the variance of photon noise is proportional to the
+the pixel. The three terms of the variance of a pixel are the sky noise, the photon noise, and the difference
+between the PSF and a Gaussian. If the gain is unknown, gain and mismatch are measured from the residuals of
+the stars. Gain and mismatch can be distinguished because the variance of photon noise is proportional to the
 light, and that of the mismatch to the square of the light.
 """
 
@@ -29,7 +29,7 @@ class StarWindows:
 
     Attributes:
         middle: column and row of the middle pixel of each window (n, 2).
-        half: half-width of the windows, px.
+        half: half-width of the windows around stars, px.
         light: counts of each pixel above the sky, including saturated pixels (n, k, k); 0 outside the frame.
         good: mask of the pixels that are inside the frame and not saturated (n, k, k).
         noise: standard deviation of a background pixel in each window (n,), counts.
@@ -69,7 +69,7 @@ def cut(
     Args:
         pixels: counts of the frame (rows, columns).
         middle: column and row of the middle pixel of each window (n, 2).
-        half: half-width of the windows, px.
+        half: half-width of the windows around stars, px.
         level: sky background in each window (n,), counts.
         noise: standard deviation of a background pixel in each window (n,), counts.
         ceiling: counts from which a pixel is saturated and not used.
@@ -173,7 +173,7 @@ def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | 
     Args:
         offset: position of each star relative to the centre of the middle pixel (n, 2), px.
         sigma: standard deviation of the PSF of each star (n,), px.
-        half: half-width of the windows, px.
+        half: half-width of the windows around stars, px.
         trail: displacement of each star during the exposure (n, 2), px, or None for no displacement.
     """
     out = np.zeros((len(offset), 2 * half + 1, 2 * half + 1))

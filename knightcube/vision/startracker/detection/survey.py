@@ -497,8 +497,8 @@ def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
     """Return whether lines in the image follow one rotation, from `centre` (n, 2), px, and `direction` (n,).
 
     Near the boresight, a rotation displaces the image at (x, y) by t + w (-y, x), with a vector t and a
-    number w. If a line follows this flow, the flow has no component along the line's normal. The best t and w
-    follow from a singular value decomposition of the normal components.
+    number w. If a line in the image follows the flow of a rotation, the flow has no component along the
+    line's normal. The best t and w follow from a singular value decomposition of the normal components.
     """
     middle = centre.mean(axis=0)
     scale = float(np.abs(centre - middle).max()) or 1.0
