@@ -46,7 +46,7 @@ _GRAZING = 0.3
 _LOWEST_SUN = np.radians(1.0)
 """Minimum elevation of the Sun (rad) at a limb point; with a lower Sun the limb appears too high."""
 _FINE = SCALE_HEIGHT / 6.0
-"""Pixel size at the limb (m) below which the air's brightness profile exceeds the stored samples."""
+"""Pixel size at the limb (m) below which the stored samples do not cover the brightness profile of air."""
 _CORRELATED = 10.0
 """Correlation length (px), along the limb, of the brightness of the ground behind the limb."""
 _PIXEL_SIGMA = 12.0**-0.5

@@ -267,7 +267,7 @@ _STRAY_LIGHT = math.radians(25.0)
 _LEAST = 8
 """Minimum number of samples, out of 64, from which an image can be judged to contradict the attitude."""
 _MOST = 0.6
-"""Fraction of contradicting samples above which an image contradicts the attitude (clouds cause less)."""
+"""Fraction of samples that contradict an attitude above which the image is false (clouds cause less)."""
 
 
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:

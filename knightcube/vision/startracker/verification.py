@@ -354,7 +354,7 @@ def _match(
     matched = settings.least_matches - 1
     for gate in settings.gates:
         within = np.flatnonzero(squared <= gate * gate)
-        # A wider gate is less significant unless it matches further stars.
+        # A match within a wider gate is less significant unless it contains more stars.
         if len(within) <= matched:
             continue
         matched = len(within)

@@ -581,7 +581,7 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
     overlap = overlap_of(column[one], column[other], common, grid.length) * profile(
         (row[one] - row[other]) * _ACROSS
     )
-    # For isolated stars, the factor on the right-hand side compensates the regularisation.
+    # The factor on the right-hand side cancels the effect of the regularisation for isolated stars.
     overlap[one == other] *= 1.0 + _RIDGE
     overlap[one == other] += _TINY
     seen = (1.0 + _RIDGE) * held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(
