@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import from_rotation_vector, multiply
-from knightcube.vision.frame_job import FrameJob, TrackerSettings
-from knightcube.vision.objects.settings import ObjectMeasurementSettings
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
+from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings, run
+from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
@@ -50,3 +51,29 @@ def frame_job(
         attitude,
         objects=ObjectMeasurementSettings(),
     )
+
+
+HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A satellite at `place` (2,) px at mid-exposure that moves by `motion` (2,) px; `turn` (3,) rad/s."""
+
+    place: FloatArray
+    motion: FloatArray
+    magnitude: float
+    turn: FloatArray
+    knows: bool = True
+
+    def found(self) -> FrameFound:
+        """Return the result of the vision job."""
+        ways = self.place + np.outer(TIMES / EXPOSURE, self.motion)
+        seen = CAMERA.pinhole.unit_vectors(ways) @ attitude_matrix(HELD)
+        return run(frame_job(HELD, self.turn, [SourceTrack(TIMES, seen, self.magnitude)], self.knows))
+
+    def sighting(self, sighted: MeasuredObjects | None) -> int | None:
+        """Return the index of the detection within a pixel of the satellite, or None."""
+        assert sighted is not None
+        away = np.linalg.norm(sighted.points - self.place, axis=1)
+        return int(away.argmin()) if len(away) and away.min() < 1.0 else None

@@ -29,6 +29,7 @@ from knightcube.gnc.control.field_detumbler import (
     without_speed_up,
 )
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
+from tests.support.recorded_results import check
 
 SCHEDULE = WindowSchedule(100_000_000, 300_000_000, 600_000_000)
 INERTIA = np.diag([1.1e-3, 1.05e-3, 0.99e-3])
@@ -325,3 +326,9 @@ def test_without_gain_no_torque_makes_the_body_faster_and_what_brakes_it_stays()
             np.testing.assert_array_equal(left, dipole)
         changed += before > 0.0
     assert 30 < changed < 70
+
+
+def test_detumbling_by_the_magnetometer_is_as_recorded() -> None:
+    rate = np.array([0.1, -0.05, 0.08])
+    with_gyro = fly(rate, 12.0, gyro=lambda true: true + 1e-3)
+    check(__file__, "detumbled", [fly(rate, 12.0, spikes=0.05), with_gyro], 1e-4)

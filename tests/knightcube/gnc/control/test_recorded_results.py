@@ -18,7 +18,6 @@ from knightcube.gnc.control.pointing_table import (
     pointing_table,
 )
 from knightcube.gnc.guidance.three_axes.attitude_law import approach, references
-from tests.knightcube.gnc.control import test_field_detumbler, test_sun_acquisition
 from tests.knightcube.gnc.control.pointing_cases import (
     INERTIA,
     LAW,
@@ -96,16 +95,3 @@ def test_a_flight_in_the_cage_is_as_recorded(tmp_path: Path) -> None:
 
 def test_a_detumbling_flight_is_as_recorded(tmp_path: Path) -> None:
     assert unlike_record("detumbling", tmp_path) == []
-
-
-def test_the_acquisition_of_the_sun_is_as_recorded() -> None:
-    towards = np.array([0.6, 0.3, -0.74])
-    slow = np.radians([0.3, -0.2, 0.4])
-    suns = (towards / np.linalg.norm(towards), None)
-    check(__file__, "sun", [test_sun_acquisition.fly(sun, slow, 41.0) for sun in suns], 1e-4)
-
-
-def test_detumbling_by_the_magnetometer_is_as_recorded() -> None:
-    rate = np.array([0.1, -0.05, 0.08])
-    with_gyro = test_field_detumbler.fly(rate, 12.0, gyro=lambda true: true + 1e-3)
-    check(__file__, "detumbled", [test_field_detumbler.fly(rate, 12.0, spikes=0.05), with_gyro], 1e-4)

@@ -9,6 +9,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.sun_acquisition import MEMORY, SunAcquisition, SunAcquisitionSettings
+from tests.support.recorded_results import check
 
 SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
 INERTIA, LIMIT = np.array([1.10e-3, 1.05e-3, 0.99e-3]), 0.0959
@@ -97,3 +98,10 @@ def test_no_dipole_in_the_pauses_and_a_reading_that_is_not_finite_is_left_out() 
         pausing = now_ns % SCHEDULE.period_ns < 200_000_000
         assert not (pausing and law.dipole(now_ns).any())
     assert law.dipole(239 * 25_000_000).any()
+
+
+def test_the_acquisition_of_the_sun_is_as_recorded() -> None:
+    towards = np.array([0.6, 0.3, -0.74])
+    slow = np.radians([0.3, -0.2, 0.4])
+    suns = (towards / np.linalg.norm(towards), None)
+    check(__file__, "sun", [fly(sun, slow, 41.0) for sun in suns], 1e-4)

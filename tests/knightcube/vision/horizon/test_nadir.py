@@ -6,7 +6,7 @@ Tests of the nadir from several cameras: a joint fit of the limb, and a coarse n
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,10 @@ import pytest
 
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray, Image, tangent_basis
-from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
-from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.reference.horizon import fit_circle
 from knightcube.vision.camera.images import read_image
-from knightcube.vision.camera.lens import MountedCamera, Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.horizon.edges import find_edges
 from knightcube.vision.horizon.hypothesis import Hypothesis, examine
 from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness
@@ -39,10 +38,10 @@ from knightcube.vision.horizon.settings import (
     SensedDirection,
 )
 from sim_hal.earth_camera import Atmosphere, EarthScene, nadir, render
+from tests.knightcube.vision.horizon.instants import ALTITUDE, UW, VT, WIDE_MODEL, Instant, instant
 from tests.sim_hal.earth_camera.scenes import limb_scene, random_scene
 from tests.support.earth_truth import limb_truth
 from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings
-from tests.support.orbit_geometry import suite
 
 MODEL = camera_model()
 SETTINGS = finder_settings(MODEL)
@@ -263,53 +262,9 @@ def test_invalid_settings_are_refused() -> None:
     assert HorizonSettings().edges.lines == 32
 
 
-WIDE_MODEL = camera_model()
 JOINT_SETTINGS = finder_settings(WIDE_MODEL)
-UW = [MountedCamera(WIDE_MODEL.lens, np.array(one.mounting)) for one in suite("uw").cameras]
-VT = [MountedCamera(WIDE_MODEL.lens, np.array(one.mounting)) for one in suite("vt").cameras]
 EARTHLIGHT = 30.0
 """Counts of a flux of 0.025 in the logarithmic camera."""
-ALTITUDE = 500e3
-
-
-@dataclass(frozen=True, eq=False)
-class Instant:
-    """A satellite with the images of its cameras and its prior knowledge."""
-
-    attitude: FloatArray
-    position: FloatArray
-    sun: FloatArray
-    scenes: list[EarthScene]
-    frames: dict[int, Image]
-
-    @property
-    def nadir(self) -> FloatArray:
-        """The true nadir (3,) in body axes."""
-        return np.asarray(attitude_matrix(self.attitude) @ (-self.position / np.linalg.norm(self.position)))
-
-    @property
-    def sun_in_body(self) -> FloatArray:
-        """The truth (3,)."""
-        return np.asarray(attitude_matrix(self.attitude) @ self.sun)
-
-    def knowledge(self, sigma: float = 0.05) -> HorizonKnowledge:
-        """Return knowledge from GPS, the Sun's ephemeris, and a rough attitude."""
-        rough = multiply(from_rotation_vector(np.array([0.6, -0.5, 0.6]) * sigma), self.attitude)
-        return HorizonKnowledge(position=self.position, sun=self.sun, attitude=RoughAttitude(rough, sigma))
-
-
-def instant(cameras: list[MountedCamera], nadir: FloatArray, sun: FloatArray, seed: int) -> Instant:
-    """Return an instant above 53 deg north with nadir (3,) in body axes and the Sun (3,) in inertial axes."""
-    down = np.array([-0.6, 0.0, -0.8])
-    position = -(6_378_137.0 + ALTITUDE) * down
-    middle = nadir / np.linalg.norm(nadir) + down
-    attitude = normalise(np.array([*middle, 0.0]))
-    generator = np.random.default_rng(seed)
-    scenes = [
-        EarthScene(position, multiply(one.mounting, attitude), ASTRONOMICAL_UNIT * sun) for one in cameras
-    ]
-    frames = {number: render(WIDE_MODEL, scene, generator) for number, scene in enumerate(scenes)}
-    return Instant(attitude, position, sun / np.linalg.norm(sun), scenes, frames)
 
 
 def error_deg(found: JointNadir, truth: FloatArray) -> float:

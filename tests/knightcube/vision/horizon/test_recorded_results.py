@@ -14,7 +14,7 @@ from knightcube.vision.horizon.illumination import coarse_nadir, image_brightnes
 from knightcube.vision.horizon.nadir import find_nadir, nadir_of_cameras
 from knightcube.vision.horizon.settings import HorizonKnowledge, RoughAttitude, SensedDirection
 from sim_hal.earth_camera import EarthScene, render
-from tests.knightcube.vision.horizon.test_nadir import UW, Instant, instant
+from tests.knightcube.vision.horizon.instants import UW, Instant, instant
 from tests.sim_hal.earth_camera.scenes import limb_scene
 from tests.support.limb_frames import camera_model, finder_settings
 from tests.support.recorded_results import check

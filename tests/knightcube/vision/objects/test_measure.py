@@ -2,45 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix
-from knightcube.vision.frame_job import FrameFound, run
-from knightcube.vision.objects.settings import MeasuredObjects
 from knightcube.vision.startracker.index.build import default_index
-from sim_hal.star_camera import SourceTrack
-from tests.knightcube.vision.satellite_frames import CAMERA, EXPOSURE, TIMES, frame_job
+from tests.knightcube.vision.satellite_frames import CAMERA, HELD, Shot
 from tests.support.scenes import catalogue as sky_to
-
-HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A satellite at `place` (2,) px at mid-exposure that moves by `motion` (2,) px; `turn` (3,) rad/s."""
-
-    place: FloatArray
-    motion: FloatArray
-    magnitude: float
-    turn: FloatArray
-    knows: bool = True
-
-    def found(self) -> FrameFound:
-        """Return the result of the vision job."""
-        ways = self.place + np.outer(TIMES / EXPOSURE, self.motion)
-        seen = CAMERA.pinhole.unit_vectors(ways) @ attitude_matrix(HELD)
-        return run(frame_job(HELD, self.turn, [SourceTrack(TIMES, seen, self.magnitude)], self.knows))
-
-    def sighting(self, sighted: MeasuredObjects | None) -> int | None:
-        """Return the index of the detection within a pixel of the satellite, or None."""
-        assert sighted is not None
-        away = np.linalg.norm(sighted.points - self.place, axis=1)
-        return int(away.argmin()) if len(away) and away.min() < 1.0 else None
 
 
 def _star(brightest: float, faintest: float) -> FloatArray:

@@ -12,8 +12,7 @@ from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
 from sim_hal.star_camera import SourceTrack
 from tests.knightcube.vision.objects.space_objects import frame_with, motion_across, object_path
-from tests.knightcube.vision.objects.test_measure import HELD, Shot
-from tests.knightcube.vision.satellite_frames import CAMERA, EXPOSURE, TIMES, frame_job
+from tests.knightcube.vision.satellite_frames import CAMERA, EXPOSURE, HELD, TIMES, Shot, frame_job
 from tests.support.recorded_results import check
 from tests.support.streak_frames import rate_at, star_camera
 
