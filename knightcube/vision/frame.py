@@ -394,7 +394,7 @@ def at_least(pixels: Image, level: float) -> BoolArray:
 _STRIDE = 16
 """Distance (px) between the pixels that are sampled to estimate the step between counts."""
 _MOST_BETWEEN = 0.01
-"""Largest fraction of pixels with counts between the steps, as a repair of hot pixels can leave."""
+"""Largest fraction of pixels whose counts are not multiples of the step, as after a repair of hot pixels."""
 
 
 def in_steps(pixels: Image) -> tuple[Image, int, int]:

@@ -74,8 +74,8 @@ class HorizonCameraResult:
 
     Attributes:
         sun, nadir: measured directions of Sun and nadir, body axes; None if there is none.
-        false: for each image whose content contradicts an accurately known attitude, the reason, by camera
-            index. If the attitude is not accurately known, images are not checked and `false` is None.
+        false: reasons, by camera index, why the content of an image contradicts an accurately known attitude.
+            If the attitude is not accurately known, images are not checked and `false` is None.
     """
 
     sun: MeasuredDirection | None

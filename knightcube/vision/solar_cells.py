@@ -187,7 +187,7 @@ def _earthlight(strings: SolarStringModel, nadir: FloatArray | None) -> tuple[Fl
     if nadir is not None:
         pattern = 0.5 * (1.0 + normals @ nadir)
         return strings.albedo * pattern, own + square * np.outer(pattern, pattern)
-    # Averaged over directions e of nadir, (1 + n.e)/2 is 1/2, and its product for n and m is 1/4 + n.m/12.
+    # Averaged over all nadir directions e, (1 + n.e)/2 is 1/2, and (1 + n.e)(1 + m.e)/4 is 1/4 + n.m/12.
     even = np.full(len(normals), 0.5)
     second = 0.25 + normals @ normals.T / 12.0
     covariance = (strings.albedo**2 + square) * second - strings.albedo**2 * np.outer(even, even)

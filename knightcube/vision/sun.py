@@ -316,7 +316,7 @@ def _disc(
         aside = float(np.linalg.norm(circle.centre))
         if aside > settings.greatest_radius:
             return None
-        # The rim is not traced again if the radius of the disc is wrong.
+        # A disc with a wrong radius is rejected later, so that its rim is not traced again.
         wrong = not 0.5 * settings.least_radius < circle.radius < 2.0 * settings.greatest_radius
         if wrong or aside * disc.pixels_per_radian < _NEAR:
             break
@@ -336,7 +336,7 @@ def _trace(
     rays = np.cos(arcs)[:, None] * axis + np.sin(arcs)[:, None] * (ways @ basis)[:, None, :]
     counts = sample(strip, first_row, camera.project(rays.reshape(-1, 3))).reshape(_SPOKES, -1)
     inner, outer = counts[:, :-1], counts[:, 1:]
-    # Counts outside the image are NaN, so that both comparisons are false.
+    # Counts outside the image are NaN, so that their comparisons with the level are false.
     falls = (inner >= level) & (outer < level)
     crosses = falls.any(axis=1)
     at = falls.argmax(axis=1)[crosses]

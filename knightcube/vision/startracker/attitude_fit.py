@@ -277,7 +277,7 @@ class DistortedFit:
 
     Attributes:
         observed: indices of the observed points that match guide stars (k,).
-        star: indices of the guide stars that they match (k,).
+        star: indices of the guide stars that the points match (k,).
         refined: attitude and scale, with a covariance that is increased if the residuals are too large.
         distortion: radial distortion, as the relative displacement of a star in the image corner.
         seen: unit vectors to all observed points, corrected for the distortion (n, 3), camera frame.

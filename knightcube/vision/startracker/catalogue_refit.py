@@ -62,7 +62,7 @@ _INSTANTS = 9
 _ROOM = 1.7
 # Largest chi-square of the difference between the rates of both fits (false alarm in 1 of 100,000 frames).
 _ONE_MOTION = 25.9
-# Increase (px) of the standard deviation of the attitude that is the prior of the new identification.
+# Standard deviation (px) added to that of the fitted attitude when the stars are identified again.
 _PRIOR_PX = 1.0
 
 
@@ -131,7 +131,7 @@ def refit_motion(
     done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
-    # The stars `hidden` are cleared, so that the fit is not repeated with fewer streaks.
+    # Without a list of hidden stars, the fit is not repeated with fewer streaks.
     done = replace(done, hidden=None)
     refit = with_rate(with_stars(motion, camera, done), camera, done, StreakVerdict.CONFIRMED)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:

@@ -389,7 +389,7 @@ def solve_near(
 
 
 def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
-    """Return whether an attitude agrees with the prior attitude; if not, its significance is not valid."""
+    """Return whether an attitude agrees with the prior attitude, as the match significance requires."""
     if solution.fix is None:
         return True
     off = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(prior.quaternion)))

@@ -155,7 +155,7 @@ class VerificationSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matching:
-    """Indices of matched observed stars (k,) and of their guide stars (k,), and log10 of chance matches."""
+    """Indices (k,) of matched observed stars and of their guide stars, and log10 of the chance matches."""
 
     observed: IntArray
     star: IntArray
@@ -165,10 +165,10 @@ class _Matching:
 # Fraction of bright expected stars that match, below which the distortion of the lens is also fitted.
 _FEW_MISSED = 0.8
 # Maximum fraction of bright expected stars that have an unmatched star nearby instead of a match.
-# Stars are nearby within a radius that is relative to the tangent of the image corner.
+# The second number is the radius within which stars are nearby, relative to the image corner's tangent.
 # A larger fraction of displaced stars indicates a wrong lens fit, because a foreground only hides stars.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
-# Excess of log10 of chance matches over its limit above which a candidate is rejected without refinement.
+# Log10 of the factor on the limit of chance matches above which a candidate is rejected at once.
 _HOPELESS = 7.0
 
 
@@ -229,7 +229,7 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
 def _bright_matched(
     expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]
 ) -> npt.NDArray[np.bool_]:
-    """Return which expected stars match, among those at least as bright as the median matched star."""
+    """Return a mask of the expected stars that match, down to the brightness of the median matched star."""
     matched = np.isin(expected, star)
     places = np.flatnonzero(matched)
     return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]

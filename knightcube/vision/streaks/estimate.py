@@ -98,7 +98,7 @@ _MOST_ANGLES = 2
 _STILL_ROUNDS = 12
 # Minimum number of complete streaks from whose lengths alone the rotation angle is guessed.
 _WHOLE = 8
-# Maximum fraction of the flux in regions longer than a guessed rotation angle, for an accepted guess.
+# Maximum fraction of the flux in regions longer than the guessed streak length, for an accepted guess.
 _CONTRADICTED = 0.3
 # Minimum number of stars in a preliminary fit that is accepted without comparison with other fits.
 _MANY = 3
@@ -123,7 +123,7 @@ _ENOUGH = 200.0
 _CONTRADICTION = 0.6
 # Last step of the fit (standard deviations) below which a preliminary fit counts as converged.
 _CALM = 2.0
-# Expected fraction of confirmed streak ends for a wrong rotation, which can match one end of each streak.
+# Fraction of streak ends that even a wrong rotation matches: one of the two ends of each streak.
 _ENDS_BY_CHANCE = 0.4
 
 
@@ -299,9 +299,9 @@ def still_fit(camera: FitProblem, regions: BrightRegions) -> StreakFit | None:
 
 # Largest fraction of stars that look like segments of a longer streak.
 _MOST_CHAINED = 0.45
-# Minimum fraction of streak ends that are confirmed, for an accepted motion and for a doubtful motion.
+# Minimum fractions of confirmed streak ends for an accepted motion (first) and a doubtful motion (second).
 _TRUE_ENDS = (0.75, 0.6)
-# Largest fraction of streaks with gaps, for an accepted motion and for a doubtful motion.
+# Largest fractions of streaks with gaps for an accepted motion (first) and a doubtful motion (second).
 _BROKEN = (0.12, 0.35)
 # Minimum number of streaks with two confirmed ends at which gaps in other streaks are tolerated.
 _CONFIRMING = 3
@@ -322,7 +322,7 @@ class StreakVerdict(Enum):
 
 
 def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> StreakVerdict:
-    """Return a verdict on whether the trusted streaks of `scene` have confirmed ends and no gaps.
+    """Return a verdict on a motion: whether its streaks have confirmed ends and no gaps.
 
     In a crowded frame, one apparent star may be a blend of several stars. A motion is doubtful if a few
     streaks have gaps, unless enough other streaks have two confirmed ends. A motion is also doubtful if no
@@ -360,12 +360,12 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
 
 
 def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
-    """Return whether stars that contradict the motion have most of the flux of bright, complete streaks."""
+    """Return whether most flux of bright, complete streaks is from stars that contradict the motion."""
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     inside = np.ones(len(scene.stars), dtype=np.bool_)
     for time in times.T:
         inside &= camera.pinhole.contains(positions(camera.pinhole, scene.motion, scene.stars, time))
-    # Stars fainter than all trusted stars are ignored, because they were never compared with the motion.
+    # Stars fainter than all stars in the fit of the motion were not compared with the motion and are ignored.
     bright = inside & (scene.light >= scene.light[scene.trusted].min())
     light = scene.light[bright]
     return float(light[scene.trusted[bright]].sum()) < _AGREEING_LIGHT * float(light.sum())
@@ -436,7 +436,7 @@ def _rolling_result(
         return None
     known = [found for found in both if found.result.rate is not None]
     if len(known) < 2:
-        # The true rotation may have the sign for which the fit fails.
+        # If the fit fails for one sign of the rotation, this sign may still be the true one.
         return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
     one, other = known
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)
@@ -455,9 +455,9 @@ def _rolling_result(
     return replace(first, rate=first.rate - 0.5 * sum_of_both, covariance=covariance)
 
 
-# Indices of rate, acceleration, x and y among the shared parameters followed by the parameters of a star.
+# Indices of rate, acceleration, x and y in the vector of the shared and one star's own parameters.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
-# Index of the flux among the shared parameters followed by the parameters of a star.
+# Index of the flux in the vector of the shared and one star's own parameters.
 _LIGHT = 9
 # Last step of the joint fit (standard deviations) above which the fit counts as not converged.
 _UNSETTLED = 2.0
@@ -475,7 +475,7 @@ _SAME = 1.5
 
 
 def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> MotionResult:
-    """Return the result `seen` with the fitted stars, the ends of their streaks and the covariances."""
+    """Return a copy of `seen` with the fitted stars, the ends of their streaks and the covariances."""
     settings, joint = camera.settings, last.solution.joint
     significance = last.scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
     kept = np.flatnonzero(significance > settings.faint_sigmas)
@@ -586,7 +586,7 @@ _MOST_MOTIONS = 2
 _AT_REST = 4.0
 # Median length (px) of the brightest regions below which a frame counts as free of streaks.
 _SPOT = 2.2
-# Number of the brightest regions whose median length is compared with `_SPOT`.
+# Number of the brightest regions from whose median length a frame without streaks is recognised.
 _BRIGHTEST = 12
 # Reason reported if no fitted motion passes the streak check.
 _NO_CONSISTENT_MOTION = "no motion is consistent with the brightness and the ends of the streaks"

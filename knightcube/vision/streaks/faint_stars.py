@@ -204,7 +204,7 @@ def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: fl
     width = max(round(grid.length), 1)
     before, after = width // 2, width - width // 2
     rows, columns = len(grid.polar), len(grid.azimuth)
-    # Memory is only used for array elements that are written, which lie on the detector.
+    # Elements off the detector are never written, so that no memory is allocated for them.
     response, count = np.zeros((rows, columns), dtype=np.float32), np.zeros((rows, columns), dtype=np.int32)
     span = np.tile([-np.inf, np.inf], (rows, 1))
     unit = max(unit, float(sums.max()) * width / _HIGHEST)
@@ -303,8 +303,8 @@ def sharp_peaks(
     """Return grid rows and columns of bright stars, found by the second difference of the filter response.
 
     The peaks of the second difference are narrow, so that stars close to each other on one circle are
-    separated. The flat indices `place` (p,) are those of high filter responses, with the noise `deviation`
-    (p,).
+    separated. Only p samples with high filter responses are searched, with the flat indices `place` (p,) and
+    the noise `deviation` (p,).
     """
     step = _SHARP_STEP
     if grid.length < _SHARP_FROM:
@@ -425,7 +425,7 @@ def find_faint(
     sigmas: float,
     most: int,
 ) -> FaintStars:
-    """Return the `most` significant streaks along `motion` after subtraction of the modelled stars.
+    """Return the most significant streaks along `motion`, at most `most`, after subtracting modelled stars.
 
     The pair `modelled` holds the flat indices of m pixels (m,) and the counts of the modelled stars there
     (m,).
@@ -475,7 +475,7 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
 def _found_stars(
     held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: float, most: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return fractional grid rows, columns and heights of the peaks that reproduce the response `held`.
+    """Return fractional grid rows, columns and heights of the peaks whose sum is the response `held`.
 
     Each pass of the search finds peaks in the residual response, solves for the heights of all stars, and
     subtracts these stars. The array `noise` holds the noise of a running sum by the number of its samples.
@@ -626,7 +626,7 @@ _ENOUGH = 40.0
 
 
 def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
-    """Return the `most` likely rotation angles (rad) about the axis of `rotation` (3,), most likely first."""
+    """Return at most `most` rotation angles (rad) about the axis of `rotation` (3,), most likely first."""
     # The sampling is that for a rotation by one radian, which is the largest angle in this search.
     grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
     step = grid.angle / grid.length
@@ -653,7 +653,7 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
 
 
 def _box_significance(padded: Float32Array, room: int, width: int) -> float:
-    """Return the sum of squared significances over all locally best boxes of `width` samples.
+    """Return the summed squared significance of the locally best boxes of `width` samples along the circles.
 
     The array `padded` (c, r) holds cumulative sums along the azimuth on r circles, with a margin of `room`
     samples at both ends.
@@ -667,7 +667,7 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
     light *= np.float32(2.0)
     light -= beyond
     light += outer
-    # The best box of each interval of one box length counts if no adjacent interval has a better box.
+    # In each interval of one box length, the best box counts if neither adjacent interval has a better box.
     best = light.reshape(stretches, width, -1).max(axis=1)
     best *= np.float32(1.0 / np.sqrt(2.0 * width))
     around = np.pad(best, 1)

@@ -85,7 +85,7 @@ class AngleCandidate:
 def scan_angles(
     frame: ReducedFrame, pinhole: Pinhole, circles: Circles, most: int, near: float | None = None
 ) -> Iterator[AngleCandidate]:
-    """Yield the `most` likely rotation angles, sorted by the distance from `near` (rad) if it is given."""
+    """Yield at most `most` likely rotation angles, sorted by distance from `near` (rad) if it is given."""
     boxes = _boxes(frame, pinhole, circles)
     longest = boxes.total.shape[1] - 2
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
@@ -107,7 +107,7 @@ def scan_angles(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BestBoxes:
-    """The best box for each of n regions: chi-square, first sample, flux, and sample count in the frame."""
+    """The best box along the circle of each region (n,): chi-square, start, flux and samples in the frame."""
 
     gain: FloatArray
     first: IntArray
@@ -117,7 +117,7 @@ class _BestBoxes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Boxes:
-    """Cumulative sums along n circles (n, c + 1) of the c samples, and of the number of samples in the frame.
+    """Cumulative sums (n, c + 1) along n circles of c samples: of values, and of samples inside the frame.
 
     The azimuth of the first sample is `begin` (rad), and the spacing of the samples is `step` (rad).
     """
@@ -130,7 +130,7 @@ class _Boxes:
     step: float
 
     def best(self, width: int) -> _BestBoxes:
-        """Return, for each region, the box of `width` samples with the largest chi-square."""
+        """Return the box of `width` samples with the largest chi-square along the circle of each region."""
         last = self.total.shape[1] - 1
         first = self.middle[:, None] - np.arange(width + 1)
         start, stop = np.clip(first, 0, last), np.clip(first + width, 0, last)
@@ -210,7 +210,7 @@ def _refined_angle(
 
 # Number of bright regions whose pairs propose rotation axes.
 _PROPOSERS = 16
-# Smallest sine of the angle between the linear equations of two regions that propose a rotation axis.
+# Sine below which the linear equations of two regions are too nearly parallel to give a rotation axis.
 _PARALLEL = 1e-9
 # Product (rad px) of the standard error of a region's orientation and the region's length.
 _SIDE_ERROR = 1.2
@@ -222,7 +222,7 @@ _LEAST_LENGTH = 3.5
 _LENGTH_ERROR = 1.0
 # Part of the standard error of a region's length that is proportional to the length.
 _LENGTH_SHARE = 0.015
-# Maximum number of rotation angles from each ranking of votes, with and without contradicting regions.
+# Maximum number of rotation angles from each ranking, one with and one without votes against an angle.
 _MOST_HYPOTHESES = 3
 # Largest distance (px) across the circles between two fragments of one star.
 _SAME_CIRCLE = 2.0

@@ -125,7 +125,7 @@ class BrightRegions:
 
 
 def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> BrightRegions:
-    """Return the `most` brightest regions in which the 3 x 3 sums exceed `sigmas` standard deviations."""
+    """Return the brightest regions, at most `most`, whose 3 x 3 sums exceed `sigmas` standard deviations."""
     threshold = 3.0 * sigmas
     pixel = np.flatnonzero(frame.sums > np.float32(threshold * np.sqrt(frame.floor.min())))
     pixel = pixel[frame.sums[pixel] > np.float32(threshold) * np.sqrt(frame.floor[pixel])]
@@ -160,7 +160,7 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
 
 # Minimum mean width (px) of a limb or a reflection, which is twice the width of the brightest stars.
 _BROAD = 25.0
-# Minimum length (px) in the mean width of a region, which is the region's area divided by its length.
+# Lower limit (px) of the length by which a region's area is divided to obtain the region's mean width.
 _LEAST_LENGTH = 40.0
 # Side (px) of a square that fits into a limb or a reflection, but not into a star.
 _SOLID = 31

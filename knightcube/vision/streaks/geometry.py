@@ -402,7 +402,7 @@ class Course:
         return cls(fitted * exposure / (powers[:, None] + 1.0), exposure * float(np.hypot(sigma, missed)))
 
     def motion(self, focal_length: float) -> CameraMotion | None:
-        """Return the motion to fit at `focal_length` px, or None if it is uncertain or nearly uniform."""
+        """Return the motion to fit, or None if it is uncertain or, at `focal_length` px, nearly uniform."""
         motion = CameraMotion(self.terms[0], 2.0 * self.terms[1], self.terms[2:])
         time = np.linspace(-0.5, 0.5, _INSTANTS)
         uneven = (motion.progress(time) - time) * float(np.linalg.norm(motion.rotation)) * focal_length
@@ -444,7 +444,7 @@ class StreakScene:
         return select(self, chosen, "motion", "width")
 
     def with_stars(self, stars: FloatArray, light: FloatArray) -> StreakScene:
-        """Return the scene with more untrusted stars at `stars` (m, 2), px, of flux `light` (m,), counts."""
+        """Return the scene with m more stars, which do not affect the motion, at `stars` (m, 2), px."""
         return replace(
             self,
             stars=np.concatenate([self.stars, stars]),
@@ -495,7 +495,7 @@ def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> F
 
 # Largest distance (px) across the streak between two segments of one streak.
 _CHAIN_ASIDE = 1.3
-# Range of the distance along the streak between two segments of one streak, relative to the rotation angle.
+# Smallest and largest angle between two segments of one streak, relative to the rotation angle.
 _CHAIN_APART = (0.55, 1.7)
 # Largest flux ratio of two segments of one streak.
 _CHAIN_RATIO = 2.5
@@ -518,7 +518,7 @@ def azimuth_differences(azimuth: FloatArray, other: FloatArray) -> FloatArray:
 def chained_stars(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, light: FloatArray, judged: int
 ) -> BoolArray:
-    """Return which of the first `judged` of `stars` (n, 2), px, look like segments of a longer streak.
+    """Return which of the first `judged` stars look like segments of longer streaks of `stars` (n, 2), px.
 
     If the assumed rotation is too small, each streak is modelled as a chain of shorter streaks of equal flux
     on one circle about the rotation axis, and each short streak fits its pixels as well as a complete streak.
@@ -536,7 +536,7 @@ def chained_stars(
 def near_streaks(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, others: FloatArray, distance: float
 ) -> BoolArray:
-    """Return which streaks of `stars` (n, 2), px, pass within `distance` px of those of `others` (m, 2)."""
+    """Return which streaks of `stars` (n, 2), px, pass within `distance` px of any of `others` (m, 2)."""
     polar, azimuth = polar_angles(pinhole, motion, stars)
     other_polar, other_azimuth = polar_angles(pinhole, motion, others)
     beside = np.abs(polar[:, None] - other_polar) * pinhole.focal_length < distance

@@ -85,8 +85,8 @@ class WorkBudget:
 _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
-# Displacement (px) of an untrusted star in the first iteration after which the fit's pixels are reselected.
-# Later iterations ignore displacements of untrusted stars, because some are poorly determined.
+# First displacement (px) of a star without effect on the motion at which the fit's pixels are reselected.
+# Later displacements of stars without effect on the motion are ignored; some are poorly determined.
 _FAINT_DRIFT = 3.2
 # Change of the acceleration, relative to the rotation, after which the fit's pixels are reselected.
 _GROWN = 0.1
@@ -99,7 +99,7 @@ _LEAST_PROGRESS = 0.7
 _LOOKS = 1
 # Probability of a false alarm of the score test for a changing rate.
 _BY_CHANCE = 1e-4
-# Fraction of its limit below which the approximate test statistic makes the exact statistic unnecessary.
+# Fraction of the test's limit below which an approximate test statistic suffices for a constant rate.
 _FAR_BELOW = 0.5
 # Number of acceleration components, which is the number of degrees of freedom of the score test.
 _GROWTHS = 3
@@ -280,8 +280,8 @@ def iterate(
 def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint: float) -> bool:
     """Return whether new fit windows are needed, because streak ends moved or the acceleration changed.
 
-    The argument The argument `faint` is the displacement (px) of an untrusted star's streak ends above which
-    the fit windows are selected again. star's streak ends above which the fit windows are selected again.
+    The argument `faint` is the displacement (px) above which the streak ends of a star without effect on the
+    motion require new fit windows.
     """
     grown = float(np.linalg.norm(after.motion.acceleration - before.motion.acceleration))
     if grown > _GROWN * float(np.linalg.norm(after.motion.rotation)):
@@ -386,7 +386,7 @@ def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
 def _end_motions(
     camera: FitProblem, scene: StreakScene
 ) -> Iterator[tuple[int, float, CameraMotion, FloatArray, FloatArray]]:
-    """Yield column index, outward sign, a uniform motion, and end positions and speeds for both streak ends.
+    """Yield, for each end of the streaks, array column, outward sign, uniform motion, positions and speeds.
 
     A uniform motion extrapolates the paths, because the true motion may come to rest at a streak end.
     """
@@ -545,13 +545,13 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
 # Largest change of the rate over the exposure, relative to the rate at mid-exposure.
 # The rate of a motion that starts or ends at rest changes by 2 in this measure.
 _MOST_CHANGE = 2.2
-# Deviation (standard deviations) of a star's motion from that of the majority above which it is untrusted.
+# Deviation (standard deviations) from the majority's motion above which a star must not affect the motion.
 _TRUST_SIGMAS = 3.5
 # Model error (px) of the ends of a streak, assumed when the motions of the stars are compared.
 _END_FLOOR = 0.01
 # Model error (px) of the width of a streak, assumed when the motions of the stars are compared.
 _WIDTH_FLOOR = 0.002
-# Distance between two streaks, in half widths of a fit window, below which they are fitted together.
+# Distance between two streaks below which they are fitted together, in half widths of the fitted strips.
 _NEAR = 1.4
 # Displacement (px) of the streak ends during the fit above which faint stars are searched again.
 _FAR = 6.0
@@ -562,7 +562,7 @@ _SUBTRACTION_ERROR = 0.35
 # Maximum number of pixels in all fit windows together, which limits memory and time.
 # A pixel that lies in several fit windows counts once for each of these windows.
 _MOST_PIXELS = 60_000
-# Fraction of the maximum number of fitted pixels for a fit of the brightest streaks and their neighbours.
+# Fraction of the pixel limit that a fit of only the brightest streaks and their neighbours may use.
 _BRIGHTEST_SHARE = 0.5
 # Minimum number of bright streaks in a fit of the brightest streaks with all their neighbours.
 _LEAST_BRIGHTEST = 10
@@ -658,10 +658,9 @@ def _find_along(camera: FitProblem, first: StreakFit) -> FaintStars:
 def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> StreakFit | None:
     """Return the fit of `scene` with the motion on which the stars agree; None if the fit fails.
 
-    A score test on the pixels decides between a constant and a changing rate. The brightest untrusted stars
-    are also fitted, as long as the fit windows of all stars together have at most `room` times the usual
-    number of pixels. The remaining stars that do not agree with the common motion (untrusted stars) are
-    subtracted from the frame.
+    A score test on the pixels decides between a constant and a changing rate. The brightest stars without
+    effect on the motion are also fitted, as long as at most `room` times the usual number of pixels is
+    needed. Stars that are not fitted are subtracted from the frame.
     """
     fitted = _affordable(camera, scene, room)
     hidden = scene.select(~fitted)
@@ -673,7 +672,7 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
     if done is None or _excessive(done.scene.motion):
         return None
     scene, windows = replace(done.scene, trusted=_trusted(camera, done)), [done.windows]
-    del done  # The fit is deleted to free tens of MB, and `pop` lets the iteration free its fit windows too.
+    del done  # Deleting the old fit and popping its windows frees tens of MB during the next fit.
     done = iterate(camera, scene, camera.free, LAST, windows.pop())
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
@@ -683,7 +682,7 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
 def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
     """Return the joint fit repeated from `last` with another `camera`, or None if it does not succeed.
 
-    At the start of this fit, all bright stars are trusted.
+    At the start of the repeated fit, all bright stars affect the motion.
     """
     scene = last.scene
     leading = np.arange(len(scene.light)) < max(camera.settings.most_stars, 1)
@@ -729,7 +728,7 @@ def _excessive(motion: CameraMotion) -> bool:
 
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
-    """Return which trusted stars agree with the motion of the majority, or all of them if too few agree."""
+    """Return which stars in the motion fit agree with the majority's motion, or all if too few agree."""
     estimates = star_estimates(rough.evaluation, rough.scene, camera.free)
     before = rough.scene.trusted
     if estimates is None:
@@ -750,7 +749,7 @@ def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
 
 
 def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArray:
-    """Return a mask (n,) of the trusted stars and of the brightest other stars within the pixel limit."""
+    """Return a mask (n,) of the stars in the motion fit and of the brightest others that the limit allows."""
     room = window_areas(camera.pinhole, scene, camera.settings.reach)
     order = np.lexsort((-scene.light, ~scene.trusted))
     needed = np.empty(len(room))
@@ -759,7 +758,7 @@ def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArra
 
 
 def _subtracted(camera: FitProblem, others: StreakScene) -> FitProblem:
-    """Return `camera` with the stars `others` subtracted from the frame and the error added to the noise."""
+    """Return `camera` without the stars `others`, whose model errors are added to the noise of the frame."""
     if not len(others.light):
         return camera
     signal, floor = camera.frame.signal.copy(), camera.frame.floor.copy()

@@ -60,18 +60,17 @@ _SAMPLES = 129
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockPixels:
-    """Values of the frame on blocks of pixels near stars; the first axis of most arrays is that of b blocks.
+    """The frame's values at the fitted pixels, which are grouped in b blocks along the first array axis.
 
     Attributes:
-        slot: index of each pixel in the list of all fitted pixels, in which every pixel of the frame occurs
-            once. Where two stars share a pixel, both of its copies have the same `slot`. A pixel outside the
-            frame has the number of fitted pixels as its `slot`.
+        slot: index of each pixel in the list of all fitted pixels, in which a pixel that two stars share
+            occurs only once. For a pixel outside the frame, `slot` is the number of fitted pixels.
         inside: mask of the fitted pixels of each block.
         signal: counts of each pixel above the background.
         floor: noise variance of each pixel without a star, counts^2.
         ceiling: counts above the background from which each pixel is saturated.
         gain: gain of the camera, electrons per count.
-        crowded: flat indices, in the blocks, of the e pixels that several stars share (e,).
+        crowded: flat indices (e,), in the arrays of this class, of the e pixels that several stars share.
         common: index of each shared pixel in the list of all pixels that several stars share (e,).
     """
 
@@ -179,7 +178,7 @@ def cut_windows(
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
     named = index[inside]
-    # Only array elements of fitted pixels are written, each with the index of the pixel's last occurrence.
+    # If a pixel occurs in several windows, `number` keeps the index of the last occurrence.
     order = np.arange(len(named), dtype=np.int32)
     number = np.empty(frame.signal.size, dtype=np.int32)
     number[named] = order
@@ -343,17 +342,17 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedPixels:
-    """Derivatives of the modelled counts on e pixels that several stars share, in the order of b blocks.
+    """Derivatives of the modelled counts at the e pixels that several stars share, sorted by block of pixels.
 
     Attributes:
         star: index of the star of each block of pixels (b,).
-        matrix: coefficients of the i basis images in the derivatives by each parameter, (b, i, SHARED +
+        matrix: coefficients that combine i images into the derivatives by each parameter, (b, i, SHARED +
             ALONE) for b blocks.
         block: index of the block to which each of the e shared pixels belongs (e,).
         first: index of the first shared pixel of each block (b,).
         slot: index of each pixel in the list of all pixels that several stars share (e,).
         weight: inverse variance of the counts of each of the e shared pixels (e,).
-        images: values of the i basis images on the e shared pixels (i, e).
+        images: values of the i images that are combined into the derivatives, at the e shared pixels (i, e).
     """
 
     star: IntArray
@@ -417,9 +416,9 @@ def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: Fi
 def model_images(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
-    """Return the basis images of long streaks, the images of spots, and the derivatives of the spot images.
+    """Return the images whose combinations model long streaks, and the images of spots with derivatives.
 
-    The last basis image of each long streak is uninitialised and later holds the residual.
+    The last image of each long streak is left uninitialised, as room for the residual.
     """
     long, spot = scene.stars[windows.long], scene.stars[windows.spot]
     images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips, 1)
@@ -432,7 +431,7 @@ def model_images(
 def _block_coefficients(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, growing: bool
 ) -> FloatArray:
-    """Return the coefficients (b, IMAGES, SHARED + ALONE) of basis images in the derivatives by parameter."""
+    """Return coefficients (b, IMAGES, SHARED + ALONE) that combine images into derivatives by parameter."""
     strips = windows.strips
     light = scene.light[windows.long[strips.star]]
     geometry = streak_model.coefficients(
@@ -457,8 +456,8 @@ def _add(
 ) -> None:
     """Add the contributions of blocks of pixels, in the order of their stars, to the normal equations.
 
-    The last basis image of each block of pixels holds the residual. Products of the residual with the other
-    basis images give the gradient, and the squared residual gives chi-square.
+    The last of the `images` of each block of pixels is the residual. Products of the residual with the other
+    images give the gradient, and the squared residual gives chi-square.
     """
     blocks, count = images.shape[:2]
     flat = images.reshape(blocks, count, -1)
@@ -507,7 +506,7 @@ def _spot_images(
 ) -> Float32Array:
     """Return the derivatives (n, SHARED + ALONE + 1, p, p) of n spot images of p x p pixels by parameter.
 
-    The last element along the second axis is uninitialised and later holds the residual.
+    The last element along the second axis is left uninitialised, as room for the residual.
     """
     light = scene.light[windows.spot, None, None, None]
     images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
@@ -755,7 +754,7 @@ _LEAST_EFFECTIVE = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarEstimates:
-    """Changes of k combinations of shared parameters (n, k) from each of n stars, and standard deviations."""
+    """Estimates of k parameter changes from each of n stars, and their standard deviations, both (n, k)."""
 
     change: FloatArray
     deviation: FloatArray

@@ -9,23 +9,24 @@ of a path. The pixels near the paths are selected once, and during the fit only 
 are updated.
 
 Near a pixel, the path is approximated by an arc on which the star has the speed v, and s and n are
-coordinates along and across the arc. A star of unit flux gives each pixel the counts
+coordinates along and across the arc. The following equation gives the counts m of a pixel from a star of unit
+flux.
 
     m = (1/v) g(n) [Phi((s - s0)/w) - Phi((s - s1)/w)] / sqrt(1 - k n),
 
-where g is a Gaussian of standard deviation w, Phi the cumulative normal distribution, k the curvature of the
-arc, and s0 and s1 the coordinates along the arc at the start and end of the exposure. With a rolling shutter,
-s0 and s1 depend on the pixel's row. The integration over the square pixel is included in the width w by w^2 =
-sigma^2 + 1/12, where sigma is the width of the point spread. The fourth cumulant of a uniform distribution
-over the pixel, -1/120 along each axis, corrects the profile across the path. If a parameter displaces the
-path at time t by c(t), the modelled counts m of a pixel change by
+In this equation, g is a Gaussian of standard deviation w, Phi the cumulative normal distribution, k the
+curvature of the arc, and s0 and s1 the coordinates along the arc at the start and end of the exposure. With a
+rolling shutter, s0 and s1 depend on the pixel's row. The integration over the square pixel is included in the
+width w by w^2 = sigma^2 + 1/12, where sigma is the width of the point spread. The fourth cumulant of a
+uniform distribution over the pixel, -1/120 along each axis, corrects the profile across the path. The
+following equation gives the change dm of the counts if a parameter displaces the path at time t by c(t).
 
     dm = c_n n/w^2 m + c_s(t1) e1 - c_s(t0) e0 - (dc_s/ds) m,
 
-where c_n and c_s are the components of c across and along the path, and e0 and e1 are the counts per px at
-the two streak ends. All derivatives of the counts are combinations of seven basis images, with coefficients
-for each block of pixels. One basis image, the first moment of m along the path, accounts for derivatives that
-change along a block of pixels.
+In this equation, c_n and c_s are the components of c across and along the path, and e0 and e1 are the counts
+per px at the two streak ends. All derivatives of the counts are combinations of seven basis images, with
+coefficients for each block of pixels. One basis image, the first moment of m along the path, accounts for
+derivatives that change along a block of pixels.
 
 A spot is a short streak or the slow part of a longer streak. The model of a spot is a sum of Gaussians at
 instants of the exposure (Gauss-Legendre quadrature), each integrated over every pixel. The quadrature is also
@@ -102,7 +103,7 @@ class Strips:
     inside: BoolArray
 
     def rows(self, of: IntArray | slice) -> Float32Array:
-        """Return the row indices in the frame of the pixels (.., LINES, k) of the selected blocks (`of`)."""
+        """Return the frame's row indices (.., LINES, k) of the pixels in the blocks that `of` selects."""
         along = np.arange(self.index.shape[2]) * self.step[of, 1, None, None]
         return (self.corner[of, :, 1, None] + along).astype(np.float32)
 
@@ -118,8 +119,8 @@ def cut_strips(
     """Return the pixels within `width` px of the paths of `stars` (n, 2), px, between start and end `times`.
 
     The start and end times (n, 2) are in exposures from mid-exposure. The mask `ending` (n, 2) states which
-    of them are ends of a streak. At the end of a streak, pixels beyond the end are included. If `ending` is
-    None, all times are ends of a streak.
+    start and end times are ends of a streak. At the end of a streak, pixels beyond the end are included. If
+    `ending` is None, all times are ends of a streak.
     """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
     if ending is not None:
@@ -175,7 +176,7 @@ def _parts(
         1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_ROTATION)
     )
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
-    edges[:, -1] = times[:, 1]  # The comparison with the end time is for exact equality.
+    edges[:, -1] = times[:, 1]  # Exact, because streak ends are found by a test for equality.
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
     owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)
@@ -451,7 +452,7 @@ def images(
     strips: Strips,
     more: int = 0,
 ) -> Float32Array:
-    """Return the basis images (b, IMAGES + more, LINES, k) of stars (n, 2), px, of unit flux on pixel strips.
+    """Return images (b, IMAGES + more, LINES, k) whose combinations model `stars` (n, 2), px, of unit flux.
 
     The argument `width` is the width w of the point spread, px. The last `more` images are left uninitialised
     for the caller.
@@ -477,7 +478,7 @@ def _draw(
     shutter: Shutter,
     width: float,
 ) -> None:
-    """Compute the basis images of the blocks `part` from the path where it crosses the blocks' lines."""
+    """Compute the basis images for the blocks `part` of pixels from the star's path through these blocks."""
     speed, time = path[2], strips.time[part]
     # The variable `gained` is the star's acceleration along its path, px per exposure^2.
     gained = np.sum(path[3] * path[1], axis=-1)
@@ -597,7 +598,7 @@ def coefficients(
     strips: Strips,
     growing: bool = True,
 ) -> FloatArray:
-    """Return the coefficients (b, IMAGES, 8) of the basis images in a star's derivatives, for b blocks.
+    """Return coefficients (b, IMAGES, 8) that combine images into a star's derivatives on b pixel blocks.
 
     The eight derivatives are with respect to rate (3), acceleration (3), and the star's position x and y. The
     derivatives with respect to the acceleration are zero unless the rate changes (`growing`).
@@ -630,7 +631,7 @@ def coefficients(
 def _displacements(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the displacements of a path along and across it by each parameter, and the star speeds."""
+    """Return the displacements along and across paths per unit of each parameter, and the star speeds."""
     change, velocity = sensitivities_and_velocity(pinhole, motion, stars, time, growing)
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
     tx, ty = (velocity / speed[:, None]).T[:, :, None]

@@ -42,7 +42,7 @@ from knightcube.vision.streaks.streak_result import MotionResult
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
-# Increase of the residual limit for another star's flux, relative to a line's brightest modelled pixel.
+# Addition to the limit for another star's flux, relative to the brightest modelled pixel of the same line.
 _FOREIGN_SHARE = 0.6
 # Minimum sensitivity of a pixel to a displacement of a streak, relative to the block's most sensitive pixel.
 _LEAST_SENSITIVITY = 0.02
@@ -50,13 +50,14 @@ _LEAST_SENSITIVITY = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakResiduals:
-    """Residuals of the trusted streaks, on b blocks of pixels.
+    """Residuals of the streaks that determine the motion, on b blocks of pixels.
 
     Attributes:
         star: index in the scene of the star of each block of pixels (b,).
         time: time at which the star crosses each line of pixels (b, LINES) of the b blocks, in exposures from
             mid-exposure.
-        images: basis images of the streak model on lines of k pixels, (b, IMAGES, LINES, k) for b blocks.
+        images: images that are combined to model a streak, on lines of k pixels, (b, IMAGES, LINES, k) for b
+            blocks.
         weight: inverse variance of each pixel of the b blocks (b, LINES, k), 0 for excluded pixels.
         residual: measured minus modelled counts of each pixel of the b blocks (b, LINES, k).
     """
@@ -69,7 +70,7 @@ class StreakResiduals:
 
 
 def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
-    """Return the residuals of the fit on the pixel strips of its trusted streaks."""
+    """Return the residuals of the fit on the pixels of the long streaks that determine the motion."""
     scene, windows = fit.scene, fit.windows
     images, spots, _ = model_images(camera.pinhole, camera.shutter, scene, windows)
     of_block = windows.long[windows.strips.star]
@@ -129,7 +130,7 @@ def _sensitive(left: StreakResiduals, change: Float32Array) -> BoolArray:
 def _displacement(
     left: StreakResiduals, squares: Float32Array, change: Float32Array, on: BoolArray, usual: float
 ) -> Displacement | None:
-    """Return the displacement that would explain the squared residuals `squares` on the pixels `on`.
+    """Return the displacement that explains the squared residuals `squares` on the pixels of the mask `on`.
 
     The array `change` is the change of the counts per px of displacement, and `usual` is the expected
     weighted square of a residual without displacement.
@@ -190,13 +191,13 @@ def correct(
         information: Fisher information of each star on k shared parameters (n, k, k), after elimination of
             the star's own parameters.
         score: gradient of each star's log-likelihood by the k shared parameters (n, k).
-        apparent: apparent change (n, k, m) of k shared parameters of each star by each of m calibration
+        apparent: change (n, k, m) of each star's estimate of k shared parameters by each of m calibration
             errors of one standard deviation. The calibration errors of specified standard deviation are the
             first of the m errors.
         spread: variance of the scatter of the stars, relative to their noise.
         described: number of calibration errors whose standard deviation is specified.
         counted: calibration errors that the fit has already corrected, in standard deviations (m,). The
-            resulting calibration errors are relative to `counted`.
+            solved calibration errors are in addition to `counted`.
     """
     m = apparent.shape[2]
     known = information / spread
@@ -328,7 +329,7 @@ class CommonMotion:
 
 
 def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> CommonMotion:
-    """Return the motion common to the trusted streaks, which is zero if there are no long streaks.
+    """Return the vibration common to the streaks that determine the motion, or zero without long streaks.
 
     At each time, vibration displaces all streaks equally across their paths. Along the paths, vibration
     changes the speed of the stars and thereby their intensity. The residuals of all stars are averaged in
@@ -508,11 +509,11 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 
 # Maximum number of conjugate-gradient iterations in the computation of the covariance.
 _CONJUGATE = 12
-# Number of stars up to which no consistency test is possible, and factor on the variance of such a fit.
+# Largest number of stars that cannot be tested for agreement, and the resulting factor on the variance.
 _UNCHECKED = (2, 4.0)
 # Relative difference between fitted and configured point-spread variance that is neglected.
 _SAME_SPREAD = 0.05
-# Uncertainty of streak ends, relative to the root of the difference of fitted and configured variance.
+# Uncertainty of streak ends per root difference between fitted and configured point-spread variance.
 _END_SHARE = 0.6
 # Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
 _END_FLOOR = 0.12
@@ -520,7 +521,7 @@ _END_FLOOR = 0.12
 _END_SHOWN = 1.5
 # Uncertainty of streak ends, relative to the upper limit of the displacement from their residuals.
 _END_CHANCE = 0.5
-# Uncertainty of streak ends (px) per motion common to all streaks (px across, or relative brightness).
+# Ratio of the streak ends' error (px) to vibration common to all streaks (px across, or brightness).
 _END_COMMON = 25.0
 # Maximum number of iterations of the lens correction.
 _MOST_LENSES = 3
@@ -608,7 +609,8 @@ class _LensEffect:
         described: part of `added` (3, 3) from calibration errors whose standard deviation is specified,
             rad^2.
         spread: variance of the scatter of the stars, relative to their noise.
-        error: remaining m calibration errors relative to `counted`, in standard deviations (m,).
+        error: estimated calibration errors that remain after the correction of `counted`, in standard
+            deviations (m,).
         counted: calibration errors that the fit has already corrected, in standard deviations (m,); None
             without any.
         seen: whether the stars show the calibration errors significantly.
@@ -652,7 +654,7 @@ def _corrected_lens(
 def _lens_effect(
     camera: FitProblem, last: StreakFit, exposure: float, counted: FloatArray | None
 ) -> _LensEffect:
-    """Return the effect on the rotation of the calibration errors that remain beyond `counted` (m,)."""
+    """Return the effect on the rotation of calibration errors that remain after correcting `counted` (m,)."""
     nothing = np.zeros((3, 3))
     equations = star_equations(last.evaluation, last.free)
     if equations is None:

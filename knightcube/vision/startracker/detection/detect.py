@@ -123,7 +123,7 @@ class Detections:
         return len(self.flux)
 
 
-# At the distance d, a bright star's wings are at most share (1 + (d / scale)^2)^-power of its peak.
+# Limit of a star's wings at d px from the peak, relative to the peak: share (1 + (d / scale)^2)^-power.
 _WING_SCALE, _WING_POWER, _WING_SHARE = 2.0, 2.0, 0.7
 _WINGS_END = 60.0
 _CELLS = 4
@@ -315,7 +315,7 @@ def quality_of(found: MeasuredStars, shapes: Shapes, spread: FrameSpread, target
 
 
 def plain_ones(sound: BoolArray, targets: StarTargets) -> BoolArray:
-    """Return which of the `sound` stars (n,) determine the PSF.
+    """Return which of the usable stars `sound` (n,) determine the PSF.
 
     The PSF is determined by the stars that are not saturated, or by all stars if all are saturated.
     """
@@ -377,7 +377,7 @@ def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
     clutter = restless | cluttered(areas, peaks.place, _CLUTTERED_SHARE)
     long = is_streak(areas)[peaks.area]
     if frame_shape(areas).kind is not FrameKind.STREAKS:
-        # A row of stars is also a long area, but has several peaks. A bright star in a corner has a tail.
+        # A long area may also be a row of stars, with several peaks, or a bright star with a tail from coma.
         long &= np.bincount(peaks.area, minlength=len(areas))[peaks.area] == 1
         long &= (areas.length[peaks.area] > _LONGER_THAN_COMA) & (peaks.core == 0.0)
     return np.asarray(Quality.CLUTTER * clutter | Quality.STREAK * long)
@@ -492,7 +492,7 @@ def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray
 
 
 def _reach(values: FloatArray) -> float:
-    """Return the 97.7th percentile of each row of `values` (n, k), as the median over the rows."""
+    """Return the median over the rows of the 97.7th percentile of each row of `values` (n, k)."""
     place = int(TAIL_PART * values.shape[1])
     return float(np.median(np.partition(values, place, axis=1)[:, place]))
 

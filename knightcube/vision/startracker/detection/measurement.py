@@ -44,7 +44,7 @@ FIRST_WIDTH = 1.0
 _HALF_OF_FIRST = 4
 LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
-"""Half-width of a star's window, in PSF standard deviations, within `LEAST_HALF` and `MOST_HALF` px."""
+"""Half-width of a star's window, in PSF standard deviations, but from `LEAST_HALF` to `MOST_HALF` px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
 # Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the star's counts.
 # The mismatch is smaller than in the first fit, so that not only the wings of bright stars are used.
@@ -228,7 +228,7 @@ def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: floa
         off = steps - place[:, :, None, None]
         window = np.exp(-0.5 * np.sum(off * off, axis=1) / psf_sigma**2)
         seen = (window * clean)[:, None]
-        # The derivative of the weighted sum by the weight's position, about half of the sum, is `gain`.
+        # `gain` is the derivative of the weighted sum by the weight's position, about half of the sum.
         gain = np.sum(seen * (1.0 - off * off / psf_sigma**2), axis=(2, 3))
         half = 0.5 * np.sum(seen, axis=(2, 3))
         gain = np.maximum(gain, np.maximum(0.5 * half, 1e-30))
@@ -465,8 +465,8 @@ def _shared(
 ) -> PsfFit:
     """Return the fits with blended stars fitted again, each after the light of its neighbours is subtracted.
 
-    The fits start from the offsets (n, 2), px, and fluxes (n,), counts, in `begin`, because a fit of two
-    stars as one is a bad start.
+    The fits start from the offsets (n, 2), px, and fluxes (n,), counts, in `begin`, because the position from
+    a fit of two stars as one is a poor initial value.
     """
     some = np.unique(pairs.first)
     own = windows.select(some)

@@ -401,7 +401,7 @@ def fit(
 
 
 def _jacobian(values: FloatArray, windows: StarWindows, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the modelled counts of the stars (n, k, k), and their derivatives (n, count, k k)."""
+    """Return the modelled counts of the stars (n, k, k), and their derivatives (n, count, k * k)."""
     total: FloatArray | None = None
     flux, size = values[:, FLUX, None], 2 * windows.half + 1
     for shift, share in path(windows.trail):
@@ -416,7 +416,7 @@ def _jacobian(values: FloatArray, windows: StarWindows, count: int) -> tuple[Flo
             out[:, WIDTH] = (flux * down)[:, :, None] * across_w[:, None, :]
             out[:, WIDTH] += (flux * down_w)[:, :, None] * across[:, None, :]
         total = share * out if total is None else total + share * out
-    assert total is not None  # a path has at least one point
+    assert total is not None  # A star's path has at least one quadrature node.
     star = values[:, FLUX, None, None] * total[:, FLUX]
     return star, total.reshape(len(values), count, -1)
 

@@ -213,16 +213,16 @@ SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
 """Resolution of the longest side in a triangle's key; the side is a chord below 1."""
 RUN_BITS = 12
-"""Binary logarithm of the number of size units that share an entry of `TriangleIndex.below`."""
+"""Binary logarithm of the interval of key values between two entries of `TriangleIndex.below`."""
 TIE = 1e-9
-"""Relative tolerance in the comparison of a triangle's side with a limit, because both may be equal."""
+"""Relative tolerance in comparisons of a triangle's side with a limit, which the side may exactly equal."""
 LEAST_RATIO = 0.1
-"""Minimum ratio of the shortest to the longest side of a triangle; flatter triangles resemble pairs."""
+"""Minimum ratio of the shortest to the longest side of a triangle; flatter triangles are not distinctive."""
 
 
 # Distance between the centres of neighbouring circles that together cover the sky, relative to their radius.
 _CIRCLES_APART = 0.7
-# Mean number of stars per circle in the first search of a circle, relative to the number of stars needed.
+# Mean number of stars per circle that are searched first, relative to the number of stars needed.
 _ENOUGH = 4.0
 
 
