@@ -313,7 +313,7 @@ class _ArcFit:
         for _ in range(_FINAL_ROUNDS):
             residual, jacobian = self._linear(unknowns[None])
             (step,), (covariance,) = _solved(residual, jacobian)
-            # Shorten steps beyond the linear range of the logarithm.
+            # Shorten steps for which the fit is not linear in the logarithm of the distance.
             unknowns = unknowns - step * min(1.0, 0.3 / max(abs(float(step[5])), 1e-12))
             if abs(float(step[5])) < 1e-4 * math.sqrt(float(covariance[5, 5])):
                 break

@@ -5,8 +5,9 @@ The filter uses measured directions only, without ranges. The filter state consi
 and y moves on a straight line. The motion is therefore linear at any angular rate, and only the measurement
 is nonlinear. After each step the state is divided by the length of y, so that y is a unit vector again. The
 filter state is the vector form of the modified polar coordinates of Aidala and Hammel (1983, IEEE
-Transactions on Automatic Control 28). The component of z across the line of sight is the angular rate v. The
-component of z along the line of sight is s = (range rate) / range. The angular acceleration is -2 s v.
+Transactions on Automatic Control 28). The component of the velocity z across the line of sight is the angular
+rate v. The component of the velocity z along the line of sight is s = (range rate) / range. Without forces
+the angular acceleration is -2 s v.
 
 Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
 gradient gives the relative acceleration of object and observer, to first order in the distance divided by the
@@ -14,8 +15,9 @@ orbit radius.
 
 The process noise models tidal accelerations as white noise of density `wander`, or `residual_wander` if the
 gravity gradient is known. More process noise along the line of sight lets the filter follow motions that are
-not straight lines. For example, s changes by rate^2 per second for an object that moves along a great circle
-at a constant rate. The additional density is (`bend` rate^2)^2 / rate.
+not straight lines. For example, (range rate) / range changes by rate^2 per second for an object that moves
+along a great circle at a constant angular rate. The additional noise density is (`bend` rate^2)^2 / rate,
+with the angular rate of the object.
 
 Sightings are assigned to tracks in order of increasing chi-square, each sighting to at most one track. This
 is the greedy nearest neighbour method (Blackman and Popoli 1999, Design and Analysis of Modern Tracking
@@ -193,7 +195,7 @@ def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArra
 def _at_unit_range(
     time_ns: int, position: FloatArray, velocity: FloatArray, covariance: FloatArray
 ) -> LineOfSightState:
-    """Return the line of sight for a state that is divided by the range, the length of `position`."""
+    """Return the line of sight from a state, whose parts are divided by the length of `position`."""
     size = float(np.linalg.norm(position))
     direction, scaled = position / size, velocity / size
     jacobian = np.zeros((6, 6))

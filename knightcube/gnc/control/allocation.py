@@ -51,8 +51,8 @@ def allocate(
     """Return currents for a torque (3,) N m in a magnetic field (3,) T, body axes.
 
     The current limits of the coils are `limits` (3,), A, and the mask `available` (3,) marks the coils that
-    may be used. The mask `free` (3,) marks the axes about which the body can rotate; a thread carries the
-    torque about the other axes. Raises FlightError for an input that is not finite.
+    may be used. The mask `free` (3,) marks the axes about which the body can rotate; a suspension thread
+    carries the torque about the other axes. Raises FlightError for an input that is not finite.
     """
     wanted = np.asarray(torque, dtype=np.float64)
     if not (np.isfinite(wanted).all() and np.isfinite(field).all()):

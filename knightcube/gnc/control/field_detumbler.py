@@ -20,18 +20,19 @@ satisfies
 
     h . y <= L integral of |B x y| over T + r |y|,
 
-The minimum time is the smallest T for which every y satisfies this inequality, and the plan is the worst y,
-for which the inequality holds with equality. For the worst y, A(y) y is parallel to h, where A is the
-integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. The worst y is found by iteratively reweighted least
-squares: A is computed with the last y, and then the next y from A. Momentum along the field can be removed
-only after the field has rotated. The minimum-time plan may first add momentum across the field, which is
-removed later. The plan leaves a residual momentum r, because removing the last momentum along a slowly
-rotating field would take most of the time.
+The minimum time is the smallest T for which every y satisfies this inequality, and the planned costate is the
+y for which the inequality holds with equality. For the planned costate y, A(y) y is parallel to h, where A is
+the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. The planned costate is found by iteratively
+reweighted least squares: the matrix A is computed with the last costate, and then the next costate from A.
+Momentum along the field can be removed only after the field has rotated. The minimum-time plan may first add
+momentum across the field, which is removed later. The plan leaves a residual momentum r, because removing the
+last momentum along a slowly rotating field would take most of the time.
 
 The minimum-time plan first accelerates a body that spins along the field, about an axis across the field. The
-settings `gentle` and `spin_up` therefore give an upper bound of the rate. At this bound, the commanded dipole
-moment does not increase the rate. If the bound equals the initial rate, detumbling takes longer, because a
-spin along the field is then stopped only after the field has rotated by a right angle.
+settings `gentle` and `spin_up` therefore give an upper bound of the rate. At this upper bound of the rate,
+the commanded dipole moment does not increase the rate. If the upper bound equals the initial rate, detumbling
+takes longer, because a spin along the field is then stopped only after the field has rotated by a right
+angle.
 """
 
 from __future__ import annotations
@@ -198,7 +199,7 @@ class _FieldPreview:
         return np.asarray(np.tensordot(weight, self.effect[:count], 1) + self.rest * np.eye(3))
 
     def worst(self, momentum: FloatArray, count: int, guess: FloatArray) -> FloatArray:
-        """Return the unit vector y (3,) along which `count` instants can remove the least momentum."""
+        """Return the direction (3,) along which coils remove the least momentum in `count` instants."""
         y = guess
         for _ in range(ITERATIONS):
             found = np.linalg.solve(self.matrix(y, count), momentum)

@@ -53,7 +53,7 @@ from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_task
 RESERVE = 0.8
 """Fraction of the coils' limit that a planned slew may use; the remainder is for the correction of errors."""
 STIFFER = 5.0
-"""Factor by which the dipole moment with a cost of one is larger during a slew than otherwise."""
+"""Ratio of the dipole moment of unit cost during a slew to the dipole moment of unit cost otherwise."""
 LONGEST = 1_500.0
 """Longest duration of a slew, s. A slew must be shorter than a table, which also includes some time after the
 slew."""
@@ -180,8 +180,8 @@ def slew_table(
 
     A step of this table is a fifth of a step of `begin.times`.
 
-    The path was planned with the residual dipole moment `residual` (3,), A m^2. Only the environment of
-    `expected` is used, at the times of `begin`.
+    The path was planned with the residual dipole moment `residual` (3,), A m^2. From `expected`, only the
+    environment is used, which is given at the times of `begin`.
     """
     step, first = float(begin.times[1] - begin.times[0]) / FINE, float(begin.times[0])
     law = law_of(target, axes, path.quaternion[-1], ahead, first + path.horizon)
@@ -218,7 +218,7 @@ def slew_table(
 
 
 def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeReferences:
-    """Return a path interpolated at `times` (n,), s, with arbitrary values at the first `count` instants."""
+    """Return a path interpolated at `times` (n,), s; the first `count` instants are placeholders."""
     rest = [path.at(float(time)) for time in times[count:]]
     whole = [*[rest[0]] * count, *rest]
     return AttitudeReferences(

@@ -2,8 +2,8 @@
 
 The law is linear in small rotations. With a large error, the law would saturate the coils and could make a
 light body rotate faster than before. A new path is therefore planned if the body leaves the planned path. Far
-from the planned path, the body is first damped until its rate is low. The damping torque is the component of
--2 w J rate normal to the field, which removes energy in any attitude.
+from the planned path, the body is first damped until its rate is low. The damping torque, which removes
+energy in any attitude, is the component normal to the field of -2 w J rate, with bandwidth w and inertia J.
 """
 
 from __future__ import annotations

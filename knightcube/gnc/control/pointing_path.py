@@ -209,8 +209,7 @@ DEAR, PROHIBITIVE = 1e4, 1e6
 """Costs of a torque along the field, relative to the cost of the same torque across the field. The cost is
 increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
 SETTLED = math.radians(20.0)
-"""Angle (rad) between the attitude of the body and the attitude law that a settled path does not exceed in
-the second half."""
+"""Largest angle (rad) from the attitude law in the second half of a path that counts as settled."""
 SWEEPS = 8
 """Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. The
 best motion is used even if the sweeps have not converged."""
@@ -323,9 +322,9 @@ class PathCriterion:
     Attributes:
         state: weights (6, 6) of rotation and rate errors relative to the law.
         dipole: weight of the squared dipole moment of each axis.
-        end: cost-to-go of following the attitude law after the path. The first column of the linear part is
-            for the law and the expected torques, and each further column is for the size of one disturbance
-            torque.
+        end: cost-to-go of following the attitude law after the path. The first column of the linear part of
+            `end` is for the law and the expected torques, and each further column is for one disturbance
+            torque of unit size.
         shape: disturbance torques of unit size (n + 1, 3, sizes), in the axes of the law.
         fastest: rate above which the cost increases steeply (see `EXCESS`), rad/s.
     """

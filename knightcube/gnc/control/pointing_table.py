@@ -64,7 +64,7 @@ def midpoint_step(expected: PathConditions, motion: PlannedMotion) -> tuple[Floa
 
 
 def defects(expected: PathConditions, motion: PlannedMotion) -> FloatArray:
-    """Return the defects (n, 6): rotation and rate from the next instant to the end of each step."""
+    """Return the defects (n, 6): rotation and rate from the next instant's state to the propagated state."""
     there, speed = midpoint_step(expected, motion)
     turn = to_rotation_vector(multiply(there, conjugate(motion.quaternion[1:])))
     return np.concatenate([turn, speed - motion.rate[1:]], axis=1)
@@ -139,7 +139,7 @@ DONE = math.radians(0.05)
 iteration improves the merit by less than the fraction SAVED."""
 SAVED = 1e-4
 ENOUGH = 0.01
-"""Largest sum of weighted defects of an acceptable motion, relative to one plus the cost of the motion."""
+"""Largest accepted sum of the weighted defects of a motion, divided by 1 + cost of the motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,9 +292,9 @@ class PointingWeights:
     """Weights of the errors. Each weight is given as the size of an error that has a cost of one.
 
     Attributes:
-        turn: rotation error about each axis with unit cost, rad.
-        rate: rate error about each axis with unit cost, rad/s.
-        dipole: dipole moment of each axis with unit cost, A m^2.
+        turn: rotation error about one axis that has a cost of one, rad.
+        rate: rate error about one axis that has a cost of one, rad/s.
+        dipole: dipole moment along one axis that has a cost of one, A m^2.
         fastest: rate above which the cost increases steeply while the body approaches the law (see
             `pointing_path.EXCESS`), rad/s.
         roll: rotation error with unit cost about the unit vector `axis` (3,), rad, if rotations about this

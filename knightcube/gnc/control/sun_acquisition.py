@@ -1,16 +1,17 @@
 """Alignment of a body axis with the Sun by solar cells, gyro and magnetometer, without an attitude estimate.
 
 The direction of the Sun s and the field B are measured in body axes, and propagated between measurements by
-the gyro. The law demands the torque J (w^2 e - 2 z w rate), where e is the rotation from the body axis to the
-Sun. The coils can produce only the component of this torque across the field (Lovera & Astolfi 2004,
-Automatica 40(8)). A torque about the direction of the Sun is therefore added, such that the sum has no
-component along the field. A torque about the Sun disturbs the pointing of the body axis least. Unless the
-field is normal to the direction of the Sun, both axes across this direction are controlled simultaneously,
-while the body may roll about the direction. The torque about the direction of the Sun is reduced for a body
-that rolls fast. The direction of the Sun is propagated through an eclipse (`PropagatedSun`). Without a known
-direction, the body is only damped. The residual dipole moment, which causes the largest torque on a light
-body, is estimated and cancelled (`ResidualDipole`). The coils are off while the field is measured. The coils
-are driven only after the fields measured in two consecutive pauses agree.
+the gyro. The law demands the torque J (w^2 e - 2 z w rate), with bandwidth w, damping ratio z, and the
+rotation e from the body axis to the Sun. The coils can produce only the component of this torque across the
+field (Lovera & Astolfi 2004, Automatica 40(8)). A torque about the direction of the Sun is therefore added,
+such that the sum has no component along the field. A torque about the Sun disturbs the pointing of the body
+axis least. Unless the field is normal to the direction of the Sun, both axes across this direction are
+controlled simultaneously, while the body may roll about the direction. The torque about the direction of the
+Sun is reduced for a body that rolls fast. The direction of the Sun is propagated through an eclipse
+(`PropagatedSun`). If the direction of the Sun is unknown, the rate of the body is only damped. The residual
+dipole moment, which causes the largest torque on a light body, is estimated and cancelled (`ResidualDipole`).
+The coils are off while the field is measured. The coils are driven only after the fields measured in two
+consecutive pauses agree.
 """
 
 from __future__ import annotations

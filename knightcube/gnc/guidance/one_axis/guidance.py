@@ -81,7 +81,7 @@ class PathGuidance:
         """Create a guidance that checks plans against `plant` and the limits.
 
         If `arrives` is true, paths must end at the target attitude, which is then held. If `arrives` is
-        false, the horizon recedes, and a path is only followed to the end if later plans are missing.
+        false, later plans normally replace a path before its end, so the path may end elsewhere.
         """
         self._plant = plant
         self._rules = rules
@@ -105,7 +105,7 @@ class PathGuidance:
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
         """Set the target attitude and its rate in rad/s; the present path is followed until a new plan comes.
 
-        Raises UsageError if a value is not finite or q2 is beyond the limit of q2.
+        Raises UsageError if a value is not finite or |target_q2| exceeds `AcceptanceRules.q2_limit`.
         """
         if not abs(target_q2) <= self._rules.q2_limit:  # NaN compares false
             raise UsageError(f"target q2 is {target_q2}: it must lie within +-{self._rules.q2_limit}")

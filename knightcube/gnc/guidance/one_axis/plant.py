@@ -1,11 +1,11 @@
 """The single-axis plant, the power of the coil, and polynomial paths of the angle.
 
-The plant is a rigid body on a thread, rotated by one torque coil in a fixed horizontal field. The equation of
-motion is Sease 2013, eq. (5.4), with the thread and a constant disturbance d added: J (w' - d) = n A B I
-cos(theta) - k theta - c w. In this equation theta is the angle about the thread, from which q2 =
-sin(theta/2). Planner, tracker and estimator use the same equations of motion, so that the tracker can follow
-the planned path. Functions with singular names (`current`) take floats and use `math` because they run in the
-40 Hz loop; functions with plural names (`currents`) take arrays of one shape.
+The plant is a rigid body that hangs on a thread and is rotated by one torque coil in a fixed horizontal
+field. The equation of motion is Sease 2013, eq. (5.4), with the thread and a constant disturbance d added: J
+(w' - d) = n A B I cos(theta) - k theta - c w. The angle theta of the body about the thread defines the
+quaternion component q2 = sin(theta/2). Planner, tracker and estimator use the same equations of motion, so
+that the tracker can follow the planned path. Functions with singular names (`current`) take floats and use
+`math` because they run in the 40 Hz loop; functions with plural names (`currents`) take arrays of one shape.
 
 The coils are driven by pulse-width modulation with a period of 20 ms (Sease thesis, chapter 5). The time
 constant L/R of a coil, 0.1 ms, is short compared with the period, so the coil current is V/R while the
@@ -68,7 +68,7 @@ SQUARE_Q2_WITHOUT_AUTHORITY = 0.5
 
 @dataclass(frozen=True, slots=True)
 class SingleAxisPlant:
-    """The parameters of the equation of motion about the thread.
+    """The parameters of the equation of motion about the suspension thread.
 
     Attributes:
         inertia: J, kg m^2.
@@ -162,8 +162,8 @@ def current_and_slopes(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the currents (n,), A, and the partial derivatives (n,) of the current by q2, q2' and q2''.
 
-    The current follows from Sease, eq. (5.6), with the exact w' and with the torques of thread and
-    disturbance.
+    The current follows from Sease, eq. (5.6), with the exact w' and with the torques of the suspension thread
+    and the disturbance.
     """
     square = 1.0 - q2 * q2
     by_acceleration = 2.0 / np.sqrt(square)  # the derivative dw'/dq2'' equals dw/dq2'
@@ -369,7 +369,7 @@ class PolynomialPath:
         return (now_ns - self.origin_ns) * 1e-9 >= self.horizon
 
     def sample(self, now_ns: int) -> PathSample:
-        """Return the commanded motion at `now_ns`, which rests before the start and coasts after the end."""
+        """Return the motion at `now_ns`: at rest before the start of the path, and coasting after the end."""
         elapsed = (now_ns - self.origin_ns) * 1e-9
         if elapsed >= self.horizon:
             return self._coast(elapsed - self.horizon)

@@ -6,10 +6,10 @@ horizon (duration) keeps the limits, the horizon is stretched to the shortest fe
 has the status STRETCHED. With a time cost, the horizon is optimised as well. Energy is the integral of R I^2
 in J, without the factor 1/2 of Sease, eq. (5.1).
 
-All three searches for a horizon minimise energy plus a time cost between a shortest and a longest horizon. A
-time cost far above the power of the coil, with the requested horizon as lower bound, gives the requested
-horizon if it is feasible, and otherwise the shortest feasible horizon. No infeasible nonlinear program
-therefore has to be solved.
+Every search for a horizon minimises energy plus time cost times horizon, between a shortest and a longest
+horizon. A time cost far above the power of the coil, with the requested horizon as lower bound, gives the
+requested horizon if it is feasible, and otherwise the shortest feasible horizon. The planner therefore never
+has to solve an infeasible nonlinear program.
 
 The planner is deterministic, so that the same arguments give the same plan in any process.
 """
@@ -93,9 +93,9 @@ class HorizonSearch:
     def within(self, asked: float, longest: float) -> tuple[PathProgram, Trial | None]:
         """Return the minimum-energy path over `asked` s, or over the shortest feasible time up to `longest`.
 
-        The current of a rest-to-rest slew scales with 1/T^2, so solutions without limits lead to a horizon
-        near the shortest feasible horizon. There the nonlinear program with a free horizon starts. If the
-        program has no solution, it is started again from a longer horizon.
+        The current of a rest-to-rest slew over the horizon T scales with 1/T^2, so solutions without limits
+        give an estimate of the shortest feasible horizon. The nonlinear program with a free horizon starts
+        from this estimate. If the program has no solution, it is started again from a longer horizon.
         """
         if self.warm is not None:
             program = self.program_at(asked)
@@ -127,12 +127,13 @@ class HorizonSearch:
     def with_time_cost(
         self, guess: float, shortest: float, longest: float, time_cost: float
     ) -> tuple[PathProgram, Trial | None]:
-        """Return the path that minimises energy plus `time_cost` W times the horizon, from a `guess`, s.
+        """Return the path that minimises energy plus `time_cost` (W) times horizon, from a guess of it (s).
 
         The derivative of the minimum energy by the horizon equals the partial derivative at the optimal path
         (envelope theorem). A tried horizon is a lower bound of the optimum if a longer horizon reduces the
-        total cost, otherwise an upper bound. The next horizon follows from E ~ 1/T^3, which holds for a slew
-        without limits. Only the last solution imposes the limits of current and angle.
+        total cost, otherwise an upper bound. The next horizon T is chosen as if the energy were proportional
+        to 1/T^3, which holds for a slew without limits. Only the last solution imposes the limits of current
+        and angle.
         """
         low, high, time = shortest, longest, min(max(guess, shortest), longest)
         time_cost = min(time_cost, SHORTEST_COST * self.program_at(time).bang_power)
@@ -176,7 +177,7 @@ class HorizonSearch:
     ) -> tuple[PathProgram, Trial | None]:
         """Return a path over at least `asked` s, by continuation from horizons at which a path was found.
 
-        If the torque of the thread exceeds the torque of the coil, only horizons that fit the free
+        If the torque of the suspension thread exceeds the torque of the coil, only horizons that fit the free
         oscillation of the body are feasible. From a horizon with a known path, the horizon is changed in
         steps, each started from the last path. Shorter horizons are tried first.
         """
@@ -202,7 +203,7 @@ class HorizonSearch:
         return stretched or (failed, None)
 
     def over(self, time: float, apart: FloatArray | None) -> tuple[PathProgram, Trial | None]:
-        """Return the program over `time` s, and a path within the limits found from prey plus `apart`."""
+        """Return the program over `time` s, and the path within limits found from prey path + `apart`."""
         program = self.program_at(time)
         trial = None if apart is None else program.limited(program.beside_prey(apart, time))
         if trial is None:
@@ -230,7 +231,7 @@ class HorizonSearch:
         return trial
 
     def _shortest(self, program: PathProgram, start: Trial, asked: float, longest: float) -> Trial | None:
-        """Return the shortest path of at least `asked` s; a path of exactly `asked` s has minimum energy."""
+        """Return the minimum-energy path over `asked` s, or the shortest path if `asked` is infeasible."""
         time_cost = SHORTEST_COST * program.bang_power
         trial = program.limited(start, FreeHorizon(asked, longest, time_cost))
         if trial is None or trial.horizon > asked * (1.0 + _AT_BOUND):
@@ -246,7 +247,7 @@ FINE_NODES = 40
 """Number of nodes for paths that run along the current limit near the requested horizon. With 24 nodes the
 cost of such paths is up to 0.3 % above the optimum, with 40 nodes up to 0.07 %."""
 _NEARLY = 1.03
-"""Largest stretch of a horizon at which a path on more nodes is tried over the requested horizon."""
+"""Stretch of a horizon up to which the requested horizon is tried again with more nodes."""
 
 REFERENCE = 2.0
 MAX_STRETCH = 6.0
@@ -257,7 +258,7 @@ SHORTEST_WITH_TIME_COST = 1.0
 
 
 class PlanStatus(StrEnum):
-    """Whether the requested horizon was kept; plans with a time cost are always optimal."""
+    """Whether a plan keeps the requested horizon; plans with a time cost always have the status OPTIMAL."""
 
     OPTIMAL = "optimal"
     STRETCHED = "stretched"
@@ -323,10 +324,10 @@ def plan(
     to at most `max_stretch` times the requested horizon. A stretched horizon is about 0.3 % longer than the
     shortest feasible horizon on `nodes` nodes, and at most 1.5 % longer than the bang-bang time.
 
-    With `time_cost` in W the path minimises energy plus time cost, over horizons from SHORTEST_WITH_TIME_COST
-    s to `max_stretch` times `horizon`; `horizon` is then the initial guess. The path followed until now is
-    `last`, with an origin relative to the start of the new path. The remainder of this path is the initial
-    guess. The argument `cost` selects which energy is minimised.
+    With `time_cost` in W the path minimises energy plus `time_cost` times horizon, over horizons from
+    SHORTEST_WITH_TIME_COST s to `max_stretch` times `horizon`; `horizon` is then the initial guess. The path
+    followed until now is `last`, with an origin relative to the start of the new path. The remainder of this
+    path is the initial guess. The argument `cost` selects which energy is minimised.
 
     Raises PlanningError if an argument is not finite or outside its limits, or if no allowed horizon is
     feasible.
@@ -372,12 +373,11 @@ def plan(
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
-    """Return the difference (N,) on the nodes between the rest of path `last` and the prey path of the rest.
+    """Return the difference (N,) on the nodes between the remainder of `last` and the remainder's prey path.
 
     None without a rest.
 
-    The sum of this difference and another prey path is a path between the boundary states of the other prey
-    path, which need not lie on `last`.
+    Added to another prey path, this difference gives a path with the boundary states of that prey path.
     """
     if last is None:
         return None

@@ -7,9 +7,10 @@ ends. The parameters v_2 and v_(N-1) follow from the boundary rates by q' = D q 
 (5.11), corrected). N - 4 path control parameters are free.
 
 The prey path is an affine function of the horizon T, and for a fixed prey path the path is an affine function
-of v - 1. Paths are therefore parametrised as prey(T) + M y with parameters y. The columns of M are whitened
-changes of a path, scaled by (q_p - q_r), that preserve the values and slopes at both ends. Trajectories are
-therefore affine functions of the optimisation variables, and the variables are well conditioned.
+of v - 1. Paths are therefore parametrised as prey(T) + M y with a matrix M and parameters y. Each column of
+the matrix M is a whitened change of the path, scaled by (q_p - q_r), that preserves the values and slopes at
+both ends. Trajectories are therefore affine functions of the optimisation variables, and the variables are
+well conditioned.
 
 Two programs share cost and limits: minimum energy at a fixed horizon, and minimum energy plus the time cost
 of the horizon. The limits hold at every time and not only at the nodes. The limits are imposed at those
@@ -164,7 +165,7 @@ class PathFamily:
 
 @dataclass(frozen=True, slots=True)
 class ObservedFamily:
-    """A path family at m points, with q2, dq2/ds and d2q2/ds2 affine in horizon and parameters."""
+    """A path family at m points: q2 and derivatives by scaled time, affine in horizon and parameters."""
 
     still: FloatArray
     drift: FloatArray
@@ -177,8 +178,8 @@ class ObservedFamily:
     def aging(self, trajectory: FloatArray, horizon: float) -> FloatArray:
         """Return the derivative (3, m) of q2, q2' and q2'' with respect to the horizon.
 
-        A longer horizon changes the prey path, and reduces the factors that convert derivatives by s to time
-        derivatives.
+        A longer horizon changes the prey path, and reduces the factors that convert derivatives by the scaled
+        time s to time derivatives.
         """
         slower = np.array([[0.0], [-1.0], [-2.0]]) / (horizon * time_scale(horizon))
         return np.asarray(self.drift + slower * trajectory)
@@ -237,8 +238,8 @@ class ImposedLimits:
     def at(cls, chosen: BoolArray, ratios: FloatArray) -> ImposedLimits:
         """Return the limits to impose at the points that the mask `chosen` (2, dense) selects.
 
-        The first row selects limits of the current and the second row limits of q2. The signs of `ratios` (2,
-        dense) tell whether the upper or the lower limit is imposed.
+        The first row of the mask selects limits of the current and the second row limits of q2. The signs of
+        `ratios` (2, dense) tell whether the upper or the lower limit is imposed.
         """
         row, index = np.nonzero(chosen)
         return cls(index, np.sign(ratios[row, index]), row == 1)
@@ -432,7 +433,7 @@ class PathProgram:
         try:
             found = np.asarray(solver.optimize(last))
         except _SOLVER_STOPS:
-            # Trivial and infeasible problems raise this error, after a line search of negligible length.
+            # NLopt raises this error for trivial and infeasible problems, after a negligible line search.
             return variables.trial(last), False
         return variables.trial(found), solver.last_optimize_result() in _CONVERGED
 
@@ -485,7 +486,7 @@ class _Variables:
 
 
 def _contract(slopes: FloatArray, basis: FloatArray) -> FloatArray:
-    """Return the gradient (m, n) by the chain rule from slopes (3, m) and derivatives (3, m, n)."""
+    """Return the chain-rule gradients (m, n) from slopes (3, m) by q2, q2', q2'' and their derivatives."""
     return np.asarray((slopes[:, :, None] * basis).sum(axis=0))
 
 

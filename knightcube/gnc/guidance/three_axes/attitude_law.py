@@ -301,7 +301,7 @@ def _any_across(axis: FloatArray) -> FloatArray:
 
 
 def _frames(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return right-handed frames (n, 3, 3) as rows, from unit vectors (n, 3)."""
+    """Return right-handed frames (n, 3, 3) whose rows are `first`, the common normal, and their product."""
     normal = np.cross(first, second)
     sine = np.linalg.norm(normal, axis=1, keepdims=True)
     if float(np.min(sine)) < MINIMUM_SINE:

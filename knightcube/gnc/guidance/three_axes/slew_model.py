@@ -113,7 +113,7 @@ def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
 def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
     """Return the second derivatives (n, 4, 4) by q of the products of `pull` (n, 3) and A(q) v.
 
-    They are twice Davenport's matrices.
+    The second derivatives are twice Davenport's matrices.
     """
     curvature = np.empty((len(pull), 4, 4))
     outer = pull[:, :, None] * vector[:, None, :]
@@ -182,7 +182,7 @@ class SlewDynamics:
         return np.asarray(result)
 
     def _quantities(self, x: FloatArray, m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the vectors z (n, 16) of the class docstring, and derivatives (n, 6, 4) of b and e by q."""
+        """Return z = (m + residual, b, e, w, q) (n, 16), and derivatives (n, 6, 4) of b and e by q."""
         z, q = np.empty((len(x), _Z)), x[:, :4]
         turned = (self._forms.reshape(-1, 24, 4) @ q[:, :, None]).reshape(-1, 6, 4)
         z[:, _M], z[:, _W], z[:, _Q] = m + self._residual, x[:, 4:], q
@@ -269,7 +269,7 @@ class HermiteCubic:
         return np.asarray(mean + (1.0 - s) * (1.0 - 3.0 * s) * out + s * (3.0 * s - 2.0) * into)
 
     def _parts(self, times: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the passed fraction of the span of each time, and the span's length, values and slopes."""
+        """Return each time's fraction of its interval, and the interval's length, values and end slopes."""
         at = np.asarray(times, dtype=float)
         before = np.clip(np.searchsorted(self.times, at, side="right") - 1, 0, len(self.times) - 2)
         span = (self.times[before + 1] - self.times[before])[:, None]
@@ -281,7 +281,7 @@ class HermiteCubic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewPath:
-    """The path of a slew, given at times from zero on, with the cubic of the collocation between these times.
+    """The path of a slew, given at times from zero on and interpolated by the cubics of the collocation.
 
     Attributes:
         times: (n,) s.

@@ -5,9 +5,9 @@ The whole motion is discretised by collocation and solved by an interior point m
 several initial guesses (`slew_search`). The path is then corrected until a Runge-Kutta integration of the
 motion reaches the end of the path. The collocation error on 24 intervals is a few thousandths of a degree.
 For the correction, each interval is integrated in small steps from the first node of the interval. The
-differences from the next nodes are removed with one factored Newton matrix (multiple shooting with the chord
-method). The energy of a slew is the heat produced in the coils, J. The planner is deterministic and has no
-side effects.
+differences between the integrated states and the next nodes are removed with one factored Newton matrix
+(multiple shooting with the chord method). The energy of a slew is the heat produced in the coils, J. The
+planner is deterministic and has no side effects.
 
 The function `plan_order` plans a slew in orbit between two pointing targets, which starts within a window of
 time. The direction of the field during the slew changes the energy of the slew by a factor of up to ten along
@@ -169,7 +169,7 @@ class SlewPlan:
 def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
     """Return the best plan found for a slew task. Raises PlanningError with the reason if no path is found.
 
-    If the path `near` of a similar task of the same duration is given, the search starts from it.
+    If the path `near` of a similar task of the same duration is given, the search starts from `near`.
     """
     check(task)
     tried = 0
@@ -439,10 +439,10 @@ def plan_slew(
 ) -> OrderedSlew:
     """Return the best slew of a satellite in orbit with torque coils alone, from one target to another.
 
-    Coils cause no torque along the magnetic field, so path and dipole moments are planned together. They are
-    discretised by collocation and optimised with an interior point method from several initial guesses. The
-    model includes the rotating magnetic field, the gravity gradient and the gyroscopic torque. The orbit is
-    predicted by SGP4. A plan takes about a second.
+    Coils cause no torque along the magnetic field, so path and dipole moments are planned together. Path and
+    dipole moments are discretised by collocation and optimised with an interior point method from several
+    initial guesses. The model includes the rotating magnetic field, the gravity gradient and the gyroscopic
+    torque. The orbit is predicted by SGP4. A plan takes about a second.
 
     In the result, `plan.path` contains attitude, rate and dipole at the times `plan.path.times`, s after the
     start of the slew. The energy `plan.energy` is the heat of the coils, J. The start `begin` of the slew is
@@ -461,9 +461,9 @@ def plan_slew(
             None stands for three times `duration`.
         window: length of the time interval in which the slew may begin, s. The start time of minimum energy
             is chosen.
-        time_cost: weight of the slew duration in the cost, W. If it is given, the duration is optimised for
-            minimum energy plus `time_cost` times the duration. Infinity gives the shortest slew, and None
-            keeps the duration.
+        time_cost: weight of the slew duration in the cost, W. If `time_cost` is given, the slew minimises
+            energy plus `time_cost` times the duration. Infinity gives the shortest slew, and None keeps the
+            duration.
         pointing_axis: unit vector (3,) of the body axis that points to the targets.
         across_axis: unit vector (3,) of the body axis from which a roll is measured, normal to
             `pointing_axis`.

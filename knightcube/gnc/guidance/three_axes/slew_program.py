@@ -60,8 +60,8 @@ class BandLayout:
         start: indices (7,) of the multipliers of the start conditions.
         end: indices (ends,) of the multipliers of the end conditions.
         begins: indices (k + 1,) of the first element of each interval and of the last node.
-        places: indices of the elements of the flattened band matrix that the intervals fill.
-        entries: indices of the block elements that belong at `places`, in a flattened block of one interval.
+        places: indices of the elements of the flattened band matrix to which the intervals contribute.
+        entries: indices, in the flattened matrix block of one interval, of the elements copied to `places`.
     """
 
     states: IntArray
@@ -79,7 +79,7 @@ class BandLayout:
         return int(self.end[-1]) + 1
 
     def band(self, blocks: FloatArray, tail: FloatArray) -> FloatArray:
-        """Return the band matrix of the `blocks` (k, WIDE, WIDE) and of the `tail`; both are modified.
+        """Return the band matrix of the intervals' `blocks` (k, WIDE, WIDE) and the `tail`; overwrite both.
 
         The block `tail` is for the state and the dipole of the last node, and for the end conditions.
         """
@@ -285,7 +285,7 @@ class Transcription:
         state_part: FloatArray,
         dipole_part: FloatArray,
     ) -> FloatArray:
-        """Return the Newton matrix, which contains the derivatives of `slope`, as a band matrix.
+        """Return the Newton matrix, the second derivatives of the Lagrangian, as a band matrix.
 
         The barrier and convexification terms `state_part` (2 k + 1, 7, 7) are added to the second derivatives
         by the states, and the terms `dipole_part` (k + 1, 3) to the second derivatives by the dipoles.
@@ -457,8 +457,8 @@ class SlewProgram:
     def factors(self, point: Iterate) -> Factors:
         """Return the factors of a Newton matrix for the smallest change of a path that removes residuals.
 
-        The matrix omits the second derivatives of the equations, because with them a large step across a flat
-        optimum would count as small. Raises PlanningError if the matrix is singular.
+        The matrix omits the second derivatives of the equations, because a matrix with these derivatives
+        hardly penalises large steps near a flat optimum. Raises PlanningError if the matrix is singular.
         """
         states, heavy = self._limits.stiffness(point.at, point.dual / point.slack, np.zeros_like(point.dual))
         stiff = states + _DAMPED * _EYE7, heavy + _DAMPED
@@ -517,12 +517,12 @@ class SlewProgram:
         limits, at = self._limits, point.at
         stiff = point.dual / point.slack
         off = limits.values(at) - point.slack
-        # The dual variables that a Newton step of zero length would give.
+        # Estimate of the dual variables for unchanged states and dipoles.
         toward = barrier / point.slack - stiff * off
         right = limits.pull(at, toward) - point.slope
         factors = Factors(band)
         change = factors.solve(right)
-        # The curvature d.H.d along the step d follows from H d = right - C' dl and C d = right.
+        # The curvature d.H.d of the step d follows from H d + C' l = a, C d = b: it is a.d - b.l.
         equal, primal = self._equal, self._primal
         bend = right[primal] @ change[primal] - right[equal] @ change[equal]
         if bend <= 1e-8 * min(convex, 1.0) * float(change[primal] @ change[primal]):
@@ -543,7 +543,7 @@ class SlewProgram:
             change = size * step.change
             for correction in range(_CORRECTIONS + 1 if attempt < _CORRECTED else 1):
                 if correction:
-                    # The second-order correction reduces the residuals that remain because of curvature.
+                    # The second-order correction reduces the residuals due to the curvature of the equations.
                     back = np.zeros(len(change))
                     back[equal] = (1.0 - size) * missed - left
                     change = change + step.factors.solve(back)

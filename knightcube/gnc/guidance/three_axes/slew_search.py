@@ -202,7 +202,7 @@ class SlewSolver:
 def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
     """Return a path interpolated on the grid of `equations` and scaled to the duration of `equations`.
 
-    The dipoles are multiplied by the square of the old duration divided by the new duration.
+    The dipoles are multiplied by the squared ratio of the old to the new duration.
     """
     at, own = start.at, start.equations
     dipoles = at.dipoles * (own.scale / equations.scale) ** 2
@@ -271,7 +271,7 @@ class _MomentumCurves:
     Attributes:
         base: momentum curve (n, 3) that reaches the end of the slew.
         modes: changes (d, n, 3) of the momentum curve that preserve both ends; an amplitude of one
-            corresponds to the torque for half a rotation.
+            corresponds to the torques of a rotation by about half a revolution.
     """
 
     base: FloatArray
@@ -281,7 +281,7 @@ class _MomentumCurves:
 def _curves(
     craft: SlewCraft, around: SlewEnvironment, start: FloatArray, end: End, scale: float
 ) -> _MomentumCurves:
-    """Return the momentum curves from start to end, with modes whose heats add up."""
+    """Return the momentum curves from start to end, with modes of additive heat (orthogonal modes)."""
     count = len(around.field)
     step, strength = scale / (count - 1), np.linalg.norm(around.field, axis=1)
     field = around.field / strength[:, None]
