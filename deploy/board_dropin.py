@@ -34,7 +34,7 @@ def dropin(config: Config) -> str:
         awaited = [device_unit(path) for path, _ in _nodes(config)]
         lines += ["[Unit]", *(f"{word}={unit}" for unit in awaited for word in ("Wants", "After"))]
     lines += ["[Service]", *_devices(config)]
-    if config.commands.udp is not None:  # commands over UDP come only from this machine, a bench
+    if config.commands.udp is not None:  # UDP commands are accepted only from this machine
         lines += _network([LOOPBACK])
     return _text(lines)
 

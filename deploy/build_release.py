@@ -1,8 +1,8 @@
-"""Builds a release beside the one that flies, tests it, and switches to it by one rename.
+"""Builds a software release beside the release that flies, tests it, and switches to it by one rename.
 
-Called by install.sh: `build_release.py PREFIX build|switch|rollback`. A release is complete once it has its
-manifest, which is written last; only a complete release is ever linked. A build that was interrupted is
-removed by the next one. Standard library only.
+The script install.sh calls `build_release.py PREFIX build|switch|rollback`. The manifest of a release is
+written last, so a release with a manifest is complete, and only complete releases are linked. Each build
+first removes the incomplete releases of interrupted builds. The script needs only the standard library.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from releases import MANIFEST, linked, manifest_text
 
 SOURCE = "source"
-"""File of a release with the digest of all that it was built from."""
+"""File of a release with the SHA-256 digest of its sources and build options."""
 SELF_TEST_S = 10
 _PARTS = ("knightcube", "flight", "hal", "sim_hal", "deploy", "config/step_demo.yaml", "pyproject.toml")
 _BOARD_LOCK = "deploy/requirements.lock"
@@ -30,7 +30,7 @@ _NOT_BUILT = shutil.ignore_patterns(".*", "build", "runs", "tests", "*.egg-info"
 
 
 class Build:
-    """One build: its source, its steps, and whether they are only printed."""
+    """A build of a release from the folder of this software; a dry run only prints the steps."""
 
     def __init__(self, prefix: Path, options: argparse.Namespace) -> None:
         self.releases = prefix / "releases"
@@ -39,7 +39,7 @@ class Build:
         self._options = options
 
     def make(self) -> int:
-        """Build a release unless the current one is of the same source; print its name."""
+        """Build a release, unless the current one has the same sources, and print its name."""
         current = linked(self._prefix, "current")
         wanted = self._digest()
         if current is not None and _text(current / SOURCE) == wanted:
@@ -53,13 +53,13 @@ class Build:
         self._test(python)
         if not self._options.dry_run:
             (release / SOURCE).write_text(wanted, encoding="ascii")
-            os.sync()  # all that the manifest speaks of is on the disk before the manifest
+            os.sync()  # the files listed in the manifest reach the disk first
             _write(release / MANIFEST, manifest_text(release))
         sys.stdout.write(f"{release.name}\n")
         return 0
 
     def _environment(self, release: Path) -> Path:
-        """Make the virtual environment; return its Python."""
+        """Create the virtual environment of a release, and return the path of its Python interpreter."""
         options, venv = self._options, release / "venv"
         python = venv / "bin/python"
         if options.venv:
@@ -69,22 +69,22 @@ class Build:
         found = ["--no-index", "--find-links", options.wheels] if options.wheels else []
         quiet = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
         self._run([options.python, "-m", "venv", venv])
-        # The lock has the build backend too, with its hash: nothing that was not checked builds a release.
+        # The lock file also lists the build backend, so only packages with a verified hash build a release.
         self._run([*quiet, *found, "--require-hashes", "--no-deps", "-r", self._source / _BOARD_LOCK])
         with tempfile.TemporaryDirectory() as folder:
-            # Of a copy: a build that was killed leaves files in its source, which a later one would ship.
+            # A copy is built, because a killed build leaves files that a later build would include.
             source = Path(folder) / "source" if not options.dry_run else self._source
             if not options.dry_run:
                 shutil.copytree(self._source, source, symlinks=True, ignore=_NOT_BUILT)
             ours = ["--no-index", "--no-deps", "--no-build-isolation", source / "knightcube", source]
             self._run([*quiet, *ours])
-        # The application's distribution has the ground tools too, which have no place on a board.
+        # The distribution also contains the ground tools, which are not used on a board.
         for ground in venv.glob("lib/python3*/site-packages/ground"):
             shutil.rmtree(ground)
         return python
 
     def _test(self, python: Path) -> None:
-        """Import, ask for the version, and fly ten seconds in lock-step."""
+        """Test a release: import its modules, print its version, and fly ten seconds in lock-step."""
         self._run([python, "-c", "import flight.app.flight, flight.loop.worker"])
         self._run([python, "-m", "flight", "--version"])
         with tempfile.TemporaryDirectory() as folder:
@@ -92,12 +92,12 @@ class Build:
             self._run([python, "-m", "flight", *words, "--out", Path(folder) / "run"])
 
     def _run(self, words: Sequence[object]) -> None:
-        """Run a step, or print it; what a step prints is shown where it fails."""
+        """Run a command, or print it in a dry run; the output of a command is shown only if it fails."""
         command = [str(word) for word in words]
         if self._options.dry_run:
             sys.stdout.write(f"would run: {' '.join(command)}\n")
             return
-        # The release is tested as the service runs it: with nothing from this shell's Python path.
+        # The release is tested without the PYTHONPATH of this shell, because the service has none.
         own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         done = subprocess.run(
             command,
@@ -118,14 +118,14 @@ class Build:
                 _remove(release)
 
     def _name(self) -> str:
-        """Return a name that no release has: the version, and a number that only grows."""
+        """Return a new release name: the version, and one more than the highest number of a release."""
         text = (self._source / "pyproject.toml").read_text(encoding="utf-8")
         version = next(line.split('"')[1] for line in text.splitlines() if line.startswith("version = "))
         numbers = [int(path.name.rpartition("+")[2]) for path in self.releases.glob("*+*")]
         return f"{version}+{max(numbers, default=0) + 1}"
 
     def _digest(self) -> str:
-        """Return the SHA-256 of the source and of how it is built."""
+        """Return the SHA-256 of the source files and of the build options."""
         options = self._options
         digest = hashlib.sha256(f"{options.python} {options.venv}\n".encode())
         for part in _PARTS:
@@ -136,7 +136,7 @@ class Build:
 
 
 def switch(prefix: Path, name: str) -> None:
-    """Have a release fly from the next start on, the present one kept as the previous; remove all others."""
+    """Link a release as current and the present release as previous, and remove all other releases."""
     release, current = prefix / "releases" / name, linked(prefix, "current")
     if current == release:
         return
@@ -152,7 +152,7 @@ def switch(prefix: Path, name: str) -> None:
 
 
 def rollback(prefix: Path) -> str:
-    """Have the previous release fly from the next start on; return its name."""
+    """Exchange the current and the previous release, and return the name of the new current release."""
     current, previous = linked(prefix, "current"), linked(prefix, "previous")
     if previous is None or previous == current:
         raise SystemExit("install: --rollback: there is no previous release")
@@ -163,7 +163,7 @@ def rollback(prefix: Path) -> str:
 
 
 def _link(link: Path, release: Path) -> None:
-    """Point a link to a release, by one rename."""
+    """Set a symbolic link to a release by one atomic rename."""
     beside = link.with_name(f".{link.name}.part")
     beside.unlink(missing_ok=True)
     beside.symlink_to(Path("releases") / release.name)
@@ -172,7 +172,7 @@ def _link(link: Path, release: Path) -> None:
 
 
 def _remove(release: Path) -> None:
-    """Remove a release: first the manifest, without which nobody takes it for one."""
+    """Remove a release, beginning with its manifest, without which the release counts as incomplete."""
     (release / MANIFEST).unlink(missing_ok=True)
     shutil.rmtree(release)
 
@@ -200,7 +200,7 @@ def _text(path: Path) -> str:
 
 
 def main(words: list[str]) -> int:
-    """Build, switch or roll back below a prefix."""
+    """Build, switch or roll back the releases in the folder that the arguments name."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("prefix", type=Path)
     parser.add_argument("action", choices=["build", "switch", "rollback"])

@@ -1,11 +1,12 @@
-"""Chooses the release that flies: `releases.py choose`, run by `fly`, prints its name and the reason.
+"""Chooses the software release to fly: `releases.py choose` prints the release's name and the reason.
 
-Releases stand side by side in /opt/knightcube/releases; `current` and `previous` are links to two of them.
-The current release flies, unless it is damaged and the previous one is whole, or it is new and `UNCLEAN`
-starts ended before it was proven: then the previous release flies, and reports why. A flight proves its
-release by flying for a minute. `fly` chooses a release itself if this program fails.
+The releases are folders in /opt/knightcube/releases, and the links `current` and `previous` select two of
+them. The current release flies unless it is damaged, or was started `UNCLEAN` times without being proven. In
+these two cases an intact previous release flies, and reports the reason. A release is proven when it has
+flown for a minute. The script `fly` runs this program, and chooses a release itself if this program fails.
 
-`releases.py verify` reads every file of both releases. Standard library only: any Python runs it.
+The command `releases.py verify` checks every file of both releases. Any Python interpreter can run this
+program, which needs only the standard library.
 """
 
 from __future__ import annotations
@@ -21,24 +22,24 @@ from contextlib import suppress
 from pathlib import Path
 
 UNCLEAN = 3
-"""Starts in a row after which a release that was never proven is left out."""
+"""Number of starts after which an unproven release is no longer chosen."""
 MANIFEST, TRIALS = "manifest", "releases.json"
 DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
-"""What reading a record raises that holds anything: another shape, `Infinity`, a deep nest."""
+"""Exceptions that reading a damaged JSON record can raise."""
 LARGEST_RECORD, LARGEST_MANIFEST = 1 << 16, 1 << 24
-"""Bytes of the largest files that are read."""
+"""Maximum sizes (bytes) of a record and of a manifest."""
 _OURS = re.compile(r"(?!venv/)|venv/lib/python[^/]*/site-packages/(flight|hal|sim_hal)/")
 
 
 def files_of(release: Path) -> Iterator[Path]:
-    """Yield the files of a release that its manifest lists: not those of a linked virtual environment."""
+    """Yield the files of a release without its manifest and without a linked virtual environment."""
     for folder, folders, names in os.walk(release):
         folders.sort()
         yield from (Path(folder, name) for name in sorted(names) if Path(folder, name) != release / MANIFEST)
 
 
 def manifest_text(release: Path) -> str:
-    """Return the manifest: SHA-256, size and path of each file, and first the SHA-256 of these lines."""
+    """Return the manifest: the SHA-256 of the lines below it, then SHA-256, size and path of each file."""
     lines = [
         f"{_sum(path)} {path.stat().st_size} {path.relative_to(release).as_posix()}\n"
         for path in files_of(release)
@@ -49,9 +50,9 @@ def manifest_text(release: Path) -> str:
 
 
 def damage(release: Path, thorough: bool = False) -> str:
-    """Return what a release lacks of its manifest, "" for a whole one.
+    """Return how a release differs from its manifest, or an empty text for an intact release.
 
-    Our own files are read, those of libraries only compared in size unless `thorough`.
+    The files of libraries are compared only by size, unless `thorough` is true.
     """
     try:
         first, _, rest = _text(release / MANIFEST, LARGEST_MANIFEST).partition("\n")
@@ -78,8 +79,8 @@ def _sum(path: Path) -> str:
 def _text(path: Path, largest: int) -> str:
     """Return the text of a file.
 
-    Raises OSError for a FIFO, which would never end, and for a file of more than `largest` bytes, such as a
-    sparse one, which would fill the memory. Raises ValueError for text that is not UTF-8.
+    Raises OSError for a file of more than `largest` bytes, which could fill the memory, and for a FIFO, from
+    which reading might never end. Raises ValueError for text that is not UTF-8.
     """
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), encoding="utf-8") as file:
         found = os.fstat(file.fileno())
@@ -89,7 +90,7 @@ def _text(path: Path, largest: int) -> str:
 
 
 def linked(prefix: Path, link: str) -> Path | None:
-    """Return the release that a link names, None without a complete one."""
+    """Return the release to which a link points, or None unless this release is complete."""
     try:
         release = prefix / "releases" / Path(os.readlink(prefix / link)).name
     except OSError:
@@ -98,13 +99,13 @@ def linked(prefix: Path, link: str) -> Path | None:
 
 
 class Trials:
-    """The starts of releases that are not proven yet, kept in the state folder; the flight writes it too."""
+    """Numbers of starts of unproven releases, in a file of the state folder that the flight also writes."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / TRIALS
         self.starts: dict[str, int] = {}
         self.proven: list[str] = []
-        # Whatever the file contains, the flight starts: a damaged count is ignored.
+        # A damaged file is ignored, so that the flight starts in any case.
         with suppress(OSError, *DAMAGED):
             kept = json.loads(_text(self._path, LARGEST_RECORD))
             starts = {str(name): int(count) for name, count in kept["starts"].items()}
@@ -112,11 +113,11 @@ class Trials:
             self.starts = starts
 
     def failed(self, release: Path) -> bool:
-        """Return whether a new release has had its starts."""
+        """Return whether an unproven release has been started `UNCLEAN` times."""
         return release.name not in self.proven and self.starts.get(release.name, 0) >= UNCLEAN
 
     def count(self, release: Path) -> None:
-        """Count a start of a release that is not proven. An error while writing it is ignored."""
+        """Count and store a start of an unproven release, ignoring write errors."""
         if release.name in self.proven:
             return
         self.starts[release.name] = min(self.starts.get(release.name, 0) + 1, UNCLEAN)
@@ -131,7 +132,7 @@ class Trials:
 
 
 def choose(prefix: Path, trials: Trials) -> tuple[Path | None, str]:
-    """Return the release that flies, and why where it is not the current one or is damaged."""
+    """Return the release to fly, and the reason if the current release is not flown or is damaged."""
     current, previous = linked(prefix, "current"), linked(prefix, "previous")
     found = [release for release in (current, previous) if release is not None]
     if not found:
@@ -150,12 +151,12 @@ def choose(prefix: Path, trials: Trials) -> tuple[Path | None, str]:
 
 
 def answer(prefix: Path, environment: Mapping[str, str]) -> int:
-    """Print the name of the release that flies and the reason, then count the start; return 1 without one."""
+    """Print the chosen release and the reason, and count its start; return 1 if there is no release."""
     trials = Trials(Path(environment.get("STATE_DIRECTORY", "/var/lib/knightcube").split(":")[0]))
     release, note = choose(prefix, trials)
     if release is None:
         return 1
-    # Printed before the count, which waits for the disk: `fly` may end this process at any time.
+    # The release is printed first, because `fly` may kill this process while it waits for the disk.
     sys.stdout.write(f"{release.name} {note}\n")
     sys.stdout.flush()
     trials.count(release)
@@ -163,7 +164,7 @@ def answer(prefix: Path, environment: Mapping[str, str]) -> int:
 
 
 def main(words: list[str]) -> int:
-    """Choose a release, or verify both; return the exit status, 2 for wrong use."""
+    """Choose a release or verify both releases, and return the exit status, which is 2 for wrong use."""
     prefix = Path(__file__).resolve().parent.parent
     if words == ["choose"]:
         return answer(prefix, os.environ)

@@ -1,12 +1,14 @@
-"""The safe state of a board whose flight was given up: coils at zero, ears open, and the flight tried again.
+"""Safe state of a board after repeated failures of the flight, with the coils at zero until the next attempt.
 
-Run by knightcube-safe.service with Python's standard library alone, from the folder of `coils-off`. It ends
-with status 0 when the flight is to be tried: after 30 s, and after twice as long each time that the flight is
-given up again, up to an hour; at once after the command `mode`. The command `safe` puts the next try an hour
-off, `ping` is answered. Other commands are refused, and datagrams that are not commands get no answer.
+The service knightcube-safe.service runs this program, which needs only Python's standard library and the
+script `coils-off` in the same folder. The program ends with status 0 when the flight is to be started again.
+The first start follows after 30 s, and the waiting time doubles with each further failure, up to an hour. The
+command `mode` ends the waiting time at once, and the command `safe` extends the waiting time to an hour from
+then. The command `ping` is answered. Other commands are refused, and datagrams that are not commands get no
+answer.
 
-Environment: KNIGHTCUBE_COMMANDS, the command socket, none without it; RUNTIME_DIRECTORY, where the number of
-tries is kept until the next boot of the board.
+The environment variable KNIGHTCUBE_COMMANDS holds the path of the command socket; without it, no commands are
+received. The folder RUNTIME_DIRECTORY keeps the number of tries until the next boot of the board.
 """
 
 from __future__ import annotations
@@ -24,12 +26,12 @@ import time
 
 FIRST_S, LONGEST_S = 30.0, 3600.0
 FLEW_S = 600.0
-"""A flight that lasted so long beyond its pause ends the series of tries."""
+"""Flight time (s) after which a later failure starts again with the shortest waiting time."""
 
 COILS_S, RETRY_S = 30.0, 1.0
-"""Between two zeros of the coils: while they are acknowledged, and while they are not."""
+"""Intervals (s) of setting the coils to zero, with and without an acknowledgement by the PWM chip."""
 
-# flight/link/commands.py and flight/link/telemetry/definitions.py; the tests compare them.
+# Tests compare these packet layouts with those of flight/link, which this program does not import.
 COMMANDS = {
     **{0x1A01: "ping", 0x1A02: "safe", 0x1A03: "mode", 0x1A04: "slew", 0x1A05: "clear", 0x1A06: "point"},
     **{0x1A10: "load-parameters", 0x1A11: "dump-parameters"},
@@ -43,7 +45,7 @@ SAFE_MODE = 1
 
 
 class Tries:
-    """The number of the next try of the flight, kept over the processes of one boot."""
+    """Number of the next attempt to start the flight, stored until the next boot of the board."""
 
     def __init__(self, folder: str, now: float) -> None:
         self._path = os.path.join(folder, "tries") if folder else ""
@@ -56,11 +58,11 @@ class Tries:
 
     @staticmethod
     def pause(number: int) -> float:
-        """Return how long to wait before a try, s."""
+        """Return the waiting time (s) before the attempt `number` to start the flight."""
         return min(FIRST_S * 2.0 ** (min(number, 20) - 1), LONGEST_S)
 
     def keep(self, now: float) -> None:
-        """Note that the flight is tried now."""
+        """Store the number and the time `now` (s) of this attempt to start the flight."""
         with contextlib.suppress(OSError):
             with open(self._path + ".part", "w", encoding="ascii") as file:
                 file.write(f"{self.number} {now}\n")
@@ -68,7 +70,7 @@ class Tries:
 
 
 class SafeState:
-    """Answers commands until the flight is to be tried."""
+    """Answers commands, and determines when the flight is to be started again."""
 
     def __init__(self, tries: Tries, now: float) -> None:
         self._tries = tries
@@ -77,7 +79,7 @@ class SafeState:
         self.due = now + tries.pause(tries.number)
 
     def answer(self, data: bytes, now: float) -> bytes | None:
-        """Obey a datagram; return the answer, or None if the datagram is not a command."""
+        """Execute the command in a datagram, and return the answer, or None if there is no command."""
         name = command_name(data)
         if not name:
             return None
@@ -99,7 +101,7 @@ class SafeState:
 
 
 def command_name(data: bytes) -> str:
-    """Return the name of the command that a datagram is, empty for anything else."""
+    """Return the name of the command in a datagram, or an empty text if there is no valid command."""
     name = COMMANDS.get(int.from_bytes(data[:2], "big"), "")
     whole = name and len(data) == LENGTHS[name] == int.from_bytes(data[4:6], "big") + 7
     return name if whole and binascii.crc_hqx(data, 0xFFFF) == 0 else ""
@@ -115,13 +117,13 @@ def pack(obeyed: bool, name: str, count: int, text: str) -> bytes:
 
 
 def say(text: str) -> None:
-    """Write a line for the journal."""
+    """Write a line to standard error, from where it enters the journal of the board."""
     sys.stderr.write(f"safe state: {text}\n")
     sys.stderr.flush()
 
 
 def listen(path: str) -> socket.socket | None:
-    """Return the bound command socket, None where there is none or another process has it."""
+    """Return a command socket bound to `path`, or None for an empty path or after an error."""
     try:
         if not path:
             return None
@@ -141,7 +143,7 @@ def listen(path: str) -> socket.socket | None:
 
 
 def coils_off() -> bool:
-    """Set the coils to zero; return whether the chip acknowledged."""
+    """Set the coils to zero by the script `coils-off`, and return whether the PWM chip acknowledged."""
     beside = os.path.join(os.path.dirname(os.path.abspath(__file__)), "coils-off")
     with contextlib.suppress(OSError):
         return subprocess.run([beside], check=False).returncode == 0
@@ -149,7 +151,7 @@ def coils_off() -> bool:
 
 
 def serve(state: SafeState, path: str) -> None:
-    """Keep the coils at zero and answer commands until the flight is to be tried."""
+    """Keep the coils at zero and answer commands until the flight is to be started again."""
     ears: socket.socket | None = None
     zero_due, zeroed = 0.0, None
     while (now := time.monotonic()) < state.due:
@@ -159,7 +161,7 @@ def serve(state: SafeState, path: str) -> None:
                 say("coils at zero" if acknowledged else "the coils' chip does not answer")
             zeroed = acknowledged
             zero_due = time.monotonic() + (COILS_S if zeroed else RETRY_S)
-            # Also where the socket's file was removed.
+            # A socket whose file was removed is replaced.
             if ears is None or not os.path.exists(path):
                 ears = listen(path)
         left = max(0.0, min(state.due, zero_due) - time.monotonic())
@@ -175,7 +177,7 @@ def serve(state: SafeState, path: str) -> None:
 
 
 def main() -> int:
-    """Stay safe until the flight is to be tried."""
+    """Keep the board in the safe state until the flight is to be started again."""
     now = time.monotonic()
     tries = Tries(os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0], now)
     state = SafeState(tries, now)

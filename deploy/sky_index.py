@@ -1,7 +1,7 @@
 """Build the star tracker's sky index at installation, because it takes seconds at the start of a flight.
 
-Run by install.sh with the installed Python: sky_index.py [--wanted] CONFIG; with --wanted it only prints a
-word when there is an index to build.
+The script install.sh runs `sky_index.py [--wanted] CONFIG` with the installed Python. With the option
+--wanted the program builds no index, but prints a word if an index must be built.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from flight.schema.reader import load
 
 
 def main(words: list[str]) -> None:
-    """Build the index that the configuration needs, or print that it is missing."""
+    """Build the sky index if the configuration needs it and it is missing."""
     camera = load(Path(words[-1])).camera
     tracker = camera.star_tracker if camera is not None else None
     if tracker is None or tracker.index is not None:

@@ -185,7 +185,7 @@ def _draw_compass(
 
 _EDGE_RADIUS = 5.0
 _DOT = 0.0
-"""Ring radius (px) at which the ring is a single pixel."""
+"""Radius (px) that draws a single pixel instead of a ring."""
 
 
 def draw_horizon(

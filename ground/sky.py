@@ -200,7 +200,7 @@ def sky_text(sky: SkyMap | None, bodies: Sequence[SkyBody]) -> str:
         return ""
     values, lines = sky_facts(sky, bodies), []
     if math.dist(values["axis"]["point_px"], values["image_centre"]["point_px"]) > _SAME_PX:
-        # The solution's text above states the right ascension and declination of the axis.
+        # The right ascension and declination of the axis are in the text of the solution, printed before.
         centre, (x, y) = values["image_centre"], values["axis"]["point_px"]
         lines.append(f"axis:             at pixel {x:.1f}, {y:.1f}")
         place = f"{centre['right_ascension_deg']:.4f} {centre['declination_deg']:+.4f} deg"

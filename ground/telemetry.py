@@ -80,7 +80,7 @@ def scan(data: bytes) -> ScanResult:
 
 def _missing(layout: Layout, packets: bytes) -> int:
     """Return the number of packets missing between the found packets, according to their sequence counts."""
-    if len(packets) <= layout.length:  # a shortcut, because most datagrams contain few packet types
+    if len(packets) <= layout.length:  # a single packet has no gaps
         return 0
     steps = np.diff(layout.sequence_counts(packets))
     return int(np.sum((steps - 1) % SEQUENCE_MODULUS))

@@ -82,7 +82,7 @@ class OrbitDevices:
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """All simulated devices. Drivers use `bus` and `camera`; only faults and tests use the rest."""
+    """All simulated devices. Drivers use only I2C bus and camera; faults and tests use all devices."""
 
     simulation: TimedSimulation
     world: World

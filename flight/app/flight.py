@@ -315,7 +315,7 @@ def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> I
     return ImagingSettings(
         camera=model,
         exposures=Exposures(camera.exposure, least, most, model.focal_length),
-        # The difference allows for a trigger that comes late while the next trigger is on time.
+        # Half a period is subtracted, so that a late trigger does not make the next trigger be skipped.
         fine_rest_ns=round(((camera.fine_period or camera.period) - 0.5 * camera.period) * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
         late_ns=round(camera.late_after * SECOND_NS),
@@ -342,7 +342,7 @@ def horizon_camera_settings(cameras: Sequence[WideCamera]) -> HorizonCameraSetti
     period_ns = min(round(min(camera.period for camera in cameras) * SECOND_NS), fine_ns)
     return HorizonCameraSettings(
         [round(camera.exposure * SECOND_NS) for camera in cameras],
-        period_ns - SECOND_NS // 2,  # the task runs once a second, possibly late
+        period_ns - SECOND_NS // 2,  # half a second of margin for a late run of the task
         fine_ns - SECOND_NS // 2,
         min(2 * SECOND_NS, period_ns),
         max(round(max(camera.max_age for camera in cameras) * SECOND_NS), 2 * fine_ns),
@@ -361,7 +361,7 @@ def _tracker(camera: Camera) -> TrackerSettings | None:
     scale = (1.0 / spread, spread)
     index = Path(section.index) if section.index is not None else None
     velocity = None if section.velocity is None else np.array(section.velocity)
-    # The camera is known: no mirror is in its light path, and its focal length is configured.
+    # A flight camera makes no mirrored images, and the configuration gives its focal length.
     identification = IdentificationSettings(mirror=False, hint_error=1.0)
     accuracy = camera.accuracy
     lens = CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion)

@@ -530,7 +530,7 @@ class Chosen:
 
 def sum_file(path: Path) -> Path:
     """Return the path of a configuration's checksum file, as written by sha256sum."""
-    return path.parent / f"{path.name}.sha256"  # unlike this, `with_name` would fail on `.`
+    return path.parent / f"{path.name}.sha256"  # `with_name` fails on the path `.`
 
 
 def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:

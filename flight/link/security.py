@@ -85,7 +85,7 @@ TELEMETRY_SPIS = (3, 4)
 """Primary and reserve SPI of telemetry frames."""
 
 HIGHEST_COUNTER = 2**63
-"""Largest accepted counter. A sender of 1000 frames per second reaches this value after 292 million years."""
+"""Largest accepted frame counter, which is reached after 292 million years at 1000 frames per second."""
 
 COPIES = ("a", "b")
 

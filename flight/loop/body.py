@@ -162,7 +162,7 @@ class Filter(Protocol):
         """Apply measurements of past times, and call `applied` with a flag for each that passed its gate."""
 
     def catch_up(self, most: int | None = None) -> None:
-        """Apply again up to `most` (or all) measurements that follow a late measurement in time."""
+        """Repeat the filter updates made after a late measurement: all updates, or at most `most` of them."""
 
     def at(self, time_ns: int) -> Estimate:
         """Return the estimate propagated to `time_ns`, without changing the filter."""
@@ -185,7 +185,7 @@ class ReadingFeed(Protocol):
 
 
 class WindowedLaw(Protocol):
-    """A control law that uses only magnetometer and gyro, in windows that begin with the coils off."""
+    """A control law that uses only magnetometer and gyro, and switches the coils off to measure the field."""
 
     def begin(self, now_ns: int) -> None:
         """Begin without knowledge of the magnetic field."""
@@ -374,7 +374,7 @@ class BodyEstimation(Protocol):
         return False
 
     def accept_sun(self, reading: StringReading) -> str | None:
-        """Accept a solar cell reading; return its fault, an empty text, or None if it was not checked."""
+        """Accept a solar cell reading; return its fault (empty for none), or None if it was not checked."""
         return None
 
 

@@ -101,7 +101,7 @@ class OnboardParameters:
             self._keep(msgspec.structs.replace(self._table, proven=True))
 
     def load(self, values: Mapping[str, float], replaced: int, now_ns: int) -> str:
-        """Load a parameter table, unless the table to be replaced does not have the CRC `replaced`.
+        """Load a parameter table, which is rejected if the table in force does not have the CRC `replaced`.
 
         Return why the new table is rejected, or an empty text.
         """

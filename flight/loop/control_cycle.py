@@ -168,7 +168,7 @@ class ControlCycle:
         record.measured = record.estimate if self._was_measured else None
 
     def _steer(self, record: _CycleRecord) -> Steered:
-        """Use the coils as the mode requires, and return the result."""
+        """Command the coils by the control law of the mode, and return the result."""
         steering, modes, now_ns = self._tasks.steering, self._tasks.modes, record.now_ns
         if record.mode in STEERING:
             return steering.run(record.measured, now_ns, self._ever_started)

@@ -54,7 +54,7 @@ class EventLog:
         self.counts: Counter[EventKind] = Counter()
 
     def react_by(self, react: Reactor) -> None:
-        """Call `react` for every event whose reaction is not just a record, even if it is held back."""
+        """Call `react` for every event with a reaction beyond its record, including events held back."""
         self._react = react
 
     def report(self, kind: EventKind, time_ns: int, text: str) -> None:
@@ -337,7 +337,7 @@ class StreamWatch:
         return StreamState.GOOD
 
     def poor(self, now_ns: int) -> tuple[bool | None, str]:
-        """Return whether the stream is poor, and why, or None if unknown or reported by another fact."""
+        """Return whether the stream is poor (None if unknown or reported by another fact), and why."""
         stream, state = self.stream, self.state(now_ns)
         if state is StreamState.GOOD:
             return False, f"{stream.name}: good again"
@@ -374,7 +374,7 @@ class Streams:
         return StreamState.NOT_FITTED if watch is None else watch.state(now_ns)
 
     def look(self, now_ns: int) -> list[tuple[StreamLimits, bool | None, str]]:
-        """Return the limits of each stream with the result of `StreamWatch.poor`."""
+        """Return for each stream its limits, whether the stream is poor, and why."""
         return [(watch.stream, *watch.poor(now_ns)) for watch in self._watches.values()]
 
 

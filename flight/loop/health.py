@@ -181,7 +181,7 @@ class Board:
     def __call__(self, now_ns: int) -> ResourceSample:
         """Return the board's resources now."""
         process = os.getpid()
-        # The name in brackets may contain any character.
+        # The process name in brackets may itself contain brackets and blanks.
         # User and system time are fields 14 and 15 of the line (proc(5)).
         stat = _read(self._proc / str(process) / "stat").rpartition(")")[2].split()
         statm = _read(self._proc / str(process) / "statm").split()
@@ -381,7 +381,7 @@ class Housekeeping:
         return self._coils.state()
 
     def run(self, cycle: Cycle, state: SteeringState) -> None:
-        """Write the packet; `state` is the coils' state of use in the newest control cycle."""
+        """Write the housekeeping packet; `state` is the use of the coils in the newest control cycle."""
         now_ns, power, log_error = cycle.start_ns, self._power, self._log_error()
         text = log_error or "packets reach the disk again"
         self._facts.update(facts.LOG_FAULT, bool(log_error), now_ns, text)

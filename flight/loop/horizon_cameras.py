@@ -103,7 +103,7 @@ class HorizonCameraTask:
             return
         found: HorizonCameraResult = result.value
         if found.false is not None:
-            # The images could be checked, because the attitude is known finely.
+            # The attitude was known well enough to check the images against it.
             text = "all images agree with the attitude"
             if found.false:
                 names = ", ".join(str(number + 1) for number in found.false)

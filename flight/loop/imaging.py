@@ -121,8 +121,7 @@ class FrameMeasurer:
             tracker = replace(tracker, solve=replace(tracker.solve, velocity=velocity))
         estimator = self._settings.estimator
         if past is None and isinstance(estimator, LikelihoodSettings):
-            # A changing rate displaces the stars from their positions at mid-exposure.
-            # Without an estimate, the rate's change is therefore fitted to the pixels.
+            # Without a prior estimate of the attitude, the change of the rate in the exposure is also fitted.
             estimator = replace(estimator, rate_model="accelerating")
         return FrameJob(
             frame.pixels,
@@ -216,7 +215,7 @@ _NAMED_ELSEWHERE = {
     StreakStatus.SATURATED,
     StreakStatus.FROZEN,
 }
-"""Results for which `unused` reports no event, because the body is at rest or another event is reported."""
+"""Results without an event of their own, because the body is at rest or another event is reported."""
 _NAN4, _NAN33 = np.full(4, np.nan), np.full((3, 3), np.nan)
 
 
@@ -321,7 +320,7 @@ _ROWS = 32
 _FRAMES = 4
 """Number of frame buffers of a camera driver."""
 _LEAST_CHANGES = 0.125
-"""Minimum fraction of different neighbouring pixels in a row that contains noise."""
+"""Minimum fraction of pixels in an image row with noise that differ from the next pixel."""
 
 
 class RepeatedRows:
@@ -472,7 +471,7 @@ class Imaging:
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:
-        """Order an exposure. Ordering exposures is the task of the camera's rate group.
+        """Order the next exposure of the star camera, if one may be made now.
 
         No exposure is made while the body rotates faster than permitted. Exposures are less frequent while
         the attitude is fine. An exposure starts when no coil will switch until its end, so that the body rate

@@ -265,7 +265,7 @@ class AttitudeWatch:
             timer.reset()
 
     def trigger(self, mode: Mode, known: bool, now_ns: int) -> Trigger | None:
-        """Return the trigger that is due, if any; `known` states whether the attitude permits steering."""
+        """Return the trigger that is due, or None; `known` states whether the attitude permits steering."""
         if mode is Mode.ACQUIRE and self.follows is not None and self._known.update(known, now_ns):
             return KNOWN[self.follows]
         if mode in POINTING and self._lost.update(not known, now_ns):

@@ -34,9 +34,9 @@ from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 
 _AT_A_TIME = 16
-"""Number of measurements that one cycle repeats after a late measurement, which takes a few ms.
+"""Number of filter updates that one control cycle repeats after a late measurement, in a few ms.
 
-Repeating the measurements of one second takes a few cycles.
+Repeating the filter updates of one second takes a few control cycles.
 """
 
 

@@ -170,7 +170,7 @@ class BootRecord:
 
     Attributes:
         boot_count: number of this boot, which is 1 for the first boot.
-        unclean_recent: number of unclean shutdowns within the last operating time.
+        unclean_recent: number of unclean shutdowns in the recent operating time (`CRASH_WINDOW`).
         after_unclean: whether the previous boot ended uncleanly.
         mode: name of the mode at the last stop; empty at the first boot.
     """
@@ -239,9 +239,9 @@ CRASH_WINDOW = 600.0
 
 
 def boot_record(begun: StoredState, window: float) -> BootRecord:
-    """Return the record for a boot that begins with a state; `window` is in s of operating time.
+    """Return the record for a boot that begins with the state `begun`.
 
-    `window` in s of operating time.
+    An unclean shutdown counts as recent within `window` s of operating time.
     """
     recent = sum(begun.operated - shutdown.operated <= window for shutdown in begun.unclean)
     after = bool(begun.unclean) and begun.unclean[-1].boot == begun.boot_count - 1
@@ -417,7 +417,7 @@ class _StateCopy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True)
 class _ReadCopy:
-    """The result of reading one copy; `problem` is empty if the copy is valid or missing."""
+    """The result of reading one copy of the state; `problem` is empty for a valid or missing copy."""
 
     name: str
     copy: _StateCopy | None
@@ -561,8 +561,8 @@ class StateKeeper:
 
         The time `window` is the operating time (s) within which an unclean shutdown counts as recent. The
         digest `devices` identifies the present devices; parameters learned for other devices are discarded.
-        The number `boots` is the boot number in other files. If the state has a smaller boot count, the state
-        is outdated or lost, and the last boot counts as unclean.
+        The number `boots` is the highest boot number in other files. If the state has a smaller boot count,
+        the state is outdated or lost, and the last boot counts as unclean.
         """
         self._store = store
         self._notices = notices
@@ -632,7 +632,7 @@ class StateKeeper:
             self._writing.release()
 
     def _write(self) -> None:
-        """Write the newest values. This is the job of the ticker."""
+        """Write the newest values to disk, as the periodic job of the ticker."""
         with self._writing:
             if not self._closed:
                 self._put(ended=False)
@@ -687,7 +687,7 @@ def open_state(
     folder = state_folder(config, environment)
     if folder is None:
         return None
-    with suppress(OSError):  # if this fails, the first write reports the error
+    with suppress(OSError):  # the first write reports a missing folder
         folder.mkdir(parents=True, exist_ok=True)
     notices = Notices()
     keeper = StateKeeper(

@@ -164,7 +164,7 @@ class CoilDrive:
         self._coils.command(self.command)
 
     def _brake(self, axes: Axes) -> None:
-        """Brake bridges, because a leg stuck high would drive its coil even at zero command."""
+        """Brake the H-bridges of failed coils: a leg stuck high would drive a coil even at zero command."""
         if axes != self._braked:
             self._coils.brake(axes)
             self._braked = axes

@@ -138,7 +138,7 @@ class WorkerProcess:
         return self._socket.fileno()
 
     def send(self, argument: Any) -> None:
-        """Submit a job. Raises FlightError if it cannot be sent, and EOFError if the process has died."""
+        """Submit a job. Raises FlightError for a job that cannot be sent, and EOFError for a dead process."""
         message = pack_trusted(argument, self._slab)
         if len(message) > LONGEST_BYTES:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
@@ -213,9 +213,9 @@ class _Kept:
         self._deaths = 0
 
     def due_ns(self) -> int:
-        """Return the next time (ns) at which the worker must be served without a message, or -1.
+        """Return the time (ns) of the worker's next timeout or restart.
 
-        -1 for no such time.
+        Returns -1 if no timeout or restart is pending.
         """
         if self.process is None:
             return self._due_ns

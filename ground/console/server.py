@@ -177,7 +177,7 @@ def application(console: Console, access: Access) -> web.Application:
             if request.path.startswith("/api/"):
                 return web.json_response({"error": NO_ACCESS}, status=401)
             raise web.HTTPUnauthorized(text=NO_ACCESS)
-        # After a link on another site, a browser would not send the cookie with a redirect.
+        # There is no redirect: browsers that come from another site would not send the cookie with it.
         response = await handler(request)
         response.set_cookie(name, session, httponly=True, samesite="Strict")
         return response
@@ -373,7 +373,7 @@ def _real(request: web.Request, name: str) -> float:
         value = float(text)
     except ValueError:
         value = float("nan")
-    if not abs(value) < 1e9:  # at most 30 years of mission time; false for NaN
+    if not abs(value) < 1e9:  # rejects NaN and mission times beyond 30 years
         raise UsageError(f"{name} = {text!r}: give the mission time in seconds")
     return value
 

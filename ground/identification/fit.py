@@ -322,7 +322,7 @@ def _fitted(record: Record, noise: MotionNoise, progress: Callable[[int, float],
     for count in range(_MAX_ROUNDS):
         passed = innovations(record, constants, noise, restarts)
         step, information = _step(passed, constants)
-        # The likelihood has a kink at each sample as the delay varies, so steps that reverse are halved.
+        # As a function of the delay, the likelihood has a kink at each sample, so reversing steps are halved.
         share *= 0.5 if step @ information @ before < 0.0 and count > 3 else 1.0
         before = step
         step = share * step

@@ -232,7 +232,7 @@ class Timeline:
         jump[samples : len(times) - len(divided)] = np.diff(record.current, prepend=0.0)[inside]
         order = np.lexsort((sample < 0, times))  # at equal times the sample comes before the switch
         times = times[order]
-        # A switch at the time of an event follows the event.
+        # A current that is switched at the time of an event flows only after the event.
         flowing = np.searchsorted(switch, times, side="left")
         current = np.append(0.0, record.current)[flowing]
         clipped = np.append(False, record.clipped)[flowing]

@@ -50,7 +50,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
     if host and port.isdigit() and not Path(to).exists():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             return _ask(line, (host, int(port)), data, timeout, to)
-    # A flight run by `deploy/knightcube.service` cannot see /tmp, so this socket is beside its socket.
+    # A flight service cannot access /tmp, so the socket for the answer is made beside the flight's socket.
     beside = Path(to).absolute().parent
     place = beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
     with (
@@ -217,7 +217,7 @@ class FileSession:
             if is_unit(packet, DOWN):
                 try:
                     self.entity.take(unit_of(packet), now_ns)
-                except PduError:  # from a satellite of another release with unknown transfer units
+                except PduError:  # sent by a satellite whose software release has other PDUs
                     continue
             elif packet[:2] == _VERIFICATION:
                 report = report_of(packet)
@@ -230,7 +230,7 @@ class FileSession:
                 self._texts[int(row["source"]), int(row["number"])] = to_text(row["text"])
 
     def transmit(self, now_ns: int) -> None:
-        """Send the commands and transfer units that are due, within the rate limit. Raises FlightError."""
+        """Send the commands and PDUs that are due, within the rate limit. Raises FlightError."""
         if self._asked is not None and now_ns >= self._asked[1]:
             self.ask(self._asked[0], now_ns)
         self._credit += self._rate * (now_ns - self._credit_ns) * 1e-9

@@ -56,7 +56,7 @@ _REPORT_S = 1.0
 _TOKEN_CHARACTERS = b"0123456789abcdef"
 _TOKEN_BYTES = 32
 _CHECKED_BYTES = HEADER_BYTES + 1
-"""Length of the primary header and the version of the packet's definition."""
+"""Number of checked bytes: the primary header and the byte with the version of the packet definition."""
 _UNSEGMENTED = 0b11
 _LONGEST_PACKET = LONGEST_FRAME - TELECOMMAND_HEADER.size - OVERHEAD_BYTES - CRC_BYTES
 _SHORTEST_UNIT = HEADER_BYTES + SECONDARY_BYTES + 1 + CRC_BYTES

@@ -141,7 +141,7 @@ def response(time: FloatArray, q2: FloatArray, command: StepCommand) -> StepResp
     t = np.concatenate([[0.0], time[inside] - command.time])
     y = np.concatenate([[np.interp(command.time, time, q2)], q2[inside]])
     steady = math.nan
-    if command.duration >= 2.0 * STEADY_STATE_S:  # in a shorter step the slew may last into the last 30 s
+    if command.duration >= 2.0 * STEADY_STATE_S:  # a shorter step may still be slewing
         last = y[t >= command.duration - STEADY_STATE_S]
         error = _angle(last) - _angle(np.array([command.target]))
         steady = float(np.degrees(np.max(np.abs(error)))) if len(last) else math.nan

@@ -135,8 +135,8 @@ class EarthCameraModel:
         """Return the camera of Meller et al. with 512 x 512 px, 8 bits, six decades and a field of 67 deg.
 
         `field_of_view` (rad) is the undistorted field from edge to edge. `k1` and `k2` are the distortion
-        coefficients of `knightcube.vision.camera.lens.Lens`. `numbers` are other attributes, such as
-        `response="linear"`.
+        coefficients of `knightcube.vision.camera.lens.Lens`. `numbers` sets further attributes of the class,
+        such as `response="linear"`.
         """
         rows, columns = int(numbers.get("rows", 512)), int(numbers.get("columns", 512))
         ideal = Pinhole.from_field_of_view(columns, rows, field_of_view)

@@ -35,7 +35,7 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 
 ATMOSPHERE = "atmosphere"
 _DEEPEST = -9.0
-"""Smallest argument of erfcx that is used; the optical depth there is 1e35."""
+"""Smallest argument of erfcx, at which the optical depth is already 1e35; smaller arguments are clipped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +94,8 @@ class Atmosphere:
         `depth` (...) is the optical depth along the line of sight. `bottom` (...) is the air density at the
         line's lowest point, relative to the ground. `sunward` (...) is the optical depth from the ground
         below that point towards the Sun. The scattered light comes from the air above the point where the
-        optical depth along the line reaches one. The mean transmission of sunlight by the scattering air is
-        (1 - exp(-x))/x.
+        optical depth along the line reaches one. The transmission of sunlight is averaged over the
+        scattering air.
         """
         x = np.maximum(sunward * bottom / (1.0 + depth), 1e-6)
         return np.asarray(np.expm1(-depth) * np.expm1(-x) / x)
@@ -221,7 +221,7 @@ def _read(volume: Float32Array, places: Float32Array) -> Float32Array:
 
 @lru_cache(maxsize=4)
 def _volumes(seed: int) -> tuple[Float32Array, Float32Array]:
-    """Return two independent periodic volumes of zero mean and unit variance, for land and for cloud."""
+    """Return two periodic volumes of independent noise, of unit variance, for land and for cloud."""
     across = np.fft.fftfreq(_CELLS, 1.0 / _CELLS).astype(np.float32)
     wave = np.sqrt(across[:, None, None] ** 2 + across[None, :, None] ** 2 + across**2)
     amplitude = np.where(wave >= 1.5, np.maximum(wave, 1.5) ** _SLOPE, 0.0)
@@ -265,7 +265,7 @@ def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
     scaled = rays @ into_earth
     squares = np.einsum("ij,ij->i", scaled, scaled)
     along = scaled @ origin
-    # This form of the nearest point's distance from the centre avoids the cancellation in b^2 - ac.
+    # The distance of the nearest point from the centre is more accurate than a quadratic's discriminant.
     step = -along / squares
     nearest = origin + step[:, None] * scaled
     distance = np.einsum("ij,ij->i", nearest, nearest)
@@ -317,7 +317,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 RIM_DARKENING = 0.6
 """Linear coefficient of limb darkening near 550 nm (Cox 2000, Allen's Astrophysical Quantities)."""
 _RINGS, _SPOKES = 24, 48
-"""Numbers of sampling points of the Sun's disc."""
+"""Numbers of rings and spokes of the sampling points on the Sun's disc."""
 
 
 def nadir(scene: EarthScene) -> FloatArray:

@@ -76,7 +76,7 @@ class EmulatedI2cBus:
         self._wait = wait
         self._faults: list[_Fault] = []
         self._closed = False
-        # The lock is re-entrant because other jobs of the same thread may run while a hang lasts.
+        # The lock is re-entrant: during a simulated hang, the waiting thread may run jobs that use the bus.
         self._lock = threading.RLock()
         self.transactions = 0
 

@@ -145,7 +145,7 @@ class EmulatedPca9685:
             for value in data[1:]:
                 written |= self._store(self._pointer, value)
                 self._advance()
-        # A write to a channel acts like RESTART, but if OCH is set, only a write of all four registers does.
+        # A write to a channel acts like RESTART; if the OCH bit is set, it must write all four registers.
         if written and (count >= 4 or not self._registers[MODE2] & _UPDATE_ON_ACK):
             self._halted &= ~written
             self._restart = False

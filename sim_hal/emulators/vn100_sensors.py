@@ -125,7 +125,7 @@ class Sensors:
         self._rng = rng
         self._profile = profile
         self._to_sensor = attitude_matrix(conjugate(mounting))
-        # conj(mounting) (small q) reference is linear in q and in small, so a table needs only two products.
+        # The measured quaternion is linear in the true quaternion and in the error, so a table gives it fast.
         body = multiply(np.eye(4)[None, :], np.eye(4)[:, None])
         self._table = multiply(multiply(conjugate(mounting), body), reference).reshape(4, 16)
         self._fixed_bias = gyro_bias
@@ -278,7 +278,7 @@ BINARY_FIELDS: Mapping[tuple[int, int], str] = {
 
 @dataclass(frozen=True, slots=True)
 class AsciiOutput:
-    """An ASCII output, with header after `$VN`, number in register 6, its data register, and content."""
+    """An ASCII output: header after `$VN`, number in register 6, register with the data, and quantities."""
 
     header: str
     async_type: int

@@ -209,7 +209,7 @@ def put(faults: Sequence[ScheduledFault], bench: Bench, epoch_ns: int) -> None:
 
 
 def _begin(fault: ScheduledFault, bench: Bench, removals: list[Removal]) -> None:
-    assert fault.kind.begin is not None  # `put` schedules no other fault
+    assert fault.kind.begin is not None  # faults without `begin` are not scheduled
     removals.append(fault.kind.begin(bench, fault.kind, fault.parameters))
 
 

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from typing import Any
 
 _ANSWER_S, _FIRST_ANSWER_S, _FIRST_S = 0.1, 5.0, 2.0
-"""Timeout of an answer (s), timeout (s) while the server may be starting, and time (s) of the start."""
+"""Timeouts (s) of an answer, later and at first, and time (s) for which the first timeout holds."""
 
 
 def pack(message: Any) -> bytes:

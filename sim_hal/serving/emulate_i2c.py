@@ -179,7 +179,7 @@ def emulate(options: argparse.Namespace) -> int:
     config = configuration.load(options.config)
     text = options.config.read_text(encoding="utf-8")
     section = configuration.simulation_section(text, str(options.config), Simulation)
-    if section is None:  # a board's configuration without simulation: the coils have the configured values
+    if section is None:  # without this section, the true coils equal the configured ones
         section = Simulation(release=Release(q2=0.0))
     coils = assemble_coils(config, section, np.random.default_rng(options.seed), SystemClock().now_ns)
     with tempfile.TemporaryDirectory(prefix="knightcube-i2c-") as folder:

@@ -297,7 +297,7 @@ def expose_rolling(
     fastest = float(np.max(lengths / np.diff(knots))) * shutter.line_time
     if fastest > FASTEST:
         raise OutOfRange(DEVICE, "motion of a source in a line time", fastest, 0.0, FASTEST, "px")
-    # A rolling shutter stretches the image of a moving source by the factor 1 / (1 - speed).
+    # A source that moves by v rows per line time has an image stretched by the factor 1 / (1 - v).
     reach = math.ceil(spread.reach / (1.0 - fastest))
     # A source just outside the first or last row still adds charge to that row.
     knots = knots.copy()
@@ -314,7 +314,7 @@ def expose_rolling(
             times = starts + span.nodes[:, None] * (ends - starts)
             points = camera.project(vectors(times, near))
             shift = camera.project(vectors(times + shutter.line_time, near)) - points
-            # The row time u grows more slowly than t while a source moves down the image.
+            # If a source moves down v rows per line time, its row time passes 1 - v times as fast as time.
             light = span.weights[:, None] * (ends - starts) * (1.0 - shift[..., 1]) / shutter.exposure
             _deposit_rows(image, spread, reach, points, shift, light * electrons[near])
 

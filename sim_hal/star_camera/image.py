@@ -167,7 +167,7 @@ def scatter_hot_pixels(
 
 
 GREATEST_TURN = 0.5 * np.pi
-"""Largest rotation (rad) between two attitude samples; beyond pi, interpolation takes the wrong way."""
+"""Largest rotation (rad) between attitude samples; beyond pi, interpolation would reverse the rotation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,7 +248,7 @@ def _turns(quaternions: FloatArray) -> FloatArray:
 
 
 FAINT_SHARE = 0.25
-"""Largest charge of a faint pixel, as a fraction of the background's variance."""
+"""Largest charge (e-) of a pixel that counts as faint, as a fraction of the variance of the background."""
 GREATEST_SKEWNESS = 0.05
 """Largest skewness of noise drawn as Gaussian, whose distribution then errs by 0.004 (Edgeworth)."""
 

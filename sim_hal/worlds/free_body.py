@@ -12,8 +12,8 @@ the coils, the residual dipole, the gravity gradient, air drag and sunlight.
 
 Euler's equations are integrated in principal axes by the classical Runge-Kutta method. Every stage evaluates
 the torques that depend on the attitude, namely those of the dipole in the field and of the gravity gradient
-(Wertz 1978, eq. 17.28). With |w| dt = 0.01 the error of one step is 1e-13 rad. The code uses plain floats,
-because for three components numpy takes ten times as long.
+(Wertz 1978, eq. 17.28). A step in which the body rotates by 0.01 rad errs by 1e-13 rad. The code uses
+plain floats, because for three components numpy takes ten times as long.
 
 The rotation is integrated when the state is read and when the currents change. The times at which the state
 is read change the result by less than a microradian. The torques of air and sunlight and the residual dipole
@@ -110,7 +110,7 @@ class Rotation:
         gx, gy, gz = a11 * x + a12 * y + a13 * z, a21 * x + a22 * y + a23 * z, a31 * x + a32 * y + a33 * z
         i1, i2, i3 = self._of_torques
         k1, k2, k3 = self._of_rates
-        # In principal axes, r x (J r) and w x (J w) contain the same differences of the moments of inertia.
+        # Gravity-gradient and gyroscopic torques have the same factors, the differences of principal moments.
         return (
             0.5 * (w3 * q2 - w2 * q3 + w1 * q4),
             0.5 * (w1 * q3 - w3 * q1 + w2 * q4),
@@ -428,7 +428,7 @@ class FreeBody:
         self._read: tuple[State, BodyMotion | None] = self._state, None
         self._slot = -1
         self._torque, self._residual = ZERO, ZERO
-        # The state is valid at `_done_ns`, and from then to `time_ns` the coil currents are `_acting`.
+        # The state holds at `_done_ns`; from then until `time_ns` the coil currents `_acting` flow.
         self._done_ns = self.time_ns = start_ns
         self._pull, self._field = self._gravity_and_field(0.0)
         self.energy = 0.0

@@ -51,7 +51,7 @@ def outlast_readers() -> None:
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is None:
-            # The descriptor is closed: without a substitute, the next opened file would receive its output.
+            # A closed descriptor is replaced, so that the next opened file does not receive the output.
             while (held := os.open(os.devnull, os.O_WRONLY)) < number:
                 pass
             if held != number:

@@ -76,7 +76,7 @@ class Incoming(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Ending(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Result of an ended incoming transfer, stored to answer units that the sender repeats."""
+    """Result of an ended incoming transfer, stored to answer PDUs that the sender repeats."""
 
     source: _Entity
     number: _Long

@@ -4,10 +4,10 @@ Once a second, the receiver syncs the received data to disk and then stores the 
 the process is killed, at most one second of data is requested again. Each EOF is acknowledged, including
 repeated EOFs.
 
-A CFDP entity handles all file transfers at one end of the link. The caller asks the entity for the next unit
-whenever a unit can be sent. Replies are sent first, followed by units of the open transfers in round-robin
-order. An entity never blocks and gets the time from its caller. State that survives a restart of the process
-is kept in the store.
+A CFDP entity handles all file transfers at one end of the link. The caller asks the entity for the next
+protocol data unit (PDU) whenever one can be sent. Replies are sent first, followed by PDUs of the open
+transfers in round-robin order. An entity never blocks and gets the time from its caller. State that survives
+a restart of the process is kept in the store.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ class Timer:
     of radio contact for hours.
 
     Attributes:
-        times: number of retries since the other end last sent a unit.
+        times: number of retries since the other end last sent a PDU.
     """
 
     def __init__(self, period_ns: int, now_ns: int) -> None:
@@ -171,14 +171,14 @@ class Timer:
         self.times += 1
 
     def heard(self, now_ns: int) -> None:
-        """Reset the timer because a unit was received from the other end."""
+        """Reset the timer because a PDU was received from the other end."""
         self._since_ns = now_ns
         self.times = 0
 
 
 ASK_NS = 5_000_000_000
 _EOF_TRIES = 20
-"""Maximum number of unacknowledged EOF units that a sender sends for a cancelled transfer."""
+"""Maximum number of unacknowledged EOF PDUs that a sender sends for a cancelled transfer."""
 
 
 class Sender:
@@ -229,7 +229,7 @@ class Sender:
         self._metadata_due, self._end_due, self._acknowledged = False, True, False
 
     def take(self, content: Content, now_ns: int) -> list[Content]:
-        """Process a unit from the receiver and return the immediate answers."""
+        """Process a PDU from the receiver and return the immediate answers."""
         self._timer.heard(now_ns)
         match content:
             case Nak(gaps=gaps) if self._stopped is None:
@@ -251,7 +251,7 @@ class Sender:
         return []
 
     def next(self, now_ns: int) -> Content | None:
-        """Return the content of the next unit to send, None if no unit is due."""
+        """Return the content of the next PDU to send, None if no PDU is due."""
         self._go_on_summing()
         if self._metadata_due:
             self._metadata_due = False
@@ -298,7 +298,7 @@ class Sender:
 
 
 def answer_to(finished: Finished) -> Ack:
-    """Return the acknowledgement of a Finished unit. A closed transfer is acknowledged as well."""
+    """Return the acknowledgement of a Finished PDU. A closed transfer is acknowledged as well."""
     return Ack(Code.FINISHED, finished.condition, 2)
 
 
@@ -313,7 +313,7 @@ LACK_NS = 2_000_000_000
 SILENT_NS = 10_000_000_000
 FINISHED_NS = 5_000_000_000
 _FINISHED_TRIES = 20
-"""Maximum number of unacknowledged Finished units before the receiver closes the transfer."""
+"""Maximum number of unacknowledged Finished PDUs before the receiver closes the transfer."""
 
 Accept = Callable[[Metadata], str]
 """Function that returns why a file is rejected, or an empty text if the file is accepted."""
@@ -353,7 +353,7 @@ class Receiver:
         return self.record.size if whole else self._ranges.total
 
     def take(self, content: Content, now_ns: int) -> list[Content]:
-        """Process a unit from the sender and return the immediate answers."""
+        """Process a PDU from the sender and return the immediate answers."""
         self.heard_ns = now_ns
         self._lack.heard(now_ns)
         self._silence.heard(now_ns)
@@ -371,7 +371,7 @@ class Receiver:
         return []
 
     def next(self, now_ns: int) -> Content | None:
-        """Return the content of the next unit to send, None if no unit is due."""
+        """Return the content of the next PDU to send, None if no PDU is due."""
         if self.record.finished is not None:
             return self._say_finished(now_ns)
         if self._whole():
@@ -632,9 +632,9 @@ class Entity:
             raise FileError(f"no transfer {number} of entity {source} is open")
 
     def take(self, unit: bytes, now_ns: int) -> None:
-        """Process a received unit and ignore units for other entities.
+        """Process a received PDU and ignore PDUs for other entities.
 
-        Raises PduError for an invalid unit and FileError if the disk cannot be written.
+        Raises PduError for an invalid PDU and FileError if the disk cannot be written.
         """
         transaction, content = unpack(unit)
         if transaction.source == self.number:
@@ -647,7 +647,7 @@ class Entity:
         self._clear()
 
     def unit(self, now_ns: int) -> bytes | None:
-        """Return the next unit to send, None if no unit is due."""
+        """Return the next PDU to send, None if no PDU is due."""
         if self._replies:
             return self._replies.popleft()
         for _ in range(len(self._out) + len(self._in)):

@@ -1,4 +1,4 @@
-"""Encoding and decoding of CFDP class 2 protocol data units (CCSDS 727.0-B-5, section 5) in packets.
+"""Encoding and decoding of the protocol data units of CFDP file transfers (CCSDS 727.0-B-5, section 5).
 
 A protocol data unit (PDU) consists of a header and either file data or a directive. The header has version 1,
 entity numbers of 2 bytes and transaction numbers of 4 bytes; the decoder also accepts other lengths. The PDUs

@@ -70,7 +70,7 @@ class LogFollower:
         self._stream = _PacketStream()
         self._idle = 0
         self.label = b""
-        """Packet `run` of the current run, empty until a run is found."""
+        """The packet `run`, which describes the present run, as bytes; empty until a run is found."""
         self._attach(at_end=True)
 
     def folder(self, number: int) -> Path | None:

@@ -77,7 +77,7 @@ class Filing:
             raise UsageError(str(error)) from error
 
     def take(self, packet: bytes, now_ns: int) -> None:
-        """Process a packet with a CFDP unit. Raises CommandError for an invalid unit or if the disk fails."""
+        """Process a packet with a CFDP PDU. Raises CommandError for an invalid PDU or if the disk fails."""
         try:
             self._entity.take(unit_of(packet), now_ns)
         except (PduError, FileError, OSError) as error:

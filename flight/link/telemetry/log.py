@@ -196,7 +196,7 @@ class SegmentStore:
 
 
 MOST_RUNS = 1000
-"""Maximum number of runs. The limit matters for a board that crashes at every start, creating many runs."""
+"""Maximum number of runs, for example of a board that crashes at every start and so creates many runs."""
 
 LEAST_FREE_BYTES = 64 << 20
 """Minimum free disk space (bytes) at the start of a run, enough for several hours of packets."""

@@ -376,7 +376,7 @@ class Recovery:
 
 TESLA_PER_GAUSS = 1e-4
 _UNIT_NORM_TOLERANCE = 1e-2
-_CERTAIN = 4  # number of consecutive contradictions that prove wrong settings
+_CERTAIN = 4  # consecutive unexpected samples after which the unit counts as misconfigured
 
 # Each row lists the packet fields that can contain a quantity, in order of preference.
 _SOURCES = (

@@ -388,7 +388,7 @@ class StreamParser:
         return found
 
     def _span(self, position: int) -> int:
-        """Return the length (bytes) of the candidate at offset `position`, or _FALSE, or _INCOMPLETE."""
+        """Return the length (bytes) of a packet or line at offset `position`, or _FALSE, or _INCOMPLETE."""
         if self._buffer[position] == SYNC:
             return self._packet_span(position)
         line = _LINE.match(self._buffer, position)
