@@ -58,8 +58,8 @@ def magnetic_field_on_ground(
 def apparent_sun(date: float, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, float]:
     """Return the apparent direction (3,) of the Sun in ICRS axes, and its distance, m.
 
-    For an observer in a low orbit, the parallax is 9". The Earth's motion causes an aberration of 20.5", and
-    the satellite's motion causes 5".
+    For an observer in a low orbit, the parallax of the Sun is 9". The Earth's orbital motion causes an
+    aberration of 20.5", and the satellite's motion an aberration of 5".
 
     Args:
         date: Julian date UTC.

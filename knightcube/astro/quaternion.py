@@ -7,9 +7,9 @@ correction, because the printed lower triangle repeats the upper triangle. The k
 formulas of quaternion algebra are contained in this module only.
 
 `NED_TO_TESTBED` and `attitude_map` convert between the reference frames of the mission. The y axis of the
-testbed frame T points down along the thread, and the magnetic field points along -z. Magnetic north is the
-direction of the field, so that N = -z, D = y and E = D x N = -x, and v_T = [[0, -1, 0], [0, 0, 1], [-1, 0,
-0]] v_NED.
+testbed frame T points down along the suspension thread, and the magnetic field points along -z. Magnetic
+north is the direction of the field, so that N = -z, D = y and E = D x N = -x, and v_T = [[0, -1, 0], [0, 0,
+1], [-1, 0, 0]] v_NED.
 
 The functions from `compose` on are the same algebra with tuples of floats, for the control cycle: a numpy
 call on three or four numbers takes ten times as long as plain arithmetic. A test compares the two forms.
@@ -139,12 +139,12 @@ def angle_between(p: FloatArray, q: FloatArray) -> FloatArray:
 
 
 def about_axis_y(angle: float) -> FloatArray:
-    """Return the quaternion of a rotation by `angle` (rad) about the y axis, the testbed's thread."""
+    """Return the quaternion of a rotation by `angle` (rad) about the y axis, the testbed's rotation axis."""
     return np.array([0.0, np.sin(0.5 * angle), 0.0, np.cos(0.5 * angle)])
 
 
 def angle_about_axis_y(q: FloatArray) -> float:
-    """Return the rotation angle (rad) of q (4,) about the y axis, the testbed's thread, in [-pi, pi)."""
+    """Return the angle (rad) of q (4,) about the y axis, the testbed's rotation axis, in [-pi, pi)."""
     angle = 2.0 * np.arctan2(q[1], q[3])
     return float(np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi)
 

@@ -1,23 +1,25 @@
 """PID and adaptive controllers of the testbed's rotation angle, for comparison (Sease 2013, chapter 5).
 
-The PID controller (0.15 W on the testbed) has free gains, or gains that place all three closed-loop poles of
-a double integrator at -w. These gains are 3 w on the rate, 3 w^2 on the angle and w^3 on the integral of the
-angle. The reference angle enters the proportional part with a weight b (set-point weighting, Astrom and
-Hagglund 1995, section 3.4). With b = 0, a step of the target causes no step of the current and no overshoot.
-The integration stops while the current is saturated and the error would increase the saturation (conditional
-integration). The only plant parameter that the PID controller uses is the ratio of inertia to torque
-constant, which scales the gains.
+The PID controller, which needs 0.15 W on the testbed, has free gains, or gains that place all three
+closed-loop poles of a double integrator at -w, with a bandwidth w. The gains for three poles at -w are 3 w on
+the rate, 3 w^2 on the angle and w^3 on the integral of the angle. The reference angle enters the proportional
+part with a weight b (set-point weighting, Astrom and Hagglund 1995, section 3.4). If the reference angle has
+no weight (b = 0), a step of the target causes no step of the current and no overshoot. The integration stops
+while the current is saturated and the error would increase the saturation (conditional integration). The only
+plant parameter that the PID controller uses is the ratio of inertia to torque constant, which scales the
+gains.
 
-The adaptive controller (0.66 W on the testbed) follows Slotine and Li 1991, section 8.5. With the composite
-error s = e' + l e and the reference acceleration a_r = theta_m'' + l e', the current I is defined by
+The adaptive controller, which needs 0.66 W on the testbed, follows Slotine and Li 1991, section 8.5. With the
+composite error s = e' + l e and the reference acceleration a_r = theta_m'' + l e', the current I is defined
+by
 
     I cos(theta) = p . Y + g s,     Y = (a_r, theta, w, -1),     p' = G Y s
 
-The parameters p are inertia, stiffness, damping and constant torque, each divided by the torque constant. The
-adaptive controller converges for any values of the parameters p. The reference angle theta_m follows the
-target through a critically damped second-order model, so that the body can follow a step of the target. The
-parameters p are adapted only while the coil is not saturated and |s| exceeds the noise level. The parameters
-p are also bounded, because noise alone would make the parameters drift.
+The adapted parameters p are inertia, stiffness, damping and constant torque, each divided by the torque
+constant. The adaptive controller converges for any values of the parameters p. The reference angle theta_m
+follows the target through a critically damped second-order model, so that the body can follow a step of the
+target. The parameters p are adapted only while the coil is not saturated and the composite error exceeds the
+noise level. The parameters p are also bounded, because noise alone would make the parameters drift.
 """
 
 from __future__ import annotations
@@ -134,7 +136,7 @@ class AdaptiveSettings:
         adaptation: adaptation gain relative to the square of each parameter's range, s/rad^2.
         reference_bandwidth: bandwidth of the reference model, rad/s, or None to follow the commanded motion
             directly.
-        dead_zone: minimum |s| for adaptation of the parameters, rad/s.
+        dead_zone: minimum absolute composite error s for adaptation of the parameters, rad/s.
     """
 
     bandwidth: float
@@ -175,7 +177,7 @@ class AdaptiveController:
         inertia = plant.inertia / plant.torque_constant
         self._gain = inertia * settings.bandwidth
         begin = np.array([plant.inertia, plant.stiffness, plant.damping, 0.0]) / plant.torque_constant
-        # Stiffness and damping may use half the maximum current at 1 rad and at 0.2 rad/s, respectively.
+        # Stiffness may use half the current limit at 1 rad, and damping half the limit at 0.2 rad/s.
         self._range = np.array([0.5 * inertia, 0.5 * self._limit, 2.5 * self._limit, 0.5 * self._limit])
         self._low = np.maximum(begin - self._range, [0.5 * inertia, 0.0, 0.0, -np.inf])
         self._high = begin + self._range

@@ -23,8 +23,8 @@ below the satellite (km). This image scale is exact for tilts about an optical a
 for other tilts of level cameras.
 
 Vector Method (Meller et al., section 3.2.2, equation 6): If a point on the horizon moves from Q to P, the
-shortest rotation from Q to P rotates the old nadir to the new nadir. A rotation of the body about P is not
-observable.
+shortest rotation from Q to P rotates the old nadir to the new nadir. A rotation of the body about the
+direction P of the horizon point is not observable.
 """
 
 from __future__ import annotations

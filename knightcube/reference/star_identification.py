@@ -15,9 +15,9 @@ The methods are:
 
 - Triangles by area and polar moment: The area of an observed triangle and its propagated standard deviation
   define a range of areas in the table of guide star triangles (Michalski, sections 3.2.2 and 3.2.3, and Cole
-  & Crassidis 2004 and 2006). The triangles in this range whose polar moment and side lengths match are
-  candidates. If several triangles match, the published methods pivot to a neighbouring triangle, while this
-  implementation tests all matching triangles.
+  & Crassidis 2004 and 2006). The triangles in this range of areas whose polar moment and side lengths match
+  are candidates. If several triangles match, the published methods pivot to a neighbouring triangle, while
+  this implementation tests all matching triangles.
 
 - Pyramid: The triangles are ordered so that no observed star occurs in many consecutive triangles, which
   limits the effect of a false star (Michalski, section 3.2.4, and Mortari, Samaan, Bruccoleri & Junkins,
@@ -34,15 +34,15 @@ The methods are:
 
 - Geometric voting: For each pair of observed stars, each guide star with a partner at the pair's angle gets
   one vote for each of the two observed stars (Michalski, section 3.2.6, and Kolomenkin, Pollak, Shimshoni &
-  Lindenbaum, IEEE TAES 44, 2008). The number of partners is ignored, because otherwise crowded regions of the
-  sky would win the vote if the noise exceeds 0.3 px. In a second vote, the assignments with the most votes
-  support each other if the angles between their stars agree. The largest group of consistent assignments is
-  the candidate.
+  Lindenbaum, IEEE TAES 44, 2008). The number of partners of a guide star is ignored, because otherwise
+  crowded regions of the sky would win the vote if the noise exceeds 0.3 px. In a second vote, the assignments
+  with the most votes support each other if the angles between their stars agree. The largest group of
+  consistent assignments is the candidate.
 
 - Grid: The grid pattern of each observed star is compared with the patterns of all guide stars by counting
   the cells that both patterns occupy (Michalski, section 3.2.7, and Padgett & Kreutz-Delgado, IEEE TAES 33,
-  1997). The neighbour that aligns a pattern may be a false star or missing in the catalogue, so that several
-  neighbours are tried.
+  1997). The neighbouring star that defines the orientation of a grid pattern may be a false star or missing
+  in the catalogue, so that several neighbours are tried.
 
 The dictionary `METHODS` contains all methods by name.
 """
@@ -305,7 +305,7 @@ def _support(
     middle = 0.5 * (pair[:, 0] + pair[:, 1])
     lever = np.linalg.norm(seen[None] - middle[:, None], axis=-1)
     sigma = float(view.sigma.max())
-    # The attitude error of the pair adds a position error proportional to the distance from the pair.
+    # The error of an attitude from two stars adds a position error proportional to the distance from both.
     gate = settings.tolerance * sigma * np.sqrt(1.5 + 2.0 * (lever / base[:, None]) ** 2)
     gate = np.minimum(gate + view.slack * lever, 0.25 * math.atan(min(sky.half_width)))
     distance, _ = sky.tree.query(seen @ matrices, distance_upper_bound=float(gate.max()))
@@ -336,7 +336,7 @@ def matching_triangles(
     a1, b1, a2, c2 = a[first], b[first], a[~first], b[~first]
     place, of = shared(a1, a2)
     triangles = np.stack([a1[of], b1[of], c2[place]], axis=-1)
-    # Angle limits beyond 0 or pi are clipped, because the cosine is not monotonic there.
+    # Angle limits are clipped to 0 to pi, the range in which the cosine is monotonic.
     alike = within(sky, triangles[:, 1], triangles[:, 2], low[2], high[2])
     triangles = triangles[alike & (triangles[:, 1] != triangles[:, 2])]
     same_orientation = _turns_left(sky.stars.direction[triangles]) == _turns_left(
@@ -362,7 +362,7 @@ def within(sky: KnownSky, one: IntArray, other: IntArray, low: FloatArray, high:
 
 
 def _turns_left(corners: FloatArray) -> BoolArray:
-    """Return for triangles (k, 3, 3) whether the corners (a, b, c) are ordered so that a . (b x c) > 0."""
+    """Return for triangles (k, 3, 3) whether their corners a, b, c are right-handed: a . (b x c) > 0."""
     a, b, c = np.moveaxis(corners, -2, 0)
     return np.asarray(np.einsum("kx,kx->k", a, np.cross(b, c)) > 0.0)
 

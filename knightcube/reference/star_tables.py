@@ -4,12 +4,13 @@ Pair table (Michalski, sections 3.3.1 and 3.3.4, eq. 49-61): A pair consists of 
 between the stars. The angle of a pair is stored as float32, with a rounding error of at most 0.003" below 0.5
 rad. Pairs are sorted by angle and searched with a k-vector, which finds the keys of a range without a binary
 search (Mortari & Neta, K-vector range searching techniques, 2000). A straight line approximates the sorted
-keys. The k-vector contains the number of keys below each of the evenly spaced values of the line. The inverse
-of the line gives the cell of a value, so that two look-ups give the beginning and end of a range. Ranges are
-half-open (low <= key < high). Equation 61 of Michalski returns some additional keys. This implementation is
-exact, because it also compares the keys in the two boundary cells. Equation 54 of Michalski is corrected to 2
-delta-epsilon, as in the original paper, so that the line ends above the largest key. The margin 2.22e-16 in
-equation 56 of Michalski is replaced by a margin proportional to the size of the keys.
+keys. The k-vector contains, for evenly spaced values on the line, the number of keys below the value. The
+inverse of the line gives the interval (cell) of the k-vector that contains a value, so that two look-ups give
+the beginning and end of a range of keys. Ranges of keys are half-open (low <= key < high). Equation 61 of
+Michalski also returns some keys just outside the range. This implementation returns exactly the keys of the
+range, because it compares the keys in the two boundary cells. Equation 54 of Michalski is corrected to 2
+delta-epsilon, as in the original paper, so that the straight line ends above the largest key. The margin
+2.22e-16 in equation 56 of Michalski is replaced by a margin proportional to the size of the keys.
 
 Triangle tables: Triangles of the brighter guide stars are described by area and polar moment. Planar
 triangles have chords as sides (Michalski, eq. 35-48, and Cole & Crassidis, Fast star-pattern recognition
@@ -84,7 +85,7 @@ class KVector:
             return np.zeros(len(value), dtype=np.int64)
         last = len(self.count) - 2
         with np.errstate(over="ignore"):
-            # An infinite quotient, for a value far above the keys, is clipped to the last cell.
+            # A value far above the keys gives an infinite quotient, which is clipped to the last cell.
             cell = np.clip((value - self.origin) / self.slope, 0.0, last).astype(np.int64)
         # The cell index is corrected if rounding has moved the quotient across the boundary of a cell.
         cell = np.maximum(cell - (self.origin + self.slope * cell > value), 0)
@@ -319,7 +320,7 @@ def spherical_shape(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     length = np.linalg.norm(inside, axis=-1)
     chord = np.linalg.norm(inside / length[..., None] - middle[..., None, :], axis=-1)
     theta = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
-    # The factor 0.5 is the area of the triangle of barycentric coordinates.
+    # The factor 0.5 is the area of the triangle over which the barycentric coordinates are integrated.
     moment = 0.5 * volume * np.sum(_WEIGHTS * theta**2 / length**3, axis=-1)
     return area, moment
 
@@ -445,8 +446,8 @@ def _triangles(pairs: PairTable, chosen: BoolArray, widest: float) -> IntArray:
 
 GRID_CELLS = 40
 BUFFER = 0.15
-"""Minimum distance of the aligning star in pattern radii. The direction to a closer star would not align the
-pattern accurately."""
+"""Minimum distance, in pattern radii, of the neighbouring star that defines the orientation of a grid
+pattern. The direction to a closer star would define the orientation of the pattern inaccurately."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -455,8 +456,8 @@ class GridTable:
 
     Attributes:
         radius: radius of the patterns, rad.
-        aligning: (n,) index of the neighbour that aligns the pattern of each guide star; -1 without a
-            neighbour.
+        aligning: (n,) index of the neighbour that defines the orientation of each guide star's pattern; -1 if
+            none.
         begin: (cells + 1,) index of the first entry of each cell in `star`.
         star: (m,) indices of guide stars, ordered by cell.
     """
@@ -521,7 +522,7 @@ def cells_of(place: FloatArray, along: FloatArray, radius: float) -> IntArray:
 
     Args:
         place: (k, 2) positions of stars on the tangent planes.
-        along: (k, 2) positions of the aligning stars, which define the +x axis of the grid.
+        along: (k, 2) positions of the stars that define the +x axis of the grid.
         radius: radius of the patterns, rad.
     """
     unit = along / np.linalg.norm(along, axis=-1, keepdims=True)

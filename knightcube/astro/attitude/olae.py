@@ -7,10 +7,10 @@ the rotation vector divided by the exposure time, with the sign convention v' = 
 4.8-4.10, corrected).
 
 The function `solve` computes attitudes with any rotation angle. A sequential rotation, based on the TRIAD
-attitude, limits the angle to 120 deg and |g| to 1.74. An error e of b enters the equation as (1 + [g x]) e,
-which is larger than e by a factor of up to sqrt(1 + g^2) and anisotropic, so that the weights 1/sigma^2 are
-not optimal. The difference from the solution of Wahba's problem is of the order of the noise. The returned
-covariance is that of the OLAE attitude.
+attitude, limits the angle to 120 deg and |g| to 1.74. An error e of the observed direction b enters the
+equation of OLAE as (1 + [g x]) e, which is larger than e by a factor of up to sqrt(1 + g^2) and anisotropic,
+so that the weights 1/sigma^2 are not optimal. The difference from the solution of Wahba's problem is of the
+order of the noise. The returned covariance is that of the OLAE attitude.
 
 Reference: Mortari, Markley and Singla, Optimal linear attitude estimator, Journal of Guidance, Control, and
 Dynamics 30 (2007).

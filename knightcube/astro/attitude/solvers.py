@@ -33,19 +33,21 @@ The solvers are:
   Astronautical Sciences 41 (1993).
 
 - Predictive filter: In each step the filter chooses the body rate that minimises the weighted residuals of
-  the directions predicted to first order (Michalski, section 3.4.1, without a formula). For measurements of
-  one time, the steps converge to the solution of Wahba's problem. The predictive filter uses residuals
-  instead of B, which avoids rounding errors. The references are Crassidis and Markley, Journal of Guidance,
-  Control, and Dynamics 20 (1997), and Park and Crassidis, Navigation 53 (2006).
+  the directions predicted to first order (Michalski, section 3.4.1, without a formula). For measurements at
+  one time, the steps of the predictive filter converge to the solution of Wahba's problem. The predictive
+  filter uses residuals instead of B, which avoids rounding errors. The references are Crassidis and Markley,
+  Journal of Guidance, Control, and Dynamics 20 (1997), and Park and Crassidis, Navigation 53 (2006).
 
 - TRIAD: The attitude follows from the pair of directions whose covariance has the smallest trace, and the
   first direction of the pair is assumed to be exact (Michalski, section 3.4.5). The covariance of the TRIAD
-  attitude is that of Shuster and Oh. The TRIAD attitude does not minimise the loss.
+  attitude is that of Shuster and Oh. The TRIAD attitude does not minimise the loss function of Wahba's
+  problem.
 
 - OLAE: The attitude follows from linear least squares, see `knightcube.astro.attitude.olae`.
 
-The optimal estimate is statistically efficient. The covariance of the difference between the TRIAD or OLAE
-attitude and the optimal attitude is therefore the difference between the covariances of the two attitudes.
+The solution of Wahba's problem is a statistically efficient estimate. The covariance of the difference
+between the TRIAD or OLAE attitude and the optimal attitude is therefore the difference between the
+covariances of the two attitudes.
 """
 
 from __future__ import annotations
@@ -126,7 +128,7 @@ def largest_eigenvalue(profile: FloatArray) -> float:
 
     Newton's method starts from 1, the sum of the weights, which is an upper bound of all roots. The
     polynomial is convex above the largest root, so that the iteration decreases monotonically towards this
-    root. The iteration ends when rounding prevents a further decrease.
+    root. Newton's iteration ends when rounding prevents a further decrease.
     """
     b, c, d = _characteristic(profile)
     root = 1.0

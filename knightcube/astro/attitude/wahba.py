@@ -121,7 +121,7 @@ def sightings(observed: FloatArray, reference: FloatArray, sigma: FloatArray) ->
     both = np.empty((n, 6))
     both[:, :3], both[:, 3:] = observed, reference
     _check_unit_length(both)
-    # The product contains B and, in its diagonal blocks, the weighted sums of b b^T and r r^T.
+    # The product contains the profile matrix B, and in diagonal blocks the weighted sums of b b^T and r r^T.
     gram = (both * weight[:, None]).T @ both
     cofactors, volume = _cofactors(gram[:3, :3], n, "observed")
     _cofactors(gram[3:, 3:], n, "reference")
@@ -238,7 +238,7 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
         quaternion: (4,) initial attitude.
     """
     weight = seen.weight[:, None]
-    # The narrowness is of the order of the inverse squared angular extent of the directions, 1/rad^2.
+    # The variable `narrowness` is about 1 / (angular extent of the directions, rad)^2.
     narrowness = seen.total * float(seen.covariance.trace())
     smallest = max(_CONVERGED**2, _ROUNDING**2 * narrowness)
     for _ in range(_MAXIMUM_STEPS):
@@ -298,7 +298,7 @@ def _check_unit_length(both: FloatArray) -> None:
 
 
 def _cofactors(gram: FloatArray, n: int, name: str) -> tuple[Rows, float]:
-    """Return the adjugate and determinant of the information matrix 1 - gram (3, 3) for normalised weights.
+    """Return adjugate and determinant of the information matrix 1 - `gram` (3, 3) for normalised weights.
 
     The eigenvalues of the information matrix add up to 2 and are at most 1. The determinant is therefore
     within a factor of two of the smallest eigenvalue. Raises AttitudeError if the smallest eigenvalue is

@@ -1,13 +1,13 @@
 """Disturbance torques on a satellite by air drag, solar radiation pressure, and a constant torque.
 
-The directions of the drag and radiation torques follow from the orbit. The magnitudes of all torques are
+The directions of the air flow and of the sunlight follow from the orbit. The magnitudes of all torques are
 estimated in flight. The atmosphere rotates with the Earth, and its density in the diurnal bulge is four times
 the density at night (Montenbruck & Gill 2000, section 3.5.2: cos^4 of half the angle from an apex 30 deg
-behind the Sun). Each torque is the cross product c x d. The vector c (N m) is a constant of the body: force
-times the lever arm of the centre of pressure. The vector d is the direction of the pressure in body axes,
-times its relative strength and the exposed area. The exposed areas are those of a homogeneous box with the
-moments of inertia of the body. All other disturbance torques are represented by a constant torque in body
-axes.
+behind the Sun). Each torque by air or sunlight is the cross product c x d of a body vector c and a pressure
+vector d. The body vector c (N m) is constant: the force multiplied by the lever arm of the centre of
+pressure. The pressure vector d is the direction of the pressure in body axes, multiplied by relative strength
+and exposed area. The exposed areas are those of a homogeneous box with the moments of inertia of the body.
+All other disturbance torques are represented by a constant torque in body axes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _NIGHT, _DAY = 0.4, 1.6
 _LAG = math.radians(30.0)
 """Angle (rad) by which the diurnal bulge lags behind the Sun."""
 _THINNEST = 0.02
-"""Minimum squared side of the box, relative to the largest moment of inertia divided by (mass / 12)."""
+"""Minimum squared side length of the box, relative to 12 times the largest moment of inertia per mass."""
 _HEIGHT, _SCALE_HEIGHT = EARTH_RADIUS + 500e3, 65e3
 """Geocentric distance (m) at which the relative air density is one, and scale height (m) of the air."""
 

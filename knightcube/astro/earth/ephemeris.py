@@ -6,8 +6,8 @@ s, the interpolation errors are 1 mm and 3 nT.
 
 The class `FieldAhead` predicts the geomagnetic field up to an hour ahead within the control loop. Because the
 full model takes 0.3 ms per time, each call adds only a few nodes at intervals of one minute, between which
-the field is interpolated linearly. Beyond the last node a dipole model is used, whose direction has an error
-of 9 deg RMS.
+the field is interpolated linearly. Beyond the last node a dipole model is used, whose field direction has an
+error of 9 deg RMS.
 """
 
 from __future__ import annotations
@@ -140,14 +140,14 @@ _DIPOLE = 1e-9 * np.array([-1410.8, 4545.4, -29351.8])
 _REFERENCE_RADIUS = 6_371_200.0
 """Reference radius of the dipole coefficients, m."""
 _CORRECTION_TIME = 400.0
-"""Time constant (s) with which the correction of the dipole to the current field decays."""
+"""Time constant (s) of the decay of the correction that fits the dipole field to the current field."""
 NODE_STEP = 60.0
-"""Time between two nodes, s.
+"""Time between two nodes of the field prediction, s.
 
 Within this time the field rotates by 8 deg, and its linear interpolation is at most 0.2 % too weak.
 """
 NODES_PER_CALL = 5
-"""Maximum number of nodes that one call adds."""
+"""Maximum number of nodes that one call adds to the field prediction."""
 LARGEST_JUMP = 50e3
 """Change (m) of the known orbit above which all nodes are discarded, for example after a clock error."""
 

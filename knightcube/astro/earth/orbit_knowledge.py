@@ -112,7 +112,7 @@ class TwoLineElements:
             _check_line(number, line.rstrip())
         self._satellite = Satrec.twoline2rv(first.rstrip(), second.rstrip())
         if not 1.0 <= self._satellite.epochdays < 367.0:
-            # SGP4 propagates resonant orbits from the epoch in steps of half a day, which would take forever.
+            # SGP4 steps through resonant orbits by half a day, which would take forever from an absurd epoch.
             raise UsageError(f"{first.rstrip()!r}: the day of the year of its epoch must be from 1 to 366")
         code, *state = self._satellite.sgp4_tsince(0.0)
         if code or not np.all(np.isfinite(state)):

@@ -6,10 +6,10 @@ The detector of Trajkovic and Hedley (Fast corner detection, Image and Vision Co
 diameters of a small circle around a pixel. At a corner the intensity changes along every diameter. The
 cornerness is therefore the minimum, over all directions, of the sum of the squared intensity changes from the
 centre to both ends of a diameter. Between two neighbouring diameters the intensity is interpolated linearly
-with a parameter t from 0 to 1. With the squared changes r and r' along the two diameters, the squared change
-is A t^2 + 2 B t + C with C = r and A = r' - r - 2B. The coefficient B combines the intensity changes to the
-two ends of the same diameter. Sease, eq. 3.12, is corrected in this respect, because the printed B1 mixes the
-ends of different diameters.
+with a parameter t from 0 to 1. With the squared changes r and r' along two neighbouring diameters, the
+squared change between the diameters is A t^2 + 2 B t + C with C = r and A = r' - r - 2B. The coefficient B is
+a sum over the two pairs of neighbouring ends of the two diameters. The coefficient B1 printed in Sease, eq.
+3.12, is corrected, because it combines the wrong pairs of ends.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from knightcube.reference.corner_streaks.settings import StreakSettings
 from knightcube.vision.objects.settings import EndpointSettings
 from knightcube.vision.objects.streak_ends import StructureTensor, harris_cornerness, smoothed, tensor_of
 
-# The tuples are offsets (x, y) to one end of each diameter, in order of direction.
+# Offsets (x, y) from the centre pixel to one end of each diameter, by number of neighbours.
 _DIAMETERS = {4: ((1, 0), (0, 1)), 8: ((1, 0), (1, 1), (0, 1), (-1, 1))}
 
 
@@ -93,7 +93,7 @@ def interpixel_response(image: FloatArray, neighbours: int) -> FloatArray:
     """Return the interpixel cornerness: the minimum squared intensity change over all directions.
 
     The minimum is computed for each pair of neighbouring diameters (Sease, eq. 3.11-3.13, corrected). For
-    four neighbours, the minimum equals Sease, eq. 3.11, with the smaller of B1 and B2 as B.
+    four neighbours, the minimum equals Sease, eq. 3.11, with the smaller of the coefficients B1 and B2 as B.
     """
     ring = _changes(image, neighbours)
     # The neighbour of the last diameter is the first diameter with exchanged ends.

@@ -214,7 +214,7 @@ def fit_rotation(
     raw = np.where(swapped[:, None, None], raw[:, ::-1], raw)
     outward = chord_outward(raw)
     errors = np.sqrt(2.0) * sigma / pinhole.focal_length
-    # The second pass corrects the bias along the arcs of the first rotation, because streaks can be curved.
+    # The second pass corrects the bias of the ends along the arcs that the first pass predicts for the stars.
     for _ in range(2):
         if np.count_nonzero(used) < needed:
             return None

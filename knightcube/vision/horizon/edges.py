@@ -3,8 +3,8 @@
 Some columns and rows of the image are normalised, thresholded and filtered as in Meller et al., section 3.1.
 Each change from dark to bright is then located at the point of maximum slope of the brightness, smoothed by a
 Gaussian. The width of this Gaussian is doubled as long as the edge is wider than the Gaussian (Lindeberg
-1998, International Journal of Computer Vision 30, 117). Therefore an edge of one pixel and an edge of a
-hundred pixels are both located at the steepest point.
+1998, International Journal of Computer Vision 30, 117). Sharp edges and edges a hundred pixels wide are
+therefore both located at the steepest point of the brightness.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _REACH = 3.0
 _TAIL = 3.5
 """Distance from the centre at which the Gaussian is truncated, in standard deviations."""
 _OUTGROWN = 1.4
-"""Ratio of an edge's step heights at two successive scales above which the larger scale is used."""
+"""Ratio of an edge's step heights under two successive Gaussians above which the wider Gaussian is used."""
 _MARGIN = 4.0
 """Distance from the image border (px) within which edges are ignored; some detectors have a black frame."""
 _FLOOR, _SHARE = 0.1, 0.05
@@ -115,7 +115,7 @@ class ScanEdges:
     Attributes:
         points: positions of the edges (n, 2), px.
         towards: unit vectors along the scan line towards the bright side (n, 2).
-        scale: standard deviation of the Gaussian with which each edge was found (n,), px.
+        scale: standard deviation of the smoothing Gaussian with which each edge was found (n,), px.
         sigma: standard deviation of each edge position along the scan line before a fit of the limb (n,), px.
         background: brightness of the dark side (n,), which is low at the limb and the terminator, and higher
             at a coast or a cloud.
@@ -297,11 +297,11 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
 
 @lru_cache(maxsize=16)
 def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
-    """Return the matrix that gives the smoothed slope at p positions from the brightness at w positions.
+    """Return the matrix that gives the smoothed slope at p positions from the brightness at w pixels.
 
-    The three returned values are the offsets of the w positions from the centre (w,), px, the matrix (w, p),
-    and the largest offset of the p positions, px. The smoothing Gaussian has the standard deviation `size`,
-    px. The matrix is scaled so that a sharp unit step has the slope 1 for every `size`.
+    The three returned values are the offsets of the pixels from the centre (w,), px, the slope matrix (w, p),
+    and the largest offset of a slope position, px. The smoothing Gaussian has the standard deviation `size`,
+    px. The slope matrix is scaled so that a sharp unit step has the slope 1 for every `size`.
     """
     half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
     x: FloatArray = np.arange(-half, half + 1, dtype=float)

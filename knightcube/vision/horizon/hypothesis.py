@@ -127,7 +127,7 @@ def _placed_by_profile(
 
 
 _GATES = (0.25, 0.5, 1.0, 2.0)
-"""Half-widths (px) of the trial gates around the limb; the most significant result is used."""
+"""Trial distances (px) from the limb within which edges count; the most significant result is used."""
 _ROUND = 0.1
 """Assumed radius of curves on which chance edges lie, such as coasts, as a fraction of the image size."""
 _BESIDE = 0.05
@@ -209,9 +209,9 @@ _UNKNOWN_TURN = 1.0
 _NIGHT = np.radians(-8.0)
 """Elevation of the Sun at a limb point (rad) below which the limb is too dark to show an edge."""
 _LIMB_RAYS, _FINE_RAYS = 120, 720
-"""Number of points along the limb at which its coverage, and its significance, are computed."""
+"""Number of points along the limb for computing its coverage by edges, and for its significance."""
 _BORDER = 8.0
-"""Distance from the image border (px) within which a limb without edges is not counted as missing."""
+"""Distance from the image border (px) within which the limb need not show edges."""
 _NEAR = 0.0375
 """Distance of an edge within which a limb point counts as covered, as a fraction of the image size."""
 
@@ -230,8 +230,8 @@ class Hypothesis:
         coverage: fraction of the sunlit limb in the image that has an edge nearby; 1 if the image shows no
             sunlit limb.
         night: fraction of the edges on the horizon at which the Sun is well below the horizon.
-        allowance: additional standard deviation per axis of the nadir due to effects that are not modelled,
-            rad.
+        allowance: standard deviation per axis, rad, that is added to the nadir for effects that are not
+            modelled.
         chance: log10 of the expected number of equally good chance horizons, from `log10_chance`.
         breadth: median width of the edges on the horizon, relative to the width expected from the air's
             brightness profile.

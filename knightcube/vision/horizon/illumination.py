@@ -15,8 +15,7 @@ directions. If the direction of the Sun is unknown, any sample on the Earth's di
 The function `why_false` compares an image with the view from a known attitude. An image contradicts the
 attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be. An
 image that contradicts the attitude is taken by a camera that is dead, blinded, mounted upside down or sends
-random data. The comparison excludes the surroundings of the limb, the twilight zone and the surroundings of
-the Sun.
+random data. The comparison excludes samples near the limb, in the twilight zone and near the Sun.
 """
 
 from __future__ import annotations
@@ -259,13 +258,13 @@ def _sphere(count: int) -> FloatArray:
 
 
 _MARGIN = math.radians(5.0)
-"""Angle (rad) beside the limb that is not compared; it covers the air and 1 deg of attitude error."""
+"""Angle (rad) from the limb within which samples are not compared, for air and 1 deg of attitude error."""
 _DAY = DAYLIGHT + math.radians(12.0)
 """Elevation of the Sun (rad) above which ground is certainly bright."""
 _STRAY_LIGHT = math.radians(25.0)
 """Angle between the Sun and the nearest sample (rad) below which stray light may cover the whole image."""
 _LEAST = 8
-"""Minimum number of samples, out of 64, from which an image can be judged to contradict the attitude."""
+"""Minimum number of compared samples, out of 64, to judge whether an image contradicts the attitude."""
 _MOST = 0.6
 """Fraction of samples that contradict an attitude above which the image is false (clouds cause less)."""
 

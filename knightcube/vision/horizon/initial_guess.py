@@ -1,13 +1,13 @@
 """Initial guess of a horizon: the cone with which most edges agree, and the camera's rotation about nadir.
 
 All rays u to the limb of a sphere make the same angle rho with the nadir n, so that u.g = 1 with g = n / cos
-rho, an equation that is linear in g (Christian & Robinson 2016). If rho is known, two rays determine n up to
-two solutions. If rho is unknown, three rays determine n and rho. Every pair of edges gives a trial cone, or
-every triple if the altitude is unknown. If there are too many pairs or triples, an evenly spaced selection is
-used. An edge agrees with a cone if the edge lies near the cone and its bright side is towards nadir. The
-edges of the best cone are removed and the search is repeated, so that the terminator, a coast or a band of
-clouds gives a separate cone. The search is a sample consensus (Fischler & Bolles 1981) without random
-selection.
+rho, an equation that is linear in g (Christian & Robinson 2016). If the angle rho is known, two rays to the
+limb determine the nadir up to two solutions. If the angle rho is unknown, three rays to the limb determine
+rho and the nadir. Every pair of edges gives a trial cone, or every triple if the altitude is unknown. If
+there are too many pairs or triples of edges, an evenly spaced selection is used. An edge agrees with a cone
+if the edge lies near the cone and its bright side is towards nadir. The edges of the best cone are removed
+and the search is repeated, so that the terminator, a coast or a band of clouds gives a separate cone. The
+search for cones is a sample consensus (Fischler & Bolles 1981) without random selection.
 
 A horizon does not determine the rotation about nadir. The rotation about nadir is needed because the Earth's
 flattening depends on the direction of the pole, and the illumination depends on the direction of the Sun. The
@@ -164,7 +164,7 @@ def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tole
     cones are given by their axes `directions` (k, 3) and the cosines (k,) of their half-angles.
     """
     sines = np.sqrt(np.maximum(1.0 - cosines**2, 1e-6))
-    # A ray at the angle a from a cone's axis lies about (cos(a) - cos(rho)) / sin(rho) inside the cone rho.
+    # A ray at angle a from the axis lies (cos a - cos rho) / sin rho inside the cone of half-angle rho.
     off = directions @ edges.rays.T
     off -= cosines[:, None]
     near = np.abs(off, out=off) <= sines[:, None] * (tolerance * edges.pixel)
@@ -205,7 +205,7 @@ def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: Horizo
     if knowledge.attitude is not None:
         matrix, sigma = attitude_matrix(knowledge.attitude.quaternion), knowledge.attitude.sigma
         known += [(matrix @ axis, axis, sigma) for axis in (inertial_nadir, tangent_basis(inertial_nadir)[0])]
-    # Each known direction restricts nadir to a ring on the sphere, and two rings share few directions.
+    # Each known direction restricts nadir to a circle on the sphere, and two circles nearly determine it.
     narrowest = sorted(math.hypot(sigma, _GUESS_SIGMA) for _, _, sigma in known)[:2]
     share = math.prod(min(1.0, MOST_MISMATCH * sigma) for sigma in narrowest)
     down = _unit(nadir)

@@ -186,7 +186,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     gradients = np.empty((len(rays), PARAMETERS))
     # A small rotation d of the camera displaces a fixed direction u by -d x u.
     gradients[:, :3] = by_ray[:, :3] * rays[:, _BEFORE] - by_ray[:, 3:6] * rays[:, _AFTER]
-    # The variable `by_size` is minus the derivative of the half-angle arcsin(1 / size) of the cone by `size`.
+    # The variable `by_size` is minus the derivative of the cone's half-angle arcsin(1 / size) by `size`.
     by_size = 1.0 / (size * math.sqrt(size * size - 1.0))
     step = -(by_height @ view.position)
     along = float(towards @ step)
@@ -201,7 +201,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
 
 _MOST_STEPS = 10
 _LAST_STEP = 3e-5
-"""Rotation step (rad) below which the iteration ends, about an eightieth of a pixel."""
+"""Rotation step (rad) below which the fit of the limb ends, about an eightieth of a pixel."""
 _SAME_GRADIENTS = 3e-3
 """Rotation step (rad) below which the gradients change by less than 1 % and are not computed again."""
 _HUBER, _BEYOND = 1.5, 5.0
@@ -415,7 +415,7 @@ def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
 def _limb_table() -> FloatArray:
     """Return the brightness of air and of ground and their slopes per m, as (4, blurs, heights)."""
     heights = np.arange(_LOWEST, _HIGHEST, _STEP)
-    # For tangent heights below the surface, the optical depth from the ground outwards is integrated.
+    # For lines of sight that end on the ground, the optical depth is integrated from the ground outwards.
     sines = np.sqrt(np.maximum(-2.0 * heights / SEMI_MAJOR_AXIS, 0.0))
     way = np.linspace(0.0, 1200e3, 601)
     above = (
@@ -476,7 +476,7 @@ def fit_profiles(
     weights = usable / (_FLOOR + _SHARE * np.clip(light, 0.0, 1.0)) ** 2
     place = np.zeros(len(profiles))
     amounts = np.zeros((len(profiles), 3))
-    # Weak priors keep the equations regular if a profile does not determine a parameter.
+    # Weak priors keep the normal equations regular if a brightness profile does not determine a parameter.
     prior = np.diag([1.0, 1.0, 1.0, 0.1])
     of_place = np.zeros((len(profiles), 4, 1))
     of_place[:, 3] = 1.0
@@ -484,7 +484,7 @@ def fit_profiles(
         heights = UNIT_DEPTH_HEIGHT - (steps - place[:, None]) * metres[:, None]
         air, ground, air_slope, ground_slope = limb_light(heights, blur)
         if not amounts.any():
-            # The brightnesses of background, air and ground are first fitted at the initial position.
+            # The brightnesses of background, air and ground are first fitted for the initial limb position.
             columns = np.stack([np.ones_like(air), air, ground], axis=2)
             weighted = (columns * weights[:, :, None]).transpose(0, 2, 1)
             amounts = np.linalg.solve(weighted @ columns + np.eye(3), weighted @ light[:, :, None])[:, :, 0]

@@ -142,7 +142,8 @@ class HorizonSolution:
 
 
 _WIDER = 2.0
-"""Factor that widens the altitude range in the search for cones, which is inaccurate with three edges."""
+"""Factor that widens the altitude range in the search for cones, because a cone of three edges is
+inaccurate."""
 _MOST_ALTITUDE = 3.0
 """Largest distance of a fitted altitude from `HorizonSettings.altitudes`, in standard deviations."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1

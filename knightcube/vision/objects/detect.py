@@ -6,20 +6,21 @@ In camera axes, all stars rotate about the same axis by the same angle. Three in
 not that of a star: the perpendicular bisector of its chord misses the common centre of rotation, the streak
 subtends a different angle at this centre, or its residual in the Optimal Linear Attitude Estimator (OLAE) is
 large (Sease, eq. (4.11) to (4.15), with corrections). If the rotation axis is nearly normal to the boresight,
-the centre recedes to infinity, and the chord's slope and length are used instead of centre and angle. In a
-wide field, the pinhole projection changes slopes and lengths by far more than their errors. Each indicator is
-therefore compared with the indicator of a star at the same position, in units of the expected error of an
-endpoint. An indicator must exceed 2.5 standard deviations over the streaks of the image (Sease, text at Table
-4.4), and also a minimum threshold, which was measured in images without objects.
+the centre of rotation is almost at infinity in the image, and slope and length of the chord are used instead
+of centre and angle. In a wide field, the pinhole projection changes slopes and lengths by far more than their
+errors. Each indicator is therefore compared with the indicator of a star at the same position, in units of
+the expected error of an endpoint. An indicator must exceed 2.5 standard deviations over the streaks of the
+image (Sease, text at Table 4.4), and also a minimum threshold, which was measured in images without objects.
 
 A streak with a large indicator may also be the overlapping streaks of two stars, or a segment of a faint
 star's streak ("overlapping streak" in Sease, Table 4.4). The class `Judge` therefore tests whether stars
 alone explain the pixels (`star_light`). Regions with more than two corners (peaks of the corner detector),
 which Sease discards, may be stars or an object that crosses a star. Bright points in an image whose stars are
 streaks are objects that the camera tracks (Sease, Figure 4.5). Saturated regions, regions with large
-indicators, and regions in which objects and stars merge are searched again after their stars are removed. The
-search needs only the rotation of the camera during the exposure. The maximum-likelihood estimate of the
-rotation from the streaks is more accurate than an estimate from the streak ends, and succeeds in more images.
+indicators, and regions in which objects and stars may merge are searched again after the stars are
+subtracted. The search needs only the rotation of the camera during the exposure. The maximum-likelihood
+estimate of the rotation from the streaks is more accurate than an estimate from the streak ends, and succeeds
+in more images.
 """
 
 from __future__ import annotations
@@ -140,7 +141,7 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     return np.stack([middle @ half.T for half in halves], axis=1)
 
 
-# Distance of the rotation centre from the boresight, in focal lengths, above which the centre is not used.
+# Distance of the rotation centre from the boresight, in focal lengths, above which slopes are used instead.
 # The centre's distance is computed from the rotation axis, because errors move a fitted centre nearer.
 _FARTHEST_CENTRE = 3.0
 
@@ -233,7 +234,7 @@ def short_regions(
         weight = weight[bright] / weight[bright].sum()
         centre = weight @ points
         offset = points - centre
-        # A line shorter than the PSF becomes a point, because noise dominates the moments.
+        # A line shorter than the PSF becomes a point, because noise dominates its moments.
         lines.append(line_of(centre, (offset * weight[:, None]).T @ offset, _LEAST_LINE_PX))
     ends = np.array(lines).reshape(-1, 2, 2)
     sigma = np.hypot(1.0, expected_sigma(short, segmented.background, settings))
@@ -354,7 +355,7 @@ class Judge:
         lines = extend(pairs, chord_outward(pairs), self.settings.endpoint_bias) if len(pairs) else pairs
         try:
             light = self._light(corners)
-            # An additional line cannot reduce chi-square to much less than the number of pixels.
+            # The possible decrease of chi-square is limited, because a good fit has about one unit per pixel.
             hopeless = light.chi_square - light.pixels < self.objects.improvement
             tried = [] if hopeless else [(ends, light.explain(ends)) for ends in lines]
         except FlightError:

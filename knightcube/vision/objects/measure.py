@@ -1,10 +1,10 @@
 """Directions of possible objects in an image whose attitude is determined from the stars.
 
 If the stars are streaks, `detect` finds objects by their motion and their pixels. If the stars are points, an
-object is also a point or a short streak. If the stars are points, a possible object is an area of light that
-is significantly brighter than the noise and not at the position of a catalogue star, or light beside a star
-that the star does not explain. A single image does not show which possible objects move relative to the
-stars; only tracks over several images show this.
+object is also a point or a short streak. If the stars are points, a possible object is an area of light
+significantly above the noise that is not at a catalogue star, or light beside a star that the star's image
+does not explain. A single image does not show which possible objects move relative to the stars; only tracks
+over several images show this.
 
 The pixels of each object are fitted together with the known stars nearby. An object is modelled as a short
 trail of constant brightness, blurred by the camera's point spread function (PSF). A Gauss-Newton iteration

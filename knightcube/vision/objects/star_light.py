@@ -12,10 +12,10 @@ the path of any star, or that ends where a star would continue, is not explained
 A star's streak has the same brightness from end to end. Therefore the brightness of a star is at most the
 minimum brightness of the image along the star's path. An erosion of the image, with the path as structuring
 element, gives the minimum brightness along the path for every position of the star. Objects that cross the
-streaks of stars, and points on these streaks, nearly vanish in the eroded image. In a region, stars are
+streaks of stars, and points on these streaks, nearly vanish in the eroded image. The stars of a region are
 subtracted one by one, the brightest first. The positions and brightnesses of all stars found are fitted
-together, without pixels that are brighter than these stars. The brightest remaining light is then fitted as a
-point or a line.
+together, without pixels that are brighter than these stars. The brightest light that remains after the
+subtraction of the stars is then fitted as a point or a line.
 """
 
 from __future__ import annotations
@@ -307,7 +307,7 @@ def _within_pixels(count: int, centres: FloatArray, sigma: float, slope: bool = 
 # Margin (px) of a patch of pixels around a region, which is wider than the PSF.
 _ROOM = 8
 _MOST_STARS = 12
-# Thresholds of a star and of the light without stars, in standard deviations of the smoothed image.
+# Detection thresholds of a star and of the remaining light, in standard deviations of the smoothed image.
 _STAR_SIGMAS, _LEFT_SIGMAS = 4.0, 6.0
 # Excess of a pixel over the modelled stars (standard deviations) above which the fit ignores the pixel.
 _NOT_THEIRS = 4.0
@@ -315,7 +315,7 @@ _NOT_THEIRS = 4.0
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
 # Minimum length (px) of an object's line of light; a shorter remainder of light counts as a point.
 _LEAST_LINE_PX = 4.0
-# Widest gap (px) that a removed star may leave in an object's line of light.
+# Widest gap (px) in an object's line of light that the subtraction of a crossing star may leave.
 _WIDEST_GAP_PX = 12
 
 
