@@ -67,3 +67,21 @@ def test_the_twist_is_what_is_left_about_y(q: Quaternion, angle: float) -> None:
         expected = quaternion.angle_about_axis_y(np.array(q))
         assert math.remainder(quaternion.twist(q) - expected, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-13)
     assert quaternion.twist(quaternion.exponential(0.0, angle, 0.0)) == pytest.approx(angle, abs=1e-14)
+
+
+def test_the_rows_of_an_array_are_tuples_of_floats_in_order() -> None:
+    assert quaternion.rows_of(np.arange(9.0).reshape(3, 3)) == (
+        (0.0, 1.0, 2.0),
+        (3.0, 4.0, 5.0),
+        (6.0, 7.0, 8.0),
+    )
+
+
+@given(vectors, vectors)
+def test_a_sum_of_vectors_adds_each_component(a: Vector, b: Vector) -> None:
+    assert quaternion.added(a, b) == (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+@given(st.floats(-3.1, 3.1))
+def test_the_twist_is_the_angle_of_a_rotation_about_y(angle: float) -> None:
+    assert quaternion.twist(quaternion.exponential(0.0, angle, 0.0)) == pytest.approx(angle, abs=1e-12)
