@@ -171,7 +171,7 @@ _SPOKES = 48
 _STEP = 0.5
 """Distance (px) between samples along a spoke from the centre of a patch to its rim."""
 _ROUNDS = 3
-"""Maximum number of tracings of a rim, each from the centre of the circle fitted before."""
+"""Maximum number of times a rim is traced, each time from the centre of the last fitted circle."""
 _NEAR = 0.5
 """Distance (px) between fitted centre and origin of the spokes at which the tracing stops."""
 
@@ -417,7 +417,7 @@ _MOST_CORRELATED = 0.9
 _TUKEY = 4.685
 """Cut-off of Tukey's biweight in standard deviations, 95 % efficient for Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
-"""Fraction of the largest number of agreeing points that a smaller circle must reach to be preferred.
+"""Minimum number of points on a preferred smaller circle, relative to the circle with the most points.
 
 Stray light enlarges discs, so that a smaller circle is more likely the Sun.
 """
@@ -519,7 +519,7 @@ _SIGMAS = 3.0
 _RING = 12
 """Number of directions that are tested at each angular distance from the coarse Sun direction."""
 _CONTRADICTED = 5.0
-"""Largest distance between measured and coarse Sun direction, in standard deviations of the latter."""
+"""Largest distance between measured and coarse Sun direction, in standard deviations of the coarse one."""
 _CUT = np.radians(0.05)
 """Systematic error per axis (rad) of a disc that the edge of the image truncates."""
 

@@ -345,7 +345,7 @@ def fit_with_distortion(
         if fitted is None:
             return None
     pose, normal, squares = fitted
-    # Too large residuals increase the part of the covariance from the stars, but not that from the prior.
+    # Residuals above expectation increase the covariance from the stars, but not that from the prior.
     normal[4, 4] -= PRIOR**-2
     normal /= inflation(squares, 5)
     normal[4, 4] += PRIOR**-2

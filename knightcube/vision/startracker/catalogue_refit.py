@@ -44,11 +44,11 @@ from knightcube.vision.streaks.normal_equations import light_of
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 
-# Distance below which a streak overlaps the fitted pixels of a bright streak, relative to their half-width.
+# Distance below which streaks overlap, relative to the half-width of a bright streak's fitted pixels.
 _NEAR = 1.4
 # Distance (px) below which two stars are too close to be fitted separately.
 _TWIN = 2.0
-# Largest distance (px) of a measured star from its catalogue star, and minimum ratio of their fluxes.
+# Largest distance (px) between a measured star and its catalogue star, and minimum ratio of the fluxes.
 _SAME, _ALIKE = 5.0, 0.3
 # Distance (px) from a catalogue star's streak within which a measured star is a segment of this streak.
 _BESIDE = 2.5
@@ -60,7 +60,7 @@ _AT_ONCE = 25
 _INSTANTS = 9
 # Factor on the maximum number of pixels in the second fit, which includes more stars than the first.
 _ROOM = 1.7
-# Largest chi-square of the difference between the rates of both fits (false alarm in 1 of 100,000 frames).
+# Largest chi-square of the rate difference of first and second fit (false alarm in 1 of 100,000 frames).
 _ONE_MOTION = 25.9
 # Standard deviation (px) added to that of the fitted attitude when the stars are identified again.
 _PRIOR_PX = 1.0

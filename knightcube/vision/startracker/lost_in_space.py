@@ -149,8 +149,8 @@ class ScaleSteps:
         """Return steps of a field's range of scales, within each of which side ratios vary by `tolerance`.
 
         At a field angle of tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2
-        / 2 across the radius. Therefore the ratio of two sides of a triangle there varies by t^2 / 2. The
-        steps are computed for the field angle half-way to the corner of the field.
+        / 2 across the radius. Therefore the ratio of two sides of a triangle at this field angle varies by
+        t^2 / 2. The steps are computed for the field angle half-way to the corner of the field.
         """
         lowest, highest = field.scale
         half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
@@ -166,8 +166,8 @@ class TriangleMatches:
     Attributes:
         observed: indices of the observed stars at the corners of each match (k, 3), uint32.
         star: indices of the guide stars at the corresponding corners (k, 3), uint32.
-        scale: factor by which the observed tangents must be multiplied to make the longest sides of each
-            match equal (k,).
+        scale: factor on the observed tangents for which both triangles of a match have equal longest sides
+            (k,).
     """
 
     observed: npt.NDArray[np.uint32]

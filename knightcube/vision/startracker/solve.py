@@ -102,7 +102,7 @@ class FrameSolution:
         return np.flatnonzero(self.star >= 0)
 
     def wider(self, by: FloatArray) -> FrameSolution:
-        """Return the solution, if solved, with `by` (3, 3), rad^2, added to the attitude covariance."""
+        """Return the solution with `by` (3, 3), rad^2, added to the attitude covariance if there is one."""
         if self.fix is None:
             return self
         return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
@@ -389,7 +389,7 @@ def solve_near(
 
 
 def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
-    """Return whether an attitude agrees with the prior attitude, as the match significance requires."""
+    """Return whether an attitude agrees with the prior, which the significance of the match assumes."""
     if solution.fix is None:
         return True
     off = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(prior.quaternion)))

@@ -55,7 +55,7 @@ class Chance:
         scales: natural logarithm of the ratio of the highest to the lowest image scale.
         choices: number of gate widths among which the matching selects.
         least: minimum number of matched stars for an identification.
-        enough: log10 of the bound of chance matches below which its exact value is not needed.
+        enough: log10 of the number of chance matches below which an exact bound is not needed.
     """
 
     observed: int
@@ -76,7 +76,7 @@ class Chance:
         Args:
             gate: half-width within which a star matches, in standard deviations.
             observed: indices of the matched observed stars in order of brightness.
-            ranks: indices of the expected stars that these stars match, in order of brightness.
+            ranks: indices of the expected stars that the observed stars match, in order of brightness.
         """
         pairs = sorted(zip(ranks, observed, strict=True))
         best = math.inf
@@ -435,7 +435,7 @@ def _same_shift(
     expected = expected_stars(sky, matrix, wider, int((1.3 * min(len(field), _BRIGHTEST) + 8) * area))
     seen = stretched(field.direction[:_BRIGHTEST], scale)
     shift = seen[:, None, :] - sky.stars.direction[expected] @ matrix.T
-    # Errors of roll and scale add different displacements to stars at the image edge.
+    # Errors of roll and scale displace stars at different edges of the image differently.
     radius = math.hypot(across, down)
     star_sigma = float(field.sigma[:_BRIGHTEST].max()) * scale
     stretch = 0.5 * math.log(field.scale[1] / field.scale[0])

@@ -92,7 +92,7 @@ _FIRST_STARS = 12
 _MOST_GUESSES = 5
 # Maximum number of initial guesses with an angular acceleration.
 _MOST_GROWING = 2
-# Maximum number of rotation angles from the scan of the whole frame.
+# Maximum number of rotation angles that the scan of the whole frame proposes.
 _MOST_ANGLES = 2
 # Maximum number of iterations of the fit for a camera at rest.
 _STILL_ROUNDS = 12
@@ -371,9 +371,9 @@ def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
     return float(light[scene.trusted[bright]].sum()) < _AGREEING_LIGHT * float(light.sum())
 
 
-# Largest distance (px) between the two fits of one star, with either sign of the rotation.
+# Largest distance (px) between a star's positions in the fits with either sign of the rotation.
 _SAME_STAR = 3.0
-# Minimum difference of chi-square between the two signs of the rotation from which the sign is decided.
+# Minimum chi-square difference between the two signs of the rotation for a decision on the sign.
 _LEAST_MARGIN = 50.0
 # Minimum ratio of the chi-square difference between both signs to its scatter over the stars, for a decision.
 _LEAST_AGREEMENT = 3.0
@@ -402,7 +402,7 @@ class _Candidate:
 
     @property
     def possible(self) -> bool:
-        """Whether the streak check accepted the motion or found it doubtful, but did not reject it."""
+        """Whether the streak check did not reject the motion."""
         return self.verdict is not StreakVerdict.REJECTED
 
 

@@ -81,7 +81,7 @@ class PolarGrid:
 
 
 def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarGrid:
-    """Return a polar grid of circles that cross the detector, with one in `every` circles kept."""
+    """Return a polar grid of the circles that cross the detector, thinned to one in `every` circles."""
     angle = float(np.linalg.norm(motion.rotation))
     axis = motion.rotation / angle
     middle = np.array([0.0, 0.0, 1.0])
@@ -251,7 +251,7 @@ def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Fl
 
 # Minimum fraction of a faint star's streak that must lie on the detector.
 _LEAST_SEEN = 0.35
-# Number of grid circles between two stars at which their profiles no longer overlap.
+# Distance between two stars, in circles of the grid, at which the profiles no longer overlap.
 _FARTHEST = 5
 # Standard deviation (px) of a star's profile across the streak, as assumed by the filter.
 _WIDTH = 1.05

@@ -70,7 +70,7 @@ class DistortedPinhole(Pinhole):
         return np.asarray(grown[:, None, None] * np.eye(2) + 2.0 * self._per_square * outer)
 
     def curvature(self, points: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return the acceleration (m, 2), px per exposure^2, that the distortion gives image points.
+        """Return the acceleration (m, 2), px per exposure^2, of image points due to the distortion.
 
         The ideal `points` (m, 2), px, move with a constant `velocity` (m, 2), px per exposure.
         """
@@ -357,7 +357,7 @@ class Shutter:
 
     def delay(self, rows: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
         """Return the exposure delay of `rows` relative to the middle row, in exposures."""
-        # The scalars have the type of `rows`, so that float32 arrays are not converted to float64.
+        # The two scalars get the type of `rows`, so that float32 arrays are not converted to float64.
         return np.asarray((rows - rows.dtype.type(self.middle)) * rows.dtype.type(self.delay_per_row))
 
 
@@ -423,8 +423,8 @@ class StreakScene:
         stars: positions of the n stars at mid-exposure (n, 2), px.
         light: flux of each star over the exposure (n,), counts.
         sky: sky level around each star relative to the frame's background (n,), counts per pixel.
-        trusted: whether each star contributes to motion and point spread (n,). For a star that is not
-            trusted, only flux, position and sky level are fitted.
+        trusted: whether each star contributes to motion and point spread (n,). For a star that does not
+            contribute, only flux, position and sky level are fitted.
     """
 
     motion: CameraMotion
@@ -518,7 +518,7 @@ def azimuth_differences(azimuth: FloatArray, other: FloatArray) -> FloatArray:
 def chained_stars(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, light: FloatArray, judged: int
 ) -> BoolArray:
-    """Return which of the first `judged` stars look like segments of longer streaks of `stars` (n, 2), px.
+    """Return which of the first `judged` of n stars at `stars` (n, 2), px, seem to be parts of one streak.
 
     If the assumed rotation is too small, each streak is modelled as a chain of shorter streaks of equal flux
     on one circle about the rotation axis, and each short streak fits its pixels as well as a complete streak.

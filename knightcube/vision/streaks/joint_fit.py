@@ -52,7 +52,7 @@ from knightcube.vision.streaks.normal_equations import (
 )
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
-# Work on a frame, in processed pixels, after which no further motion is fitted.
+# Number of processed pixels per frame after which no further motion is fitted.
 # A fit in progress is always completed, so that the work on a frame may reach twice this limit.
 _MOST_WORK = 1_600_000
 # Fixed overhead of one evaluation of the model, expressed as a number of processed pixels.
@@ -167,7 +167,7 @@ class FitProblem:
 
     @property
     def free(self) -> BoolArray:
-        """Mask of those parameters shared by all stars that are fitted."""
+        """Mask (SHARED,) of the fitted parameters among those that all stars share."""
         return np.array([True] * 3 + [self.growing] * 3 + [True])
 
     @property
@@ -197,7 +197,7 @@ class StreakFit:
         last_step: last step of the shared parameters, in standard deviations. The last step is 0 if the fit
             is converged.
         windows: fitted pixels.
-        free: mask (SHARED,) of those parameters shared by all stars that were fitted.
+        free: mask (SHARED,) of the fitted parameters among those that all stars share.
         hidden: stars on the fitted pixels that were subtracted instead of fitted; None without any.
     """
 
@@ -324,7 +324,7 @@ _LEAST_VALID = 0.7
 _LEAST_SIGNIFICANCE = 4.0
 # Number of instants of the exposure at which the rotation angle is evaluated.
 _INSTANTS = 65
-# Minimum speed of a star, relative to its mean speed, in the expected intensity of its streak.
+# Lower limit of a star's speed in the expected intensity of its streak, relative to the mean speed.
 # The point spread limits the intensity of streak segments in which the star is slow.
 _SLOW = 0.5
 # Minimum intensity beyond a streak end that counts as a trail, relative to the streak's mean intensity.
@@ -749,7 +749,7 @@ def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
 
 
 def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArray:
-    """Return a mask (n,) of the stars in the motion fit and of the brightest others that the limit allows."""
+    """Return a mask (n,) of the stars in the motion fit and the brightest others within the pixel limit."""
     room = window_areas(camera.pinhole, scene, camera.settings.reach)
     order = np.lexsort((-scene.light, ~scene.trusted))
     needed = np.empty(len(room))

@@ -1,10 +1,10 @@
 """Selection of the fitted pixels, and the normal equations of a scene (Fisher scoring).
 
-Long streaks are fitted on strips of pixels along their paths, and spots on square patches of pixels. The flux
-per px of a streak is inversely proportional to the speed of the star. The model of a streak on a strip
-expands the flux per px to first order around each block of pixels, which does not hold near zero speed. If
-the rate increases from zero or decreases to zero, a square patch of pixels covers the slow part of each
-streak.
+Long streaks are fitted on strips of pixels along their paths, and stars with short or slow paths (spots) on
+square patches of pixels. The flux per px of a streak is inversely proportional to the speed of the star. The
+model of a streak on a strip expands the flux per px to first order around each block of pixels, which does
+not hold near zero speed. If the rate increases from zero or decreases to zero, a square patch of pixels
+covers the slow part of each streak.
 
 The weight of a pixel is the inverse of the variance that the model predicts. The iteration therefore
 converges to the maximum likelihood for Poisson noise. The residual of a pixel is its value minus the modelled
@@ -13,8 +13,8 @@ equations, which leaves the shared parameters (rate, acceleration, width). Stars
 coupled, and a few conjugate-gradient iterations account for the coupling.
 
 Each star also provides its own estimate of the shared parameters. A blend of two stars is wider or longer
-than a single star, and flux of a neighbouring star shifts the ends of a streak. Blended stars disagree with
-the majority in their estimates and are no longer trusted.
+than a single star, and flux of a neighbouring star shifts the ends of a streak. Blended stars, whose
+estimates disagree with the majority, no longer affect the motion.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from knightcube.vision.streaks.geometry import (
 )
 from knightcube.vision.streaks.streak_model import STEEPEST, Patches, Strips, cut_patches, cut_strips
 
-# Path length, in point-spread widths, below which a star is fitted as a spot.
+# Path length, in point-spread widths, below which a star is fitted on a square patch of pixels.
 _SPOT_WIDTHS = 8.0
 # Margin below saturation, in standard deviations of the modelled counts, within which a pixel is excluded.
 # The modelled counts are used, because a selection by the measured counts would be biased by their noise.
@@ -261,7 +261,7 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
 
 
 def _without_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntArray) -> Strips:
-    """Return the pixel strips without those pixels that also belong to a patch of the same star."""
+    """Return the pixels along each star's path, without pixels of the star's own square patch."""
     both = np.isin(long, spot)
     if not both.any():
         return strips

@@ -157,7 +157,7 @@ def cut_strips(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Lines of pixels across paths (b, LINES), with the star and path part of each block of lines."""
+    """Lines of pixels across star paths (b, LINES), with star and path part of each block of such lines."""
 
     star: IntArray
     part: IntArray
@@ -313,7 +313,7 @@ _BELL = 1.0 / math.sqrt(2.0 * math.pi)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Square patches of pixels around spots.
+    """Square patches of pixels around spots, which are short streaks or slow parts of streaks.
 
     Attributes:
         column: column indices in the frame of the p pixels along the side of each of n patches (n, p).
@@ -429,7 +429,7 @@ def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatAr
 
 
 IMAGES = 7
-"""Number of basis images of a block of pixels, from which its counts and derivatives are combined."""
+"""Number of images that are combined into the counts and derivatives of a block of pixels."""
 
 # Number of blocks computed at once, small enough for their pixels to fit into the processor's cache.
 _AT_ONCE = 256
@@ -496,7 +496,7 @@ def _draw(
     out[:, 5] += u
     across *= np.float32(1.0 / width**2)
     np.multiply(across, light, out=out[:, 1])
-    # The basis image `out[:, 2]` is the first moment of the counts along the path, between the streak ends.
+    # The image `out[:, 2]` is the first moment of the counts along the path, between the streak ends.
     along *= out[:, 1]
     across *= np.float32(width**2)
     across *= out[:, 3] - out[:, 4]

@@ -160,7 +160,7 @@ class MotionResult(FrameMotion):
         return None if self.rate is None else from_rotation_vector(self.rate * self.exposure)
 
     def line_time_displacement(self, chosen: IntArray, middle_row: float) -> FloatArray:
-        """Return the displacements (m, 2), px, of the stars `chosen` (m,) by a line time error of one sigma.
+        """Return the displacements (m, 2), px, of the stars `chosen` (m,) for a line time error of one sigma.
 
         The delay of a star is proportional to the distance of its row from `middle_row`. If the line time is
         exactly known, an empty array (0, 2) is returned.

@@ -458,7 +458,7 @@ def reversal_improvement(camera: FitProblem, scene: StreakScene) -> float:
 def _path_light(
     camera: FitProblem, onward: CameraMotion, rest: FloatArray, length: float, width: float
 ) -> _PathLight:
-    """Return the sums along the path of a star that is first at rest at the pixel `rest` (2,)."""
+    """Return the sums along the path of a star that starts from rest at the pixel `rest` (2,)."""
     frame, pinhole = camera.frame, camera.pinhole
     places = np.arange(-_BEFORE, _BEYOND * length + _BEFORE, _STEP)
     path = positions(pinhole, onward, np.repeat(rest[None], len(places), axis=0), places / length)
@@ -513,7 +513,7 @@ _CONJUGATE = 12
 _UNCHECKED = (2, 4.0)
 # Relative difference between fitted and configured point-spread variance that is neglected.
 _SAME_SPREAD = 0.05
-# Uncertainty of streak ends per root difference between fitted and configured point-spread variance.
+# Ratio of the streak ends' error to the root of fitted minus configured point-spread variance.
 _END_SHARE = 0.6
 # Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
 _END_FLOOR = 0.12

@@ -480,7 +480,7 @@ def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray
     step = np.abs(np.arange(-windows.half, windows.half + 1))
     rim = np.maximum(step[:, None], step) > radius + 1.0
     mean, variance = _clipped(np.where(windows.good, windows.light, np.inf)[:, rim])
-    # All windows use the median noise, because other stars or low counts falsify that of a single window.
+    # All windows use the median noise, because other stars or low counts falsify the noise of one window.
     common = float(np.sqrt(np.median(variance) + _ROUNDING**2))
     light = np.where(windows.good, windows.light - mean[:, None, None], 0.0)
     smooth = smoothed(light)[:, 1:-1, 1:-1][:, rim[1:-1, 1:-1]]

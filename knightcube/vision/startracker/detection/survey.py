@@ -50,7 +50,7 @@ _ROUNDING = 12.0**-0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A bilinear surface over a frame.
+    """A quantity that is interpolated bilinearly between the centres of blocks of a frame.
 
     Attributes:
         values: values at the centres of the blocks of pixels of the frame (down, across).
@@ -287,11 +287,12 @@ class DetectionSettings:
         threshold_sigmas: minimum height of a peak in the smoothed frame, in standard deviations of its noise.
         most_stars: maximum number of stars, the brightest first. Each sixteenth of the frame's area
             contributes at most a quarter of `most_stars`.
-        psf_sigma: standard deviation of the PSF, px. With None, the PSF is measured in the frame, which needs
-            several stars. For tracking windows with few stars, the width of the PSF should be stated.
+        psf_sigma: standard deviation of the PSF, px. If `psf_sigma` is None, it is measured in the frame,
+            which needs several stars. For tracking windows with few stars, the width of the PSF should be
+            stated.
         gain: electrons per count, or None to measure the gain from the residuals of the stars.
-        saturation: counts at which a pixel saturates. With None, the frame saturates at its highest count if
-            several pixels have it, otherwise at the maximum of the integer type.
+        saturation: counts at which a pixel saturates. If `saturation` is None, the frame saturates at its
+            highest count if several pixels have it, otherwise at the maximum of the integer type.
         window: side length of the centroid window, px, an odd number (a_ROI in Michalski, eq. (12) to (15)).
         search_radius: radius around a predicted position in which `measure_near` searches, px.
     """
@@ -343,7 +344,7 @@ class FrameKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameShape:
-    """The kind of a frame, and the median length of its streaks or points (about 0), px."""
+    """The kind of a frame, and the median length of its streaks, px, which is about 0 for points."""
 
     kind: FrameKind
     length: float
@@ -516,7 +517,7 @@ class Survey:
     """The sky background of a frame and the areas above the noise.
 
     Attributes:
-        pixels: frame in counts (rows, columns); hot pixels are replaced if they are many.
+        pixels: frame in counts (rows, columns); hot pixels are replaced if there are many.
         unit: size of one count in the original unit of the frame.
         settings: detection settings, converted to counts.
         sky: sky background and noise.

@@ -44,7 +44,8 @@ class IndexSettings:
         density: number of stars that count as bright around a triangle whose longest side is 2.5 deg. For
             larger triangles, more stars count as bright, so that every octave of size has about the same
             number of triangles.
-        few: number of the brightest stars of each circle on the sky whose triangles are always included.
+        few: number of brightest stars per circle on the sky; the index always contains the triangles of these
+            stars.
     """
 
     faintest: float = 8.5

@@ -211,7 +211,7 @@ CELL = 1.0 / CELLS
 FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
-"""Resolution of the longest side in a triangle's key; the side is a chord below 1."""
+"""Resolution of the longest side of a triangle, a chord below 1, in the triangle's key."""
 RUN_BITS = 12
 """Binary logarithm of the interval of key values between two entries of `TriangleIndex.below`."""
 TIE = 1e-9
