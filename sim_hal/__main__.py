@@ -183,7 +183,7 @@ def _serve(options: argparse.Namespace) -> int:
 
 
 def _emulate_vn100(options: argparse.Namespace) -> int:
-    """Serve a VN-100 that rotates or oscillates about the thread, until a signal or the duration's end."""
+    """Serve a VN-100 on a rotating or oscillating testbed, until a signal or the end of the duration."""
     if options.link is not None and options.link.exists() and not options.link.is_symlink():
         raise UsageError(f"--link {options.link} exists and is not a symbolic link: choose another path")
     clock, rng = SystemClock(), np.random.default_rng(options.seed)

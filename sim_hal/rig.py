@@ -197,7 +197,7 @@ def with_host_faults(rig: Rig, section: Simulation) -> Rig:
 
 @dataclass(frozen=True, slots=True)
 class LockStep:
-    """Lock-step devices. The flight uses clock, wires and release; faults and tests also use the rest."""
+    """Lock-step devices. The flight uses `clock`, `wires` and `release`; only faults and tests use more."""
 
     clock: SimClock
     wires: Wires

@@ -60,7 +60,7 @@ class TargetLaw(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A target and its number in packets: the number of a configured step, at least COMMANDED, or KEPT."""
+    """A target and its number in packets: that of a configured step, or COMMANDED and above, or KEPT."""
 
     index: int
     law: TargetLaw

@@ -278,7 +278,7 @@ def streams_of(config: Config) -> tuple[StreamLimits, ...]:
         camera = config.camera
         longest = camera.period
         if camera.fine_period is not None or camera.streak_exposure is not None:
-            # Frames are not periodic if the exposure time depends on the rate.
+            # The period of the frames varies if the exposure time depends on the body rate.
             longest = max(longest, camera.fine_period or 0.0)
             longest += max(camera.streak_exposure or (camera.exposure,))
         rows.append(StreamLimits("camera", 1.0 / longest, camera.max_age, CAMERA_POOR))

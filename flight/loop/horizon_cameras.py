@@ -66,7 +66,7 @@ class HorizonCameraTask:
         self._sequences = [-1] * len(cameras)
         self._errors = [""] * len(cameras)
         self._pictures = [b""] * len(cameras)
-        self._job: tuple[int, int, int] | None = None  # mid-exposure (ns), camera bit mask, submission (ns)
+        self._job: tuple[int, int, int] | None = None  # exposure (ns), camera bits, submission (ns)
 
     def begin(self, time_ns: int) -> None:
         """Measure the ages of frames from `time_ns` on, when the first trigger is due."""

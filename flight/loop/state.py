@@ -681,7 +681,7 @@ def open_state(
     """Open the stored state and count this boot, or return None if no state is stored.
 
     The folders `runs` of the newest runs, of which the last is the present run, contain files with boot
-    numbers. When `stack` closes, the final state is written: as a clean end, unless an exception passes. A
+    numbers. When `stack` closes, the final state is written, as a clean end unless an exception was raised. A
     DeviceError counts as a clean end, because it is reported as a device error and safe mode would not help.
     """
     folder = state_folder(config, environment)

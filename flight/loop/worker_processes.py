@@ -223,7 +223,7 @@ class _Kept:
         return min([*dues, *([] if self.process.ready else [self._begun_ns + START_LIMIT_NS])], default=-1)
 
     def serve(self) -> tuple[list[JobResult], list[WorkerNews]]:
-        """Start the process, exchange messages with it or reap it, and return results and news."""
+        """Start or reap the worker process, or exchange messages with it, and return results and news."""
         now_ns = self._clock.now_ns()
         try:
             if self.process is None:

@@ -221,7 +221,7 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PaperNadir:
-    """Result of a method: nadir (3,) in camera axes, and the circle in the first picture."""
+    """Nadir (3,) in camera axes by a method of Meller et al., and the limb circle of the first picture."""
 
     nadir: FloatArray
     seen: ScannedHorizon

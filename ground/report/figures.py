@@ -207,7 +207,7 @@ def cage_figure(signals: RunSignals) -> Figure | None:
 
 def path_figure(plan: StepPlan, plant: SingleAxisPlant) -> Figure:
     """Return the picture of a planned path: q2, rate and current, with its nodes (Sease, Fig. 5.4 to 5.6)."""
-    last = plan.horizon * (1.0 - 1e-12)  # the path already holds its target at the end of the horizon
+    last = plan.horizon * (1.0 - 1e-12)  # just before the horizon, from which on the target is held
     time, nodes = np.linspace(0.0, last, 401), np.minimum(plan.node_times, last)
     figure = Figure(figsize=(OVERVIEW[0], 0.75 * OVERVIEW[1]), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)

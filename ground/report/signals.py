@@ -195,7 +195,7 @@ def streaks(run: Run) -> Object:
 def star_attitudes(run: Run) -> Object:
     """Return the number of frames and attitudes of the star tracker, and the errors of the attitudes.
 
-    `rms_error` (rad) is about the body axes, and `normalised` is defined as in `streak_rates`.
+    `rms_error` (rad) is about the body axes, and `normalised` is defined as in `streaks`.
     """
     packets, truth = run["stars"], run["truth"]
     solved = packets[np.all(np.isfinite(packets["quaternion"]), axis=1)]

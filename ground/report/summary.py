@@ -234,7 +234,7 @@ def _modes(packets: PacketArray) -> list[Object]:
 
 
 def _health(packets: PacketArray) -> Object | None:
-    """Return the time fraction of each good stream, the facts and the resources; None without packets."""
+    """Return how long each stream was good, active facts and resources, or None without health packets."""
     if not len(packets):
         return None
     streams = {

@@ -65,7 +65,7 @@ def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
 
 
 def provenance(run: Object) -> str:
-    """Return a text of configuration, devices, pace, seed and software of a run, empty if unknown."""
+    """Return a line on how a run was flown: configuration, devices and software; empty if unknown."""
     if "software" not in run:
         return ""
     devices = f"simulated devices, seed {run['seed']}" if run["simulated"] else "real devices"

@@ -72,7 +72,7 @@ class GpsReading:
     """Navigation solution of a GPS receiver for one epoch.
 
     Attributes:
-        time_ns: host time at which the receiver began to send, ns; the epoch itself is up to 0.2 s earlier.
+        time_ns: host time at which the receiver began to send, ns, up to 0.2 s after the epoch of the fix.
         arrival_ns: host time at which the last byte of the message was received, ns.
         utc_ns: UTC of the epoch, ns since 1970; 0 if the receiver does not know the time.
         position: (3,) position in the ITRS, m.

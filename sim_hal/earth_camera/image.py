@@ -286,7 +286,7 @@ def _kernel(
     """
     shape = (next_fast_len(2 * down), next_fast_len(2 * across))
     y, x = (np.minimum(np.arange(n), n - np.arange(n)) * (_BIN / focal_length) for n in shape)
-    # The mean squared distance of two random points in one bin is a third of the squared bin width.
+    # Within a bin, the mean squared distance of two points is a third of the squared bin width.
     squares = y[:, None] ** 2 + x**2 + (_BIN / focal_length) ** 2 / 3.0
     share = scatter / (math.pi * angle**2 * math.log(1.0 + 2.0 / angle**2))
     kernel = share * (_BIN / focal_length) ** 2 / (1.0 + squares / angle**2)

@@ -320,7 +320,7 @@ def _stuck_monitor(bench: Bench, *_: object) -> Removal:
     if monitor is None:
         return no_removal
     monitor.frozen = {number: monitor.register(number) for number in range(6)}
-    monitor.frozen[2] |= 0b10  # keeps the conversion-ready flag set
+    monitor.frozen[2] |= 0b10  # the conversion-ready flag stays set
     return monitor.frozen.clear
 
 

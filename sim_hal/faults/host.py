@@ -186,7 +186,7 @@ class _FailingFile:
 
 @dataclass(slots=True)
 class _ModelledOutcome:
-    """Outcome of a job that no worker answers, which the job runner reports at `due_ns`."""
+    """Simulated outcome of a job without an answer, which the job runner reports at `due_ns`."""
 
     due_ns: int
     outcome: str

@@ -52,7 +52,7 @@ class PointSpread:
     quadrature: Callable[[float], int]
 
     def shares(self, positions: FloatArray, size: int) -> Float32Array:
-        """Return the charge fractions (..., size) on a line of pixels for sources at `positions` (...)."""
+        """Return the charge fractions (..., size) of sources at `positions` (...) on a row or column."""
         table, rise = _table(self, size)
         entry, beyond = _entries(positions)
         shares = table.take(entry, axis=0)
@@ -60,7 +60,7 @@ class PointSpread:
         return np.asarray(shares)
 
     def own_shares(self, positions: FloatArray) -> Float32Array:
-        """Return the charge fraction (..., size) on each pixel of a line from its source in `positions`."""
+        """Return the charge fraction on each pixel of a row or column, with one source position per pixel."""
         pixel = np.arange(positions.shape[-1])
         table, rise = _table(self, len(pixel))
         entry, beyond = _entries(positions)
@@ -314,7 +314,7 @@ def expose_rolling(
             times = starts + span.nodes[:, None] * (ends - starts)
             points = camera.project(vectors(times, near))
             shift = camera.project(vectors(times + shutter.line_time, near)) - points
-            # If a source moves down v rows per line time, its row time passes 1 - v times as fast as time.
+            # The factor 1 - v conserves the charge of a source that moves down by v rows per line time.
             light = span.weights[:, None] * (ends - starts) * (1.0 - shift[..., 1]) / shutter.exposure
             _deposit_rows(image, spread, reach, points, shift, light * electrons[near])
 
@@ -354,7 +354,7 @@ def _deposit_rows(
     shift: FloatArray,
     electrons: FloatArray,
 ) -> None:
-    """Add `electrons` (m, k) at `points` (m, k, 2), px, moved by `shift` (m, k, 2), px, from row to row."""
+    """Add `electrons` (m, k) at `points` (m, k, 2), px, of sources that move by `shift` px per line time."""
     low = np.floor(points.min(axis=0) + 0.5)
     high = np.floor(points.max(axis=0) + 0.5)
     seen = np.flatnonzero(touches(low, high, image.shape[1], image.shape[0], reach))

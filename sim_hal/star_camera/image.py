@@ -484,7 +484,7 @@ def _stars_seen_by(history: AttitudeHistory, directions: FloatArray) -> Vectors:
 
 
 def _at_own_times(history: AttitudeHistory, directions: OwnTimes) -> OwnTimes:
-    """Return a function that gives ICRS `directions` (..., 3) in the camera frame at the sources' times."""
+    """Return a function that rotates ICRS `directions` into the camera frame, at a time per source."""
 
     def vectors(times: FloatArray, sources: IntArray) -> FloatArray:
         matrices = history.matrices_at(times.reshape(-1)).reshape(*times.shape, 3, 3)

@@ -360,7 +360,7 @@ class Environment:
         date = self._julian_date + times / DAY
         position = self._orbit.positions_at(times)
         sun_there = sun_position(date)
-        # The four Gauss-Markov walks have unit standard deviation, and the first one is the air density.
+        # Four Gauss-Markov processes of unit variance: air density, and three axes of the residual dipole.
         keep = np.exp(-KNOT / np.array([_TURBULENCE_TIME, _WALK_TIME, _WALK_TIME, _WALK_TIME]))
         walks = [self._noise]
         for kick in np.sqrt(1.0 - keep**2) * self._generator.standard_normal((_CHUNK, 4)):

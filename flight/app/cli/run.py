@@ -142,7 +142,7 @@ def run(options: argparse.Namespace) -> int:
     progress = None if options.archive and not sys.stderr.isatty() else progress_on(sys.stderr)
     try:
         result = fly(request, progress)
-    except StoppedError as error:  # whoever started the service stopped it
+    except StoppedError as error:  # a signal ended the start of the service
         sys.stderr.write(f"flight: {error}\n")
         return 0
     except OSError as error:

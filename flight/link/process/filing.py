@@ -158,7 +158,7 @@ class Filing:
         origin = Origin(done.spi, done.counter, *done.request)
         kind = (
             MODULAR if entity == FOREIGN else CRC32
-        )  # CRC-32 detects more errors, but other ground stations may not support it
+        )  # CRC-32 is not used for other ground stations, which may not support it
         one = self._entity.send(path, name, entity, kind, utc_ns, now_ns, origin)
         text = f"{name}: {one.size} bytes, transfer {one.number}"
         return [replace(done, stage=Stage.STARTED, text=text)]

@@ -140,7 +140,7 @@ class UdpLine:
         return found
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Send telemetry to this sender for one minute."""
+        """Send telemetry to the authenticated `sender` for one minute."""
         self._heard[sender] = now_ns
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
@@ -425,7 +425,7 @@ class Station:
         try:
             frames = self._downlink.frames(now_ns)
             self._problem = ""
-        except FlightError as error:  # a command can still set a new key if no counter is free
+        except FlightError as error:  # commands are still accepted, such as one that sets a new key
             self._problem, frames = str(error), []
         for line in self._lines:
             line.send(frames, now_ns)
