@@ -2,8 +2,8 @@
 
 The script install.sh runs board_dropin.py [--safe | --link] CONFIG with the installed Python. By default the
 script prints the drop-in of knightcube.service, with --safe that of knightcube-safe.service, and with --link
-that of knightcube-link.service. With --link it prints an empty text if the configuration has no link. For an
-invalid configuration it prints one line and exits with status 2.
+that of knightcube-link.service. If the configuration has no link, the script prints an
+empty text for --link. For an invalid configuration, the script prints one line and exits with status 2.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def allowed(path: str, plugged: tuple[str, ...], root: Path = Path("/")) -> list
 
 
 def _driver_classes(major: int, root: Path) -> tuple[str, ...]:
-    """Return the names in /proc/devices of the drivers of character devices with a major number."""
+    """Return the names of the character device drivers with a major number, from /proc/devices."""
     listed = (root / "proc/devices").read_text(encoding="ascii").partition("Block devices:")[0]
     pairs = (words for line in listed.splitlines() if len(words := line.split()) == 2)
     return tuple(name for number, name in pairs if number == str(major))

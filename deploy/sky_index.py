@@ -1,4 +1,4 @@
-"""Build the star tracker's sky index at installation, because it takes seconds at the start of a flight.
+"""Builds the star tracker's sky index at installation, so that flights start some seconds earlier.
 
 The script install.sh runs `sky_index.py [--wanted] CONFIG` with the installed Python. With the option
 --wanted the program builds no index, but prints a word if an index must be built.

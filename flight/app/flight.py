@@ -315,7 +315,7 @@ def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> I
     return ImagingSettings(
         camera=model,
         exposures=Exposures(camera.exposure, least, most, model.focal_length),
-        # Half a period is subtracted, so that a late trigger does not make the next trigger be skipped.
+        # Half a period is subtracted, so that the trigger after a late trigger is not skipped.
         fine_rest_ns=round(((camera.fine_period or camera.period) - 0.5 * camera.period) * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
         late_ns=round(camera.late_after * SECOND_NS),

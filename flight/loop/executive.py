@@ -64,7 +64,7 @@ class JobResult:
 
 
 class WorkerChange(Enum):
-    """A change of a worker: its process died, was restarted, or died so often that restarts pause."""
+    """State change of a worker: its process died, was restarted, or died so often that restarts pause."""
 
     DIED = "died"
     READY = "ready"
@@ -73,7 +73,7 @@ class WorkerChange(Enum):
 
 @dataclass(frozen=True, slots=True)
 class WorkerNews:
-    """A change of a worker, with a text about its circumstances."""
+    """State change of a worker process, with a text on the cause."""
 
     worker: str
     change: WorkerChange

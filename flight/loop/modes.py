@@ -181,7 +181,7 @@ class ModeChange:
 
 
 class ModeMachine:
-    """The present mode and the transition table, without side effects.
+    """State machine of the modes, which determines mode changes but does not carry them out.
 
     The attribute `since_ns` is the time (ns) at which the mode was entered.
     """

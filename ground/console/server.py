@@ -177,7 +177,7 @@ def application(console: Console, access: Access) -> web.Application:
             if request.path.startswith("/api/"):
                 return web.json_response({"error": NO_ACCESS}, status=401)
             raise web.HTTPUnauthorized(text=NO_ACCESS)
-        # There is no redirect: browsers that come from another site would not send the cookie with it.
+        # The page is answered without a redirect, after which some browsers would not send the cookie.
         response = await handler(request)
         response.set_cookie(name, session, httponly=True, samesite="Strict")
         return response
@@ -263,7 +263,7 @@ class _Pages:
         )
 
     async def series(self, request: web.Request) -> web.StreamResponse:
-        """Answer with a field over time, for the query ?packet=&field=&component=&from=&to= (s) &points=."""
+        """Answer the query ?packet=&field=&component=&from=&to= (s) &points= with a field over time."""
         name, column = request.query.get("packet", ""), request.query.get("field", "")
         if name not in LAYOUTS or column not in (LAYOUTS[name].dtype.names or ()):
             raise UsageError(f"{name}.{column}: no such field")
@@ -280,19 +280,19 @@ class _Pages:
         return web.json_response({"times": times.tolist(), "values": finite})
 
     async def track(self, request: web.Request) -> web.StreamResponse:
-        """Answer with the ground track around a time: ?at= (s)."""
+        """Answer the query ?at= (s) with the ground track around this time."""
         utc = self._utc(_real(request, "at"))
         track = [] if utc is None else await asyncio.to_thread(self._console.surroundings.track, utc)
         return web.json_response({"track": track})
 
     async def frame(self, request: web.Request) -> web.StreamResponse:
-        """Answer with the results of a kept frame: ?sequence=; null if it was not kept."""
+        """Answer the query ?sequence= with the results of this frame, or null if the frame was not kept."""
         sequence = _whole(request, "sequence", 0)
         facts = await self._drawn(self._console.frames.facts, sequence)
         return web.json_response(facts)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Answer with the picture of a kept frame: ?sequence=."""
+        """Answer the query ?sequence= with the picture of this kept frame."""
         found = await self._drawn(self._console.frames.picture, _whole(request, "sequence", 0))
         if found is None:
             raise web.HTTPNotFound(text="this frame was not kept")

@@ -178,7 +178,7 @@ def _field(
 ) -> HorizontalField | None:
     """Return the mean horizontal field over the samples with the coils off; y is along the thread."""
     on = np.flatnonzero(current)
-    since = np.full(len(switch_time), -np.inf)  # end of the last active current before each switch
+    since = np.full(len(switch_time), -np.inf)  # when a current last ended before each switch
     if len(on):
         newest = np.searchsorted(on, np.arange(len(switch_time)), side="right") - 1
         ends = np.append(switch_time[1:], np.inf)

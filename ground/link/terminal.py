@@ -264,7 +264,10 @@ class StreamGround:
 
 
 def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = None) -> Terminal:
-    """Open the line to HOST:PORT (UDP), tcp:HOST:PORT, or /dev/FILE@BAUD. Raises UsageError, FlightError."""
+    """Open the line to HOST:PORT (UDP), tcp:HOST:PORT, or /dev/FILE@BAUD.
+
+    Raises UsageError for an invalid address or key folder, and FlightError if the line cannot be opened.
+    """
     settings = settings or TerminalSettings()
     vault = Vault(keys)
     line: GroundLine

@@ -487,7 +487,7 @@ class ExposureTiming:
         self._contradictions = 0
 
     def begin(self, driver: str) -> None:
-        """Restart for a newly opened camera with the given kernel driver."""
+        """Reset the detection for a newly opened camera; `driver` is the name of its kernel driver."""
         self._arrival_stamps = driver == "uvcvideo" and not _uvc_uses_device_clock()
         self._contradictions = 0
 

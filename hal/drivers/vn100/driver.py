@@ -6,12 +6,12 @@ linear maps in the settings convert the attitude and the measured vectors to the
 the body axes (`knightcube.astro.quaternion.attitude_map`). Readings that are not finite or physically
 impossible are rejected and counted.
 
-The generator `set_up` yields the questions (commands) that configure a unit, and the caller decides how to
+The generator `set_up` yields the commands that configure a unit, and the caller decides how to
 wait for the answers. `Recovery` advances by one step at each poll and never blocks. A unit that lost power or
 was reset runs with the settings in its flash memory, possibly at another baud rate. Received packets show
 that the baud rate is correct. If bytes arrive but no packets, the recovery tries other baud rates,
 alternating with the configured rate. At the correct baud rate, the recovery configures the unit again, one
-question at a time.
+command at a time.
 """
 
 from __future__ import annotations
@@ -143,11 +143,11 @@ class Question:
 
 
 Dialogue = Generator[Question, tuple[str, ...], None]
-"""Generator that yields questions and receives the fields of the answers. Raises Refused."""
+"""Generator that yields commands and receives the fields of the answers. Raises Refused."""
 
 
 def set_up(settings: Vn100Settings) -> Dialogue:
-    """Yield the questions that configure the unit. The flash memory of the unit is not written."""
+    """Yield the commands that configure the unit. The flash memory of the unit is not written."""
     model = yield Question("RRG", (1,))
     if not model or not model[0].startswith("VN-100"):
         raise Refused(DEVICE, f"the unit reports the model {','.join(model)!r}, but a VN-100 is needed")
@@ -182,7 +182,7 @@ def _write(register: int, *values: object) -> Dialogue:
 
 
 def _switch_off(register: int) -> Dialogue:
-    """Yield the question that switches a binary output off."""
+    """Yield the command that switches a binary output off."""
     echo = yield Question("WRG", (register, 0, 20, "01", "0001"))
     if not echo or not _same("0", echo[0], True):
         raise Refused(DEVICE, f"register {register} should be off, but the unit answered {','.join(echo)}")
@@ -580,7 +580,7 @@ class Vn100:
     def poll(self) -> list[ImuReading]:
         """Return the samples since the last call, oldest first. Never blocks.
 
-        If the unit sends no samples, the driver searches for the unit and configures it again, one question
+        If the unit sends no samples, the driver searches for the unit and configures it again, one command
         per call. Corrupted and implausible packets are counted, see `link`. Raises NotResponding if the
         serial port is lost.
         """
@@ -642,7 +642,7 @@ class Vn100:
         raise self._no_answer(question.text(), before)
 
     def _await(self, question: Question) -> tuple[str, ...] | None:
-        """Wait for the answer to a question and return it, None after the timeout or a transient error."""
+        """Wait for the answer to a command and return it, None after the timeout or a transient error."""
         deadline_ns = self._clock.now_ns() + self._settings.response_timeout_ns
         while True:
             for item in self._receive():
