@@ -1,13 +1,13 @@
 """Tracks of several objects over camera frames, and a filter of the line of sight to each object.
 
-The filter uses measured directions only, without ranges. The filter state consists of the relative position y
-(a unit vector) and the relative velocity z, both divided by the present range. Without forces z is constant
-and y moves on a straight line. The motion is therefore linear at any angular rate, and only the measurement
-is nonlinear. After each step the state is divided by the length of y, so that y is a unit vector again. The
-filter state is the vector form of the modified polar coordinates of Aidala and Hammel (1983, IEEE
-Transactions on Automatic Control 28). The component of the velocity z across the line of sight is the angular
-rate v. The component of the velocity z along the line of sight is s = (range rate) / range. Without forces
-the angular acceleration is -2 s v.
+The line-of-sight filter uses measured directions only, without ranges. The filter state consists of the
+relative position y (a unit vector) and the relative velocity z, both divided by the present range. Without
+forces z is constant and y moves on a straight line. The model of the motion is therefore linear at any
+angular rate, and only the measurement model is nonlinear. After each step the state is divided by the length
+of y, so that y is a unit vector again. The filter state is the vector form of the modified polar coordinates
+of Aidala and Hammel (1983, IEEE Transactions on Automatic Control 28). The component of the velocity z across
+the line of sight is the angular rate v. The component of the velocity z along the line of sight is s = (range
+rate) / range. Without forces the angular acceleration is -2 s v.
 
 Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
 gradient gives the relative acceleration of object and observer, to first order in the distance divided by the
@@ -19,11 +19,12 @@ not straight lines. For example, (range rate) / range changes by rate^2 per seco
 along a great circle at a constant angular rate. The additional noise density is (`bend` rate^2)^2 / rate,
 with the angular rate of the object.
 
-Sightings are assigned to tracks in order of increasing chi-square, each sighting to at most one track. This
-is the greedy nearest neighbour method (Blackman and Popoli 1999, Design and Analysis of Modern Tracking
-Systems, section 6.4). Unassigned sightings start tentative tracks. A track is confirmed after m sightings in
-n frames if its angular rate differs from the rate of a star. During these n frames, two unconfirmed tracks
-may share a sighting. A confirmed track is propagated without measurements while the object is not visible.
+Sightings are assigned to tracks in order of increasing chi-square, each sighting to at most one track. The
+assignment in order of chi-square is the greedy nearest neighbour method (Blackman and Popoli 1999, Design and
+Analysis of Modern Tracking Systems, section 6.4). Unassigned sightings start tentative tracks. A track is
+confirmed after m sightings in n frames if its angular rate differs from the rate of a star. Two unconfirmed
+tracks may share a sighting. A confirmed track is propagated without measurements while the object is not
+visible.
 """
 
 from __future__ import annotations

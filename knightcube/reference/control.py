@@ -103,7 +103,7 @@ class PidController:
         Raises UsageError if an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
-        # The initial integral cancels the proportional part, so that the first command at rest is zero.
+        # The initial integral of the error cancels the proportional part: the first command at rest is zero.
         unweighted = (1.0 - self._weight) * wanted.angle
         if self._sum is None:
             self._sum = self._gains.proportional / self._gains.integral * ((1.0 - self._weight) * angle)

@@ -10,8 +10,8 @@ The methods are:
 
 - Angle matching: The triangles of the brightest observed stars are processed in order of brightness
   (Michalski, section 3.2.1, and Gottlieb in Wertz 1978, section 7.7). Two pairs of guide stars whose angles
-  match two sides of a triangle are joined if the pairs share a star. The joined pairs are a candidate if the
-  third angle matches as well.
+  match two sides of a triangle are joined if the pairs share a star. Two joined pairs are a candidate if the
+  angle of the third side matches as well.
 
 - Triangles by area and polar moment: The area of an observed triangle and its propagated standard deviation
   define a range of areas in the table of guide star triangles (Michalski, sections 3.2.2 and 3.2.3, and Cole
@@ -22,8 +22,8 @@ The methods are:
 - Pyramid: The triangles are ordered so that no observed star occurs in many consecutive triangles, which
   limits the effect of a false star (Michalski, section 3.2.4, and Mortari, Samaan, Bruccoleri & Junkins,
   Navigation 51, 2004). A matched triangle becomes a pyramid if the angles between a fourth observed star and
-  all three corners match as well. Only pyramids are candidates, because the fourth star makes chance matches
-  rare.
+  all three corners match as well. Only pyramids are candidates, because a matching fourth star makes chance
+  matches rare.
 
 - Rate matching: Two frames, or the ends of streaks, give the velocity of each observed point (Michalski,
   section 3.2.5, and Samaan, Mortari & Junkins, Recursive mode star identification algorithms, IEEE TAES 41,
@@ -326,7 +326,7 @@ def matching_triangles(
     """Return guide star triangles (k, 3) that match an observed triangle in angles and orientation.
 
     Pairs of guide stars that match the first and the second side are joined at their common star. The third
-    side is then compared by the cosine of its angle.
+    side of each joined triangle is then compared by the cosine of the angle.
     """
     pivot, second, third = corners
     one, other = np.array([pivot, pivot, second]), np.array([second, third, third])
@@ -698,7 +698,7 @@ def _agrees(direction: FloatArray, motion: StarMotion, rate: FloatArray, covaria
     """Return for each point (n,) whether the motion of the point agrees with `rate` within the errors."""
     residual = motion.velocity - np.cross(direction, rate)
     residual -= np.sum(residual * direction, axis=-1, keepdims=True) * direction
-    # The largest eigenvalues of the covariance of the rate give an upper bound of the error it causes.
+    # The largest eigenvalues of the rate's covariances give an upper bound of the velocity error.
     spread = motion.sigma**2 + float(np.linalg.eigvalsh(covariance)[-1]) * (1.0 - direction[:, 2] ** 2)
     spread = spread + float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     return np.asarray(np.sum(residual**2, axis=-1) <= _CHI_SQUARE * spread)

@@ -25,7 +25,7 @@ opposite side, so that matching triangles also have matching corners.
 
 Grid table (Padgett & Kreutz-Delgado 1997): The grid pattern of a star is the set of cells that the
 neighbouring stars occupy. The star is the origin of a tangent plane, and the nearest neighbour outside a
-buffer radius defines the +x axis. Each other star within the pattern radius occupies one cell.
+buffer radius defines the +x axis. Each further star within the pattern radius occupies one cell of the grid.
 
 Each table is built at its first use, so that only the tables of the methods in use need memory.
 """
@@ -105,8 +105,8 @@ class KVector:
 def build_k_vector(key: npt.NDArray[Any], cells: int | None = None) -> KVector:
     """Return the k-vector of sorted keys (n,).
 
-    By default there is about one cell per key, as in the publication. Raises ValueError if the keys are not
-    finite or not sorted, or if `cells` is not positive.
+    By default the k-vector has about one cell per key, as in the publication. Raises ValueError if the keys
+    are not finite or not sorted, or if `cells` is not positive.
     """
     wide = key.astype(np.float64)
     if not np.all(np.isfinite(wide)) or np.any(np.diff(wide) < 0.0):

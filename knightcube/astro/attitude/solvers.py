@@ -82,9 +82,9 @@ from knightcube.astro.quaternion import (
 
 _MAXIMUM_STEPS = 100
 _MINIMUM_SLOPE = 1e-13
-"""Minimum product of the differences between the largest eigenvalue of K and the other three eigenvalues.
+"""Minimum product of the three differences between the largest eigenvalue of Davenport's K and the others.
 
-In a narrow field of view, two of the three eigenvalue differences are of the order of one.
+In a narrow field of view, two of the three differences are of the order of one.
 """
 
 
@@ -197,11 +197,11 @@ def quest(profile: FloatArray) -> FloatArray:
     """Return the optimal quaternion (4,) by QUEST, from the Gibbs vector M^-1 z.
 
     The matrix is M = l + t - S, with the largest eigenvalue l of K, the trace t of B and S = B + B^T. The
-    adjugate of M is used instead of its inverse, so that a rotation by 180 deg causes no division by zero. A
+    adjugate of M is used instead of the inverse, so that a rotation by 180 deg causes no division by zero. A
     small determinant of M still causes a loss of accuracy. The reference frame is therefore rotated by 180
     deg such that the determinant is largest and the remaining rotation smallest. The determinant of M is
-    proportional to the square of the quaternion's scalar part. The trace of B would be a cheaper criterion,
-    but it does not depend on the roll angle in a narrow field of view.
+    proportional to the square of the quaternion's scalar part. The trace of the profile matrix B would be a
+    cheaper criterion, but does not depend on the roll angle in a narrow field of view.
     """
 
     def gibbs_matrix(profile: FloatArray, eigenvalue: float) -> FloatArray:

@@ -168,9 +168,9 @@ _HALF_ROTATIONS = np.eye(4)
 def half_rotation(component: int) -> tuple[FloatArray, FloatArray]:
     """Return the matrix diagonal (3,) and the quaternion (4,) of a 180 deg rotation about a coordinate axis.
 
-    The index `component` is 0, 1 or 2 for the axes x, y and z, and 3 for the identity. The rotation moves
-    this component of a quaternion into the scalar part. If the moved component is the largest component, the
-    remaining rotation is at most 120 deg.
+    The index `component` is 0, 1 or 2 for the axes x, y and z, and 3 for the identity. The 180 deg rotation
+    moves the component of a quaternion with this index into the scalar part. If the moved component is the
+    largest component, the remaining rotation is at most 120 deg.
     """
     return _SIGNS[component], _HALF_ROTATIONS[component]
 
@@ -226,7 +226,7 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
     """Return the attitude quaternion (4,) of minimum loss, computed by Newton's method, and the minimum loss.
 
     The second derivative of the loss differs from the information matrix by at most sqrt(2 loss/total). If
-    this difference is small, the information matrix is used instead (Gauss-Newton method). The four
+    the loss is small, the information matrix is used as second derivative (Gauss-Newton method). The four
     stationary points of the loss are the eigenvectors of Davenport's matrix K, and only one of these is a
     minimum. If the largest eigenvalue is double, for example for mirrored directions, the minimum is not
     unique.

@@ -144,7 +144,7 @@ _CORRECTION_TIME = 400.0
 NODE_STEP = 60.0
 """Time between two nodes of the field prediction, s.
 
-Within this time the field rotates by 8 deg, and its linear interpolation is at most 0.2 % too weak.
+Between two nodes the field rotates by 8 deg, and the linearly interpolated field is at most 0.2 % too weak.
 """
 NODES_PER_CALL = 5
 """Maximum number of nodes that one call adds to the field prediction."""
@@ -226,7 +226,7 @@ class FieldAhead:
         return NODE_STEP * (len(self._fields) - 1)
 
     def _restart(self, state: OrbitState) -> float:
-        """Discard past nodes, or all nodes if they contradict the state.
+        """Discard past nodes, or all nodes if the known orbit has changed.
 
         Returns the time (s) since the first node.
         """
@@ -248,7 +248,7 @@ class FieldAhead:
         return since
 
     def _extend(self) -> bool:
-        """Add one node. Return False if the node is outside the years of the field model."""
+        """Add one node. Return False if the new node is outside the years of the field model."""
         after = propagated(self._states[-1], NODE_STEP)
         try:
             there = field(self._begin + (self._span + NODE_STEP) / DAY, after[:3])

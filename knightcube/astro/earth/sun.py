@@ -102,9 +102,9 @@ def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conica
 def _covered_share(disc: FloatArray, cover: FloatArray, apart: FloatArray) -> FloatArray:
     """Return the fraction (...) of one disc that is covered by another disc.
 
-    The covered area of two plane discs consists of two circular segments along the common chord. The plane
-    approximation is sufficient, because the Sun's disc is small and the Earth's limb is nearly straight
-    across it.
+    The covered area of two plane discs consists of two circular segments along the common chord. Plane discs
+    are a sufficient approximation, because the Sun's disc is small and the Earth's limb across the disc is
+    nearly straight.
 
     Args:
         disc: (...) angular radii of the covered disc, rad.

@@ -20,8 +20,8 @@ from knightcube.errors import FlightError
 
 WEAKEST = 0.15
 """Torque per unit current, relative to the strongest direction, below which a torque direction is discarded.
-A weak direction would need all the current, and scaling would then reduce the torque in the other
-directions."""
+A torque in a weak direction would need all the current, and scaling would then reduce the torque in the
+other directions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ def allocate(
         raise FlightError(f"allocation: torque {wanted} or field {field} is not finite")
     turns = np.ones(3) if free is None else np.asarray(free, dtype=np.float64)
     usable = np.ones(3) if available is None else np.asarray(available, dtype=np.float64)
-    # Column a of the matrix `effect` is the torque about the free axes of one ampere in coil a.
+    # Column i of the matrix `effect` is the torque about the free axes that one ampere in coil i causes.
     effect = turns[:, None] * np.cross(np.eye(3), field).T * (dipole_per_ampere * usable)
     wanted = wanted * turns
     currents = np.linalg.pinv(effect, rcond=WEAKEST) @ wanted * usable

@@ -8,9 +8,9 @@ momentum plan uses a predicted field. If the attitude is known, the field is pre
 Otherwise the measured field is assumed to continue to rotate at the present rate. In contrast to B-dot
 control, a spin along the field is also removed, as soon as the field has rotated. The coils stay off until
 `TRUSTED` consecutive samples agree with the prediction of the filter and the standard deviation of the rate
-across the field is below `BOUNDED`. Until then, samples outside the pauses are used as well. The coils are
-switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a restarted sensor may give
-only unusable fields.
+across the field is below `BOUNDED`. Until the coils are driven, samples outside the pauses are used as well.
+The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a restarted
+sensor may give only unusable fields.
 
 The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
 momentum obeys h' = m x B, in which inertia and attitude do not appear. By Pontryagin's principle, the dipole
@@ -83,8 +83,8 @@ def momentum_plan(
     """Return the plan that reduces `momentum` (3,) N m s to `rest` N m s in minimum time.
 
     The predicted field after `times` (n,), s, is `field` (n, 3), T, in the inertial axes of the momentum. The
-    dipole limit of each coil is `limit`, A m^2. If the prediction ends too early, the plan removes as much
-    momentum as possible until the end of the prediction. Raises UsageError for fewer than three times.
+    dipole limit of each coil is `limit`, A m^2. If the field prediction ends too early, the plan removes as
+    much momentum as possible until the end of the prediction. Raises UsageError for fewer than three times.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
@@ -155,7 +155,7 @@ def rotating_field(field: FloatArray, change: FloatArray, times: FloatArray) -> 
 def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
     """Return `fields` (n, 3), rotated so that the first predicted field has the direction of `field` (3,).
 
-    The correction is useful because the measured field is more accurate than fields predicted with a coarse
+    The rotation is useful because the measured field is more accurate than fields predicted with a coarse
     attitude.
     """
     first = fields[0] / math.sqrt(float(fields[0] @ fields[0]))
@@ -298,7 +298,7 @@ class FieldDetumbler:
         self._planned_rotation = _NO_DIPOLE
         self._agreed = 0
         self._bounded = False
-        self._driven_ns = now_ns  # another flight mode may have driven the coils before this pause
+        self._driven_ns = now_ns  # another flight mode may have driven the coils until now
         self._accepted_ns = now_ns
         self._fastest = math.inf
         self._filter.restart()

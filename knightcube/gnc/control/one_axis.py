@@ -11,25 +11,25 @@ corrected) are
 The regulator demands e'' = v = -K (e', e), with K from the Riccati equation. The expression for e'' is solved
 for the angular acceleration w', from which the plant model gives the current.
 
-The tracker extends the controller of the thesis by two features, which the option `as_in_thesis` switches
-off. First, the estimated disturbance is fed forward, so that a constant torque causes no offset. The
-estimator integrates the acceleration that the model did not predict. Integrator windup cannot occur, because
-the disturbance estimator uses the limited current. Second, the rate at which an error is reduced is limited,
-so that the coil can decelerate the body in time and the angle does not overshoot. Small errors are reduced at
-the rate s e with s = K_e / K_e', and errors above A / s^2 at the rate sqrt(2 A |e| - (A / s)^2), where A is
-the available deceleration. This law is the proximate time-optimal servomechanism (Workman 1987), here with a
-continuous slope.
+The tracker extends the controller of Sease's thesis by two features, which the option `as_in_thesis` switches
+off. As the first feature, the estimated disturbance is fed forward, so that a constant torque causes no
+offset. The estimator integrates the acceleration that the model did not predict. Integrator windup cannot
+occur, because the disturbance estimator uses the limited current. As the second feature, the rate at which an
+angle error is reduced is limited, so that the coil can decelerate the body in time and the angle does not
+overshoot. Small errors are reduced at the rate s e with s = K_e / K_e', and errors above A / s^2 at the rate
+sqrt(2 A |e| - (A / s)^2), where A is the available deceleration. The rate limit is that of the proximate
+time-optimal servomechanism (Workman 1987), but with a continuous slope.
 
-The error e = sin(d) is monotonic in d only up to 90 degrees. Beyond `largest_error` the angle d is therefore
-clamped. The demanded acceleration then stays bounded and does not decrease for larger angles.
+The error e = sin(d) is monotonic in d only up to 90 degrees. The angle error d is therefore clamped to
+`largest_error`. With the clamped angle error, the demanded acceleration stays bounded and does not decrease
+for larger errors.
 
 The excitation manoeuvres do not follow a path. Before the first manoeuvre, the tracker brings the body to
-rest. Long and short current pulses then rotate the body out and back, and the response identifies torque
-constant and delay. Further pulses displace the body, which then oscillates with the coils off, and the
-oscillation identifies stiffness and damping. All pulses are repeated with the opposite sign. Between
-manoeuvres the tracker brings the body to rest again. The tracker also takes over whenever the body could
-otherwise not be stopped within the allowed angle. If the tracker cannot bring the body to rest, the current
-stays zero.
+rest. Long and short current pulses rotate the body out and back, and the response identifies torque constant
+and delay. Further pulses displace the body, which then oscillates with the coils off, and the oscillation
+identifies stiffness and damping. All pulses are repeated with the opposite sign. Between manoeuvres the
+tracker brings the body to rest again. The tracker also takes over whenever the body could otherwise not be
+stopped within the allowed angle. If the tracker cannot bring the body to rest, the current stays zero.
 """
 
 from __future__ import annotations

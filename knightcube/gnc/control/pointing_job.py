@@ -60,7 +60,7 @@ slew."""
 FINE = 5
 """Number of steps of a slew table per step of a pointing table, because a slewing body rotates faster."""
 TAIL = 300.0
-"""Duration (s) after the end of a slew for which the slew table still contains feedback gains."""
+"""Duration (s) after the end of a slew that the computation of the feedback gains of the slew also covers."""
 END = 2_000.0
 """Weight (s) of errors at the end of a slew: an error at the end costs as much as the same error that lasts
 for this time. The weight is high because disturbance torques are poorly known before the slew, and the errors

@@ -1,9 +1,10 @@
 """The pointing law, which computes a dipole moment from a table of gains, and the recovery from large errors.
 
-The law is linear in small rotations. With a large error, the law would saturate the coils and could make a
-light body rotate faster than before. A new path is therefore planned if the body leaves the planned path. Far
-from the planned path, the body is first damped until its rate is low. The damping torque, which removes
-energy in any attitude, is the component normal to the field of -2 w J rate, with bandwidth w and inertia J.
+The pointing law is linear in small rotations. With a large error, the pointing law would saturate the coils
+and could make a light body rotate faster than before. A new path is therefore planned if the body leaves the
+planned path. Far from the planned path, the body is first damped until its rate is low. The damping torque,
+which removes energy in any attitude, is the component normal to the field of -2 w J rate, with bandwidth w
+and inertia J.
 """
 
 from __future__ import annotations
@@ -113,8 +114,8 @@ LEAVING = math.radians(5.0)
 SLOW = math.radians(0.1)
 """Rate (rad/s) below which the damping ends; the orbital rate is 0.06 deg/s."""
 DAMPING_TIMEOUT = 180.0
-"""Time (s) after which the damping ends although the rate is not low. Momentum along the field could be
-removed only within a quarter of an orbit."""
+"""Time (s) after which the damping ends although the rate is not low. Removing momentum along the field would
+take a quarter of an orbit."""
 DAMPING = 0.01
 """Bandwidth w of the damping torque, rad/s."""
 

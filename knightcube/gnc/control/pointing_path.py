@@ -8,18 +8,19 @@ obey the linear equations
 
 The matrix G is the stiffness of the gravity gradient, and f is the torque that the reference motion requires
 in addition to the modelled torques. Riccati's equation is integrated backwards for the cost-to-go x^T S x / 2
-+ s^T x (Psiaki 2001, Journal of Guidance, Control, and Dynamics 24(2)). The affine part s, which anticipates
-future torques, is added here. The dipole moment m = -(K x + k) is constant during a step. The affine part of
-the error model has one column for each source of errors. The vector k is linear in the affine part and has
-the same columns. A sweep also supports controls other than the dipole moment.
++ s^T x (Psiaki 2001, Journal of Guidance, Control, and Dynamics 24(2)). The affine part s of the cost-to-go,
+which anticipates future torques, is an extension of Psiaki's method. The dipole moment m = -(K x + k) is
+constant during a step. The affine part of the error model has one column for each source of errors. The
+control offset k is linear in the affine part of the error model and has the same columns. A linear-quadratic
+sweep also supports controls other than the dipole moment.
 
 The path minimises the squared rotation error relative to the law plus the squared dipole moment, in the
 predicted field and torques. The path obeys the full equations of motion and the limit of the coils. The path
 is found by iterative linear-quadratic sweeps (Li & Todorov 2004, ICINCO, and Tassa, Erez & Todorov 2012,
-IROS). Each iteration linearises the equations of motion about the last motion and simulates the corrected
-motion. Because coils cause no torque along the field, the first iterations from a large error would give
-tumbling motions. The first sweeps therefore allow a torque along the field, at a cost that is increased until
-this torque vanishes.
+IROS). Each sweep linearises the equations of motion about the last motion and simulates the corrected motion.
+Because coils cause no torque along the field, the first iterations from a large error would give tumbling
+motions. The first sweeps therefore allow a torque along the field, at a cost that is increased until this
+torque vanishes.
 """
 
 from __future__ import annotations
@@ -133,8 +134,8 @@ def acceleration_slopes(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the derivatives (n, 3, 6) of angular accelerations by rotation and rate.
 
-    The second and third result are the field and the position (n, 3) in body axes. The motion has attitudes
-    (n, 4) and rates (n, 3) rad/s; the other arguments have the same meaning as in `linearised`.
+    The second and third results are the magnetic field and the position (n, 3) in body axes. The motion has
+    attitudes (n, 4) and rates (n, 3) rad/s; the other arguments have the same meaning as in `linearised`.
     """
     turned, inverse = attitude_matrix(quaternion), np.linalg.inv(inertia)
     shown, up = (np.einsum("nij,nj->ni", turned, vectors) for vectors in (field, position))
@@ -203,7 +204,7 @@ def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
 
 
 RISES = (4.0, 2.0, 10.0)
-"""Ratios between successive costs of a torque along the field. The ratios are tried in turn until a path
+"""Ratios between successive costs of a torque along the field. The cost ratios are tried in turn until a path
 settles, because different ratios lead to different optima."""
 DEAR, PROHIBITIVE = 1e4, 1e6
 """Costs of a torque along the field, relative to the cost of the same torque across the field. The cost is
@@ -211,8 +212,8 @@ increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
 SETTLED = math.radians(20.0)
 """Largest angle (rad) from the attitude law in the second half of a path that counts as settled."""
 SWEEPS = 8
-"""Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. The
-best motion is used even if the sweeps have not converged."""
+"""Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. After
+this number of sweeps, the best motion is used even without convergence."""
 SAVED = (0.05, 2e-3)
 """Relative improvement by a sweep below which the cost of a torque along the field is increased, and relative
 improvement below which the sweeps at the largest cost end."""

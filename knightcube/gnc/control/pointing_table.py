@@ -7,9 +7,9 @@ defect of a time step is the difference between the propagated state at the end 
 the next instant. All defects vanish in the course of the iterations (Bock & Plitt 1984, IFAC 9th World
 Congress). Multiple shooting prevents errors from growing along a revolution. Errors could otherwise grow,
 because coils cause no torque about the field and the body may rotate far about the pointing axis. An
-iteration takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and derivatives are
-computed of this discrete rule. With derivatives of the continuous motion, the iteration would stall for
-bodies that rotate by degrees per time step.
+iteration of multiple shooting takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and
+derivatives are computed of this discrete rule. With derivatives of the continuous motion, the iteration would
+stall for bodies that rotate by degrees per time step.
 
 If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
 the module `pointing_path` instead. The cost of an error at the end of this path follows from a sweep along
@@ -283,8 +283,8 @@ def _moved(motion: PlannedMotion, change: FloatArray, control: FloatArray) -> Pl
 
 
 LEAST_PART = 1.0 / 3.0
-"""Minimum fraction of a table that is used if the remainder of the table is unusable. If the usable part is
-shorter, the previous table is kept."""
+"""Minimum fraction of a table that is used if the remainder of the table is unusable. If the usable part of a
+new table is shorter, the previous table is kept."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -389,8 +389,8 @@ def pointing_table(
     """Return the pointing table for the instants of `ahead.initial`.
 
     The inertia tensor `inertia` (3, 3) is in kg m^2, and `limit` is the dipole limit of each coil in A m^2.
-    The preview after the table should cover one revolution. Raises UsageError for times that are not equally
-    spaced.
+    The preview after the table should cover one revolution of the orbit. Raises UsageError for times that are
+    not equally spaced.
     """
     steps = np.diff(ahead.wanted.times)
     count = len(ahead.initial.times) - 1

@@ -134,7 +134,7 @@ ROLL = 150.0
 """Cost of torques about other axes relative to the cost of a torque about the Sun."""
 FASTEST, FASTEST_ACROSS = 0.0165, 0.010
 """Total rate, and rate across the direction of the Sun (rad/s), above which the body is only damped. Both
-limits are below the rates at which the flight software starts detumbling."""
+rate limits are below the rates at which the flight software starts detumbling."""
 FASTEST_ROLL = 0.0105
 """Roll rate (rad/s) about the Sun above which a torque about the Sun is no longer preferred."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
@@ -249,7 +249,7 @@ class SunAcquisition:
         if square > FASTEST**2 or square - roll**2 > FASTEST_ACROSS**2:
             return torque
         torque = torque + speed**2 * seeking.inertia * _rotation_to_sun(seeking.axis, sun)
-        # A torque about the Sun cancels the torque along the field, because it disturbs the pointing least.
+        # A torque about the Sun, which disturbs the pointing least, cancels the torque along the field.
         cheap = 1.0 + (ROLL - 1.0) * math.exp(-((roll / FASTEST_ROLL) ** 2))
         spread = field + (cheap - 1.0) * float(sun @ field) * sun
         return torque - spread * (float(field @ torque) / float(field @ spread))

@@ -45,7 +45,7 @@ def minimum_eigenvalue(tensor: StructureTensor) -> FloatArray:
     half_trace = 0.5 * (tensor.xx + tensor.yy)
     larger = half_trace + np.hypot(0.5 * (tensor.xx - tensor.yy), tensor.xy)
     determinant = tensor.xx * tensor.yy - tensor.xy**2
-    # The smaller eigenvalue is the determinant divided by the larger one, which avoids cancellation.
+    # The smaller eigenvalue is the determinant divided by the larger eigenvalue, which avoids cancellation.
     return np.asarray(np.maximum(determinant, 0.0) / np.where(larger > 0.0, larger, 1.0))
 
 
@@ -64,7 +64,7 @@ class _Changes(NamedTuple):
 def trajkovic_response(
     image: FloatArray, neighbours: int, coarse_relative: float, fine_relative: float
 ) -> FloatArray:
-    """Return the interpixel cornerness of pixels that pass both thresholds, and zero for other pixels.
+    """Return the interpixel cornerness of pixels above the thresholds T1 and T2, and zero for other pixels.
 
     The thresholds T1 and T2 are relative to the largest simple cornerness in the image (Sease, text at eq.
     3.10).

@@ -159,8 +159,8 @@ def _brightest_first(found: StreakResult, camera: CameraModel) -> tuple[FloatArr
 def _scatter(both: TwoAttitudes, count: int) -> float:
     """Return the ratio of the observed variance of the residuals to the assumed variance.
 
-    The fit of each attitude has two residual components per star and three parameters. The ratio is
-    multiplied by nu/(nu - 2), with nu degrees of freedom, to allow for its own uncertainty (Student's t
+    The fit of each attitude has two residual components per star and three parameters. The variance ratio is
+    multiplied by nu/(nu - 2), with nu degrees of freedom, to allow for its uncertainty (Student's t
     distribution).
 
     Args:

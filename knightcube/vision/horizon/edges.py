@@ -2,9 +2,9 @@
 
 Some columns and rows of the image are normalised, thresholded and filtered as in Meller et al., section 3.1.
 Each change from dark to bright is then located at the point of maximum slope of the brightness, smoothed by a
-Gaussian. The width of this Gaussian is doubled as long as the edge is wider than the Gaussian (Lindeberg
-1998, International Journal of Computer Vision 30, 117). Sharp edges and edges a hundred pixels wide are
-therefore both located at the steepest point of the brightness.
+Gaussian. The width of the smoothing Gaussian is doubled as long as the edge is wider than the Gaussian
+(Lindeberg 1998, International Journal of Computer Vision 30, 117). Sharp edges and edges a hundred pixels
+wide are therefore both located at the steepest point of the brightness.
 """
 
 from __future__ import annotations
@@ -306,7 +306,7 @@ def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
     half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
     x: FloatArray = np.arange(-half, half + 1, dtype=float)
     kernel = x * np.exp(-0.5 * (x / size) ** 2)
-    # The response of the kernel to a step between two pixels is the sum over one side of the kernel.
+    # The response of the derivative kernel to a step between two pixels is the sum over half of the kernel.
     kernel = kernel / np.sum(kernel[x > 0])
     window = np.arange(-reach - half, reach + half + 1)
     matrix = np.zeros((len(window), 2 * reach + 1))

@@ -1,10 +1,10 @@
 """A horizon hypothesis: a limb fitted to edges of the image, and the evidence for and against it.
 
-The significance of a horizon is an upper bound of the expected number of equally good horizons among chance
-edges, such as coasts and the rims of clouds. The density of chance edges is estimated from the edges that lie
-beside the limb. A coast or the rim of a cloud with radius R that touches the limb stays within a distance g
-of the limb over a length of 2 sqrt(2 g R). Scan lines that cross the same segment of a coast or cloud are not
-independent, so that the test counts segments of this length instead of scan lines.
+The significance of a horizon is an upper bound of the expected number of equally good horizons that chance
+edges form, such as coasts and the rims of clouds. The density of chance edges is estimated from the edges
+that lie beside the limb. A coast or the rim of a cloud with radius R that touches the limb stays within a
+distance g of the limb over a length of 2 sqrt(2 g R). Scan lines that cross the same segment of a coast or
+cloud are not independent, so that the test counts segments of this length instead of scan lines.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ _NEAR = 0.0375
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
-    """A fitted horizon and the evidence for and against it.
+    """A fitted horizon, with the evidence for and against this horizon.
 
     Attributes:
         fit: the fitted limb.

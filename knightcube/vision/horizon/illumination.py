@@ -1,9 +1,9 @@
 """Comparison of images with the brightness that an assumed view of the Earth predicts, and a coarse nadir.
 
-A correct assumption about the view of the Earth agrees with the whole image: sky and night side are dark, and
-the sunlit limb has edges along its entire length. A view that was fitted to the terminator instead of the
-limb does not agree with the image. Meller et al., section 3.3, do not state how to distinguish the limb from
-the terminator.
+A correctly assumed view of the Earth agrees with the whole image: sky and night side are dark, and the sunlit
+limb has edges along its entire length. A view that was fitted to the terminator instead of the limb does not
+agree with the image. Meller et al., section 3.3, do not state how to distinguish the limb from the
+terminator.
 
 If no image shows a limb, the Earth fills the field of one camera and the other cameras are dark (Meller et
 al., section 4.1). If the Earth fills the field of one camera, `coarse_nadir` tries nadir directions that
@@ -158,8 +158,8 @@ class CoarseNadir:
 def image_brightness(image: Image, camera: MountedCamera, bright: float) -> ImageBrightness:
     """Return which of 8 x 8 samples of an image (rows, columns) are bright, with their directions.
 
-    The argument `bright` is the threshold, counts. A dark sea under a low Sun must exceed this brightness
-    threshold, and stray light beside the Earth must not exceed it.
+    The argument `bright` is the threshold, counts. The threshold must be below the brightness of a dark sea
+    under a low Sun, and above stray light beside the Earth.
     """
     rows, columns = (_sample_indices(size) for size in image.shape)
     lit = bright < image[np.ix_(rows, columns)].T
@@ -170,7 +170,7 @@ def image_brightness(image: Image, camera: MountedCamera, bright: float) -> Imag
 def coarse_nadir(
     looks: Sequence[ImageBrightness], altitude: float, sun: FloatArray | None = None
 ) -> CoarseNadir | None:
-    """Return the nadir that explains the brightness of all images, or None if it is too uncertain.
+    """Return the nadir that explains the brightness of all images, or None if the nadir is too uncertain.
 
     Args:
         looks: directions and brightness of the samples of each image.

@@ -12,7 +12,7 @@ search for cones is a sample consensus (Fischler & Bolles 1981) without random s
 A horizon does not determine the rotation about nadir. The rotation about nadir is needed because the Earth's
 flattening depends on the direction of the pole, and the illumination depends on the direction of the Sun. The
 rotation about nadir is derived from a rough attitude, the coarse direction of the Sun or the magnetic field.
-The angles between nadir and these known directions are also known, so that a nadir at a different angle is
+The angles between nadir and the known directions are also known, so that a nadir at a different angle is
 rejected.
 """
 
@@ -262,7 +262,7 @@ def shortest_turn(source: FloatArray, target: FloatArray) -> FloatArray:
     square = float(middle @ middle)
     if square < 1e-12:
         return half_turn(tangent_basis(source)[0], 1.0)
-    # A half turn about `source`, followed by one about `middle`, is the smallest rotation to `target`.
+    # A half turn about `source` and a half turn about `middle` give the smallest rotation to `target`.
     return np.asarray(half_turn(middle, square) @ half_turn(source, 1.0))
 
 

@@ -1,26 +1,26 @@
 """The Earth's limb: its direction from a camera, its brightness profile, and robust fits of both.
 
-A scaling along the axes of the Earth's ellipsoid transforms it into the unit sphere, whose limb is a circular
-cone about the direction of the centre. The scaling transforms rays into rays, so that a ray lies on the
-ellipsoid's limb if and only if the scaled ray lies on the cone (Christian & Robinson 2016, "Noniterative
-Horizon-Based Optical Navigation by Cholesky Factorization", Journal of Guidance, Control, and Dynamics 39,
-2757). The residual of a ray is the angle between the scaled ray and the scaled direction of the centre, minus
-the half-angle of the limb cone. The residual of a ray is 0 on the limb and positive outside of the Earth. The
-gradient of the residuals is analytic.
+A scaling along the axes of the Earth's ellipsoid transforms the ellipsoid into the unit sphere, whose limb is
+a circular cone about the direction of the centre. The scaling transforms rays into rays, so that a ray lies
+on the ellipsoid's limb if and only if the scaled ray lies on the cone (Christian & Robinson 2016,
+"Noniterative Horizon-Based Optical Navigation by Cholesky Factorization", Journal of Guidance, Control, and
+Dynamics 39, 2757). The residual of a ray is the angle between the scaled ray and the scaled direction of the
+centre, minus the half-angle of the limb cone. The residual of a ray is 0 on the limb and positive outside of
+the Earth. The gradient of the residuals is analytic.
 
 The limb cone is fitted by a Gauss-Newton iteration. Huber's weights, with zero weight beyond five standard
 deviations, exclude clouds, glare and the ends of the terminator. The standard deviation of the residuals is
-estimated from their median if this estimate exceeds the stated standard deviation. The limb height, the
-rotation about nadir and the altitude, which the limb does not determine, have a prior, so that the covariance
-includes their uncertainty.
+estimated from the median of the residuals if this estimate exceeds the stated standard deviation. The limb
+height, the rotation about nadir and the altitude, which the limb does not determine, have a prior, so that
+the covariance includes their uncertainty.
 
 Along a line of sight with the tangent height h, the optical depth of the air is t(h) = t0 exp(-h/H) with t0 =
 t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's radius and H
-the scale height of the air. A line of sight with h < 0 ends on the ground, where the sine of its elevation is
-sqrt(-2h/R). The brightness of sunlit air at the optical depth t is 1 - exp(-t), and the air attenuates the
-ground by exp(-t). Without blur, the brightness falls fastest at the optical depth t = 1, at a tangent height
-of 15.4 km. Refraction is neglected. Refraction lowers the apparent limb by 1 to 2 km, which is within
-`HorizonSettings.limb_height_sigma`.
+the scale height of the air. A line of sight with a tangent height h < 0 ends on the ground at an elevation
+whose sine is sqrt(-2h/R). The brightness of sunlit air at the optical depth t is 1 - exp(-t), and the air
+attenuates the ground by exp(-t). Without blur, the brightness falls fastest at the optical depth t = 1, at a
+tangent height of 15.4 km. Refraction is neglected. Refraction lowers the apparent limb by 1 to 2 km, which is
+within `HorizonSettings.limb_height_sigma`.
 
 The brightness profile across an edge is fitted by background + a air(h) + b ground(h), where a and b are
 free, and the tangent height h falls by a known number of metres per pixel. The position of unit optical depth
@@ -177,7 +177,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     cosine = stretched @ towards / lengths
     sine = np.sqrt(1.0 - cosine * cosine)
     # The derivative with respect to the scaled ray is transformed into camera axes.
-    # The same matrix product also gives the permuted components that the cross product below needs.
+    # The matrix product also gives the permuted components for the cross product with the ray.
     slope = (stretched * (cosine / lengths)[:, None] - towards) / (lengths * sine)[:, None]
     back = to_stretched.T
     by_ray = slope @ np.concatenate(
@@ -438,7 +438,7 @@ def _limb_table() -> FloatArray:
 def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
     """Return a profile (m,) after Gaussian blurs with standard deviations `widths` (k,), m, as (k, m).
 
-    Beyond its ends, the profile is continued with its end values.
+    Beyond both ends, the profile is continued with the end values.
     """
     margin = int(4.0 * _BROADEST / _STEP)
     padded = np.pad(profile, margin, mode="edge")
@@ -493,7 +493,7 @@ def fit_profiles(
         columns = np.stack([np.ones_like(air), air, ground, shift], axis=2)
         weighted = (columns * weights[:, :, None]).transpose(0, 2, 1)
         right = weighted @ (light - model)[:, :, None]
-        # The second right-hand side of the equations gives the variance of the position.
+        # The second right-hand side of the normal equations gives the variance of the limb position.
         answer = np.linalg.solve(weighted @ columns + prior, np.concatenate([right, of_place], axis=2))
         amounts = amounts + answer[:, :3, 0]
         place = place + np.minimum(np.maximum(answer[:, 3, 0], -1.0), 1.0)

@@ -303,7 +303,7 @@ def _hypotheses(
     free = np.ones(len(observation.edges), dtype=bool)
     sound: list[Hypothesis] = []
     contradicted: list[InitialGuess] = []
-    # Cones are skipped if they have too few edges to make an accepted horizon ambiguous.
+    # Cones with too few edges to make an accepted horizon ambiguous are skipped.
     enough = float(settings.least_edges)
     for _ in range(settings.candidates):
         if np.count_nonzero(free) < enough:
@@ -348,7 +348,7 @@ def _angle(one: FloatArray, other: FloatArray) -> float:
 
 
 def _is_limb(one: Hypothesis) -> bool:
-    """Return whether a horizon is significant and its edges have the width expected from the air."""
+    """Return whether a horizon is significant and has edges of the width expected from the air."""
     return one.chance < _MOST_CHANCE and _BREADTH[0] < one.breadth < _BREADTH[1]
 
 

@@ -304,7 +304,7 @@ class ObjectReport:
 
 # Distance (px) between two corners of a region below which they count as the same corner.
 _LEAST_CROSSING_PX = 10.0
-# Distance (px) of a fitted streak's ends from the predicted ends of a star below which it counts as a star.
+# Distance (px) of a streak's ends from the predicted ends of a star below which the streak is a star's.
 _FITTED_PX = 1.0
 # Minimum distance (px) from the image border at which the ends of a region count as inside the image.
 _BORDER_PX = 2
@@ -450,7 +450,7 @@ class Judge:
     def _candidate(
         self, ends: FloatArray, fired: tuple[str, ...], light: StarLight, found: Explanation
     ) -> SpaceObject:
-        """Return the object between `ends`, in the order that makes its motion relative to stars slower."""
+        """Return the object between `ends`, ordered such that the motion relative to the stars is slower."""
         rate, direction = self._among_stars(ends)
         other, other_direction = self._among_stars(ends[::-1])
         if other < rate:

@@ -3,14 +3,13 @@
 If the stars are streaks, `detect` finds objects by their motion and their pixels. If the stars are points, an
 object is also a point or a short streak. If the stars are points, a possible object is an area of light
 significantly above the noise that is not at a catalogue star, or light beside a star that the star's image
-does not explain. A single image does not show which possible objects move relative to the stars; only tracks
-over several images show this.
+does not explain. Only tracks over several images show which possible objects move relative to the stars.
 
 The pixels of each object are fitted together with the known stars nearby. An object is modelled as a short
 trail of constant brightness, blurred by the camera's point spread function (PSF). A Gauss-Newton iteration
 fits the position, extent and brightness of the object, the sky level and the brightness of each star,
-weighted by the noise of the modelled light. Saturated pixels are excluded, because they would displace a
-centroid by 0.03 px. The covariance of a fit is increased if the residuals exceed the noise.
+weighted by the noise of the modelled light. Saturated pixels, which would displace a centroid by 0.03 px, are
+excluded. The covariance of a fit is increased if the residuals exceed the noise.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Test whether stars explain the light of a region, and search of a region after its stars are removed.
+"""Test whether stars explain the light of a region, and search for objects after the stars are subtracted.
 
 The test compares two hypotheses by chi-square: that the light of the region comes from stars only, or from
 stars and one object. Stars and object are modelled as streaks of constant brightness with the camera's point
@@ -380,7 +380,7 @@ def cut_patch(
 
 
 def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[list[FloatArray], FloatArray]:
-    """Return the paths (m, 2), px, of stars in a patch, and the counts (rows, columns) without them."""
+    """Return the paths (m, 2), px, of the stars in a patch, and the counts (rows, columns) without stars."""
     middles: list[FloatArray] = []
     left = patch.signal
     rows, columns = patch.signal.shape
@@ -476,7 +476,7 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
 
 
 def _continued(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2), px, of a line of light extended across gaps, or None if it does not continue.
+    """Return the ends (2, 2), px, of a line of light extended across gaps, or None if no light continues.
 
     A star that crosses the object's line leaves a gap, because the star is subtracted together with the
     line's light.

@@ -4,8 +4,8 @@ A pixel is bright if the sum of the 3 x 3 pixels around it, without background, 
 standard deviations of the sum. The sum of 3 x 3 pixels is nearly the matched filter of a star image one pixel
 wide. The Harris response of the structure tensor (cornerness) is computed for each connected region of bright
 pixels. A streak has exactly two peaks of the Harris response, and each peak is located by its centre of
-intensity. The equations are those of Sease, with the corrections of the errata to eq. (3.5), (3.15), (3.17)
-and (3.18). Images have the shape (rows, columns), and points are (x, y) in px.
+intensity. The equations are those of Sease, where eq. (3.5), (3.15), (3.17) and (3.18) are corrected as in
+the errata. Images have the shape (rows, columns), and points are (x, y) in px.
 
 The Gaussian kernels displace the peaks of the Harris response along the streak by a constant that depends on
 the point spread function. The function `extend` compensates the displacement of measured streak ends by the
@@ -38,7 +38,7 @@ from knightcube.vision.objects.settings import EndpointSettings
 _PADDING = 8
 # Minimum length of a region that may be a streak, as a fraction of `EndpointSettings.least_length`.
 _LENGTH_MARGIN = 0.75
-# Fraction of a streak's counts per px of length that lies in its central row, for a PSF of 1 px.
+# Fraction of a streak's counts in the pixel row along its centre line, for a PSF of 1 px.
 _PEAK_FRACTION = 0.28
 
 
@@ -381,8 +381,8 @@ def centre_of_rotation(endpoints: FloatArray) -> FloatArray:
     """Return the centre of rotation (2,), px: the point nearest to the perpendicular bisectors of streaks.
 
     Each streak is given by its two ends (n, 2, 2), px. The nearer the rotation axis is to the normal of the
-    boresight, the farther away is the centre; for parallel chords it is NaN. Source: Sease, eq. (3.17) and
-    (3.18) as corrected in the errata.
+    boresight, the farther away is the centre; for parallel chords the centre is NaN. Source: Sease, eq.
+    (3.17) and (3.18) as corrected in the errata.
     """
     chord = endpoints[:, 1] - endpoints[:, 0]
     chord = chord / np.linalg.norm(chord, axis=-1, keepdims=True)

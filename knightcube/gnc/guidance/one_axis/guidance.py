@@ -67,7 +67,7 @@ class AcceptanceRules:
 class PlanVerdict:
     """Whether a plan was accepted.
 
-    The text `reason` is the reason for a rejection, and empty for an accepted plan.
+    The text `reason` states why a plan was rejected, and is empty for an accepted plan.
     """
 
     accepted: bool

@@ -17,8 +17,8 @@ The motion is discretised by the pseudospectral method of Sease, eq. (5.8). The 
 roots of P'(x), where P is the Legendre polynomial of degree n - 1. Quadrature on the nodes is exact up to
 degree 2n - 3, and the differentiation matrix up to degree n - 1. A path is a single polynomial q2(t) of time.
 Angle, rate and acceleration follow exactly from q2 (Sease, eqs. (5.9) and (5.13), corrected), so the
-planner's limits also hold between the nodes. After the end of a path, the commanded motion is the last
-attitude, or continues at the end rate up to the angle at which the coil loses its torque.
+planner's limits also hold between the nodes. After the end of a path, the commanded motion holds the last
+attitude, or continues at the end rate up to the angle at which the coil has no torque.
 """
 
 from __future__ import annotations
@@ -254,7 +254,7 @@ def lgl_rule(count: int) -> LglRule:
     series = legendre.Legendre.basis(degree)
     inner = np.sort(np.real(series.deriv().roots()))
     slope, curvature = series.deriv(), series.deriv(2)
-    for _ in range(3):  # eigenvalues of the companion matrix are accurate to 1e-12; Newton steps refine them
+    for _ in range(3):  # refines the eigenvalues of the companion matrix, which are accurate to 1e-12
         inner = inner - slope(inner) / curvature(inner)
     nodes = np.concatenate([[-1.0], 0.5 * (inner - inner[::-1]), [1.0]])
 

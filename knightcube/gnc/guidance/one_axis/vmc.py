@@ -471,7 +471,7 @@ class PlanJob:
     """A planning job for a path between two states (q2 and rate, rad/s) in `horizon` s.
 
     The job has a `number`, and the path starts at `origin_ns`. The path followed until now is `last`, with an
-    origin relative to `origin_ns`. The other attributes are arguments of `plan`.
+    origin relative to `origin_ns`. The remaining attributes of a job are arguments of `plan`.
     """
 
     number: int
@@ -492,7 +492,7 @@ class PlanJob:
 def run(job: PlanJob) -> StepPlan:
     """Return the plan for `job`.
 
-    Raises PlanningError. The function is at module level, so that a worker process can import it.
+    Raises PlanningError. The planning function is at module level, so that a worker process can import it.
     """
     return plan(
         job.plant,

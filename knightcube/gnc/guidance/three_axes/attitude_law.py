@@ -265,7 +265,7 @@ def approach(
         left = to_rotation_vector(multiply(quaternion, conjugate(start[1])))
         law_rate = to_rotation_vector(multiply(start[2], conjugate(start[0]))) / (2.0 * DIFFERENCE)
         shown = attitude_matrix(from_rotation_vector(left)) @ law_rate
-        # The polynomial is also evaluated before the start, because central differences at the start need it.
+        # The polynomial is also evaluated just before the start, for the central differences at the start.
         share = np.minimum((np.asarray(times) - begin) / (end - begin), 1.0)[:, None]
         rest = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
         drift = (end - begin) * share * (1.0 - share) ** 3 * (1.0 + 3.0 * share)
@@ -289,7 +289,7 @@ def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArra
     """Return `vector` (3,) rotated by the shortest rotation from unit vector `start` to `end`."""
     axis = np.cross(start, end)
     cosine = float(start @ end)
-    if cosine < -1.0 + 1e-9:  # opposite directions can be rotated about any axis normal to them
+    if cosine < -1.0 + 1e-9:  # any normal axis rotates a direction into the opposite direction
         return vector
     return np.asarray(cosine * vector + np.cross(axis, vector) + axis * (axis @ vector) / (1.0 + cosine))
 
@@ -345,7 +345,7 @@ def law_of(
 def directions_of(target: PointingTarget) -> tuple[Direction, Direction]:
     """Return the functions for the direction of a goal and for the direction that defines zero roll.
 
-    An INERTIAL goal has a quaternion instead of these directions.
+    The goal INERTIAL is defined by a quaternion and not by two directions.
     """
     if target.goal is Goal.GROUND:
         return ground(*target.numbers), velocity

@@ -84,7 +84,7 @@ class SlewEnvironment:
     pressures: Pressures | None = None
 
     def part(self, which: IntArray) -> SlewEnvironment:
-        """Return the environment at those times that have the indices `which`."""
+        """Return the environment at the times with the indices `which`."""
         found = self.pressures
         pressed = None if found is None else Pressures(found.air[which], found.light[which])
         return SlewEnvironment(self.field[which], self.position[which], pressed)
@@ -358,7 +358,7 @@ class ConeConstraints:
     """
 
     def __init__(self, cones: tuple[Cone, ...], margin: FloatArray, times: FloatArray) -> None:
-        """Widen the cones by `margin` at `times` (n,) s, because the path between these times is not checked.
+        """Widen the cones by `margin` at `times` (n,) s, because the path between two times is not checked.
 
         The margin (rad) is a scalar or an array (cones, n).
         """
@@ -413,7 +413,7 @@ class BoresightEnd:
     rate: FloatArray
 
     def is_met(self, q: FloatArray) -> bool:
-        """Return whether an attitude (4,) with zero error points to the direction and not opposite to it."""
+        """Return whether the boresight at an attitude (4,) of zero error is not opposite to the direction."""
         return float(self.axis @ shown(q[None], self.direction[None])[0]) > 0.0
 
     def misses(self) -> tuple[FloatArray, FloatArray]:

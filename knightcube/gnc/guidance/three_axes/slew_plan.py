@@ -123,7 +123,7 @@ _DENSE = 16
 """Number of times at which cones are checked between a node and the next midpoint of a path."""
 _ROOM = math.radians(0.005)
 """Minimum angle (rad) to an exclusion cone at the checked times. Between two checked times, the angle to a
-cone decreases by less than this margin."""
+cone decreases by less than this minimum angle."""
 
 _OVER = 1.001
 """Largest ratio of the flown dipole to the dipole limit along an accepted path."""

@@ -16,8 +16,8 @@ The vector of inequalities g >= 0 contains the lower and upper limits of the dip
 by the exclusion cones (cones, 2 k), for k intervals. The interior point method is that of Wachter and Biegler
 (Mathematical Programming 106, 2006) with second-order corrections. The curvature test of Chiang and Zavala
 (Mathematical Programming, 2016) replaces the count of eigenvalues. Without inequalities, the interior point
-method reduces to Newton's method. Far from a feasible point, the second derivatives of the equations are
-omitted (Gauss-Newton), because there they lead to bad steps.
+method reduces to Newton's method. Far from a feasible point, the second derivatives of the equations lead to
+bad steps and are omitted (Gauss-Newton).
 """
 
 from __future__ import annotations
@@ -400,8 +400,8 @@ _HEAVIER = 1.2
 _FAR = 0.03
 """Sum of the constraint violations beyond which the curvature of the equations is omitted."""
 _DAMPED = 3e-3
-"""Minimum convexification far from a feasible point, which prevents too long steps. The value holds for a
-constraint violation of one and decreases in proportion to a smaller violation."""
+"""Minimum convexification far from a feasible point, which prevents too long steps. The minimum
+convexification holds for a constraint violation of one, and is proportional to smaller violations."""
 _CONVEX = 1e-3, 1e4
 FIRST_BARRIER = 1e-3
 

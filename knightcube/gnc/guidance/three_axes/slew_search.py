@@ -4,9 +4,9 @@ An initial guess is a curve of the angular momentum over time. Coils cause no to
 so the derivative of the inertial angular momentum is always normal to the field. This constraint on the
 torque is linear, so every momentum curve that reaches the end is the sum of a fixed curve and weighted modes.
 The attitude follows from the momentum by integration. A least-squares fit of about a dozen mode amplitudes
-finds curves that end at the target, stay outside the cones and need little heat. The fit is started from many
-random amplitudes at once. Gravity gradient and other disturbance torques are neglected in the guesses. The
-random starts are the same in every call.
+finds curves that end at the target, stay outside the cones and need little heat. The fit of the mode
+amplitudes is started from many random amplitudes at once. Gravity gradient and other disturbance torques are
+neglected in the initial guesses. The random starts of the fit are the same in every call.
 
 Without the dipole limit, most guesses converge in a dozen Newton steps to a path outside the exclusion cones
 (a relaxed path). The heat of a relaxed path is a lower bound of the heat of a path within the dipole limit. A
@@ -493,8 +493,8 @@ class HorizonContinuation:
     def eased(self, found: SolvedPath, peak: float) -> SolvedPath | None:
         """Return a path with smaller dipoles, found from a path whose flown dipole is `peak` times the limit.
 
-        The new path uses a smaller fraction of the dipole limit. If no such path exists or the duration is
-        free, the new path takes longer. Returns None if no path is found.
+        The new path uses a smaller fraction of the dipole limit. If no path with smaller dipoles exists or
+        the duration is free, the new path takes longer. Returns None if no path is found.
         """
         task, solver, time = self._task, self._solver, found.horizon
         if peak > _LOST:
@@ -575,8 +575,8 @@ class HorizonContinuation:
 GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3000))
 """Number of collocation intervals and budget of work of each successive search. No further guess is tried
 when the work, measured in Newton steps times intervals, exceeds the budget. A work of 1,000 takes about 0.1
-s. Ten intervals are too coarse for paths around cones, because such paths differ too much from paths on the
-fine grid."""
+s. Ten intervals are too coarse for paths around exclusion cones, because coarse paths around cones differ
+too much from paths on the fine grid."""
 _WALKS = 1.8
 """Work, relative to the budget of a search, after which the continuation ends with the best path so far."""
 _MAXIMUM_TRIED = 16
@@ -638,7 +638,7 @@ class SlewSearch:
         return self._walker.eased(found, peak) if self._widened <= _WIDENED else None
 
     def _fresh(self, found: SolvedPath) -> SolvedPath:
-        """Return the path after resetting the cones and the usable dipole limit of the solver."""
+        """Reset the cones and the usable dipole limit of the solver, and return the path `found`."""
         self._widened, self.solver.share = 0, 1.0
         self.solver.extra = np.zeros_like(self.solver.extra)
         return found
@@ -646,8 +646,8 @@ class SlewSearch:
     def _rungs(self) -> Iterator[Iterator[list[SolvedPath]]]:
         """Yield paths without the dipole limit, first of the requested duration and then of longer durations.
 
-        Paths from deferred guesses follow. Longer slews converge more often, because the field rotates more
-        during a longer slew.
+        Paths from deferred initial guesses come last. Longer slews converge more often, because the field
+        rotates more during a longer slew.
         """
         deferred: list[NewtonRun] = []
         for longer in LONGER:
@@ -710,7 +710,7 @@ class SlewSearch:
             if (kept and energy(start) >= min(map(energy, kept))) or self.solver.work > self._budget:
                 break
             if any(math.isclose(energy(start), known, rel_tol=1e-4) for known in self._known):
-                continue  # a path of this energy was already tried without success
+                continue  # a path of the same energy was already tried without success
             self._known.append(energy(start))
             found = self._walker.within(start)
             if found is not None:
