@@ -130,7 +130,7 @@ def box_sum(image: Image) -> Image:
 
 
 def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Image) -> Image:
-    """Return the 3 x 3 `sums` of a frame of `shape`, flat, after counts are subtracted from some pixels.
+    """Return the flattened 3 x 3 `sums` of a frame of `shape` after counts are subtracted from some pixels.
 
     The indices `pixels` (m,) are those of the changed pixels, each given once, and `taken` (m,) are the
     counts to subtract.
@@ -206,7 +206,7 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
 
 
 def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int) -> Moments:
-    """Return the moments of `count` regions from the region, position and counts of their m pixels (m,).
+    """Return the moments of `count` regions from region index, position and counts of each of m pixels.
 
     The moments of a region with zero flux are zero.
     """
@@ -308,7 +308,7 @@ def _hot(
 
 
 _DEAD_FRACTION = 1e-4
-"""Largest fraction of the pixels in a dead frame, such as hot pixels, that differ from the common value."""
+"""Largest fraction of pixels, such as hot pixels, that differ from the common value in a dead frame."""
 _PLATEAU = 6
 """Minimum number of saturated pixels in a frame of streaks from which saturation is recognised."""
 _LEAST_PLATEAU, _PILED_UP, _PLATEAU_REACH = 4, 2.0, 0.02

@@ -21,13 +21,13 @@ from knightcube.vision.horizon.settings import HorizonKnowledge, LogarithmicResp
 from knightcube.vision.solar_cells import SolarStringModel
 
 SUNLIT_COUNTS = 30.0
-"""Count of a pixel that the sunlit Earth exceeds, but not the Earth's stray light."""
+"""Count that pixels of the sunlit Earth exceed, but pixels with stray light from the Earth do not."""
 LIT_SIGMA = 0.3
 """Largest standard deviation (rad) of an attitude that is used to predict the Sun direction."""
 EARTHLIGHT_SIGMA = 0.1
 """Largest standard deviation (rad) of an attitude that predicts which solar strings the Earth illuminates."""
 JUDGING_SIGMA = 0.005
-"""Largest standard deviation (rad) of an attitude with which the content of the images is compared."""
+"""Largest standard deviation (rad) of an attitude that is used to check the content of the images."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

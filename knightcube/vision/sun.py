@@ -417,7 +417,7 @@ _MOST_CORRELATED = 0.9
 _TUKEY = 4.685
 """Cut-off of Tukey's biweight in standard deviations, 95 % efficient for Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
-"""Minimum number of points on a preferred smaller circle, relative to the circle with the most points.
+"""Fraction of the best circle's number of points from which a smaller circle is preferred.
 
 Stray light enlarges discs, so that a smaller circle is more likely the Sun.
 """

@@ -388,7 +388,7 @@ def _squared_tangent(direction: FloatArray) -> FloatArray:
 def _distorted_fit(
     field: StarField, sky: SkyIndex, observed: IntArray, star: IntArray, pose: _DistortedPose, corner: float
 ) -> tuple[_DistortedPose, FloatArray, FloatArray] | None:
-    """Return attitude, scale and distortion from matched stars, normal matrix (5, 5) and chi-squares (k,).
+    """Return a fit of attitude, scale and distortion to stars, its normal matrix (5, 5) and chi-squares (k,).
 
     The normal matrix includes the prior of the distortion. Each chi-square is that of one matched star.
     """

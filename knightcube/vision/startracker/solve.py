@@ -170,7 +170,7 @@ def timing_covariance(motion: MotionResult) -> FloatArray:
     """Return the covariance (3, 3), rad^2, of the rotation error that all streaks of a frame share.
 
     If the rate changes, only the brightness along a streak determines the star's position at mid-exposure. An
-    error of the acceleration displaces all stars along their paths by the same time, an error that does not
+    error of the acceleration shifts all stars along their paths by the same time interval, which does not
     average out over the stars. The error that all streaks share is at most the uncertainty of the most
     accurate star along its path.
     """

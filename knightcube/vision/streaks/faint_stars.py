@@ -185,7 +185,8 @@ class RunningSums:
         light: (r, c) counts.
         count: number of samples on the detector in each running sum (r, c).
         span: indices of the first and last column of each circle that lie on the detector (r, 2). The range
-            `span` is infinite if the samples of a circle on the detector are not contiguous.
+            `span` is unlimited, from -inf to inf, if the samples of a circle on the detector are not
+            contiguous.
         excess: noise of the running sums on each circle, relative to the noise for independent samples (r,).
     """
 
@@ -394,7 +395,7 @@ _PASSES = 3
 _RIDGE = 0.01
 # Absolute regularisation of the normal equations for peak heights.
 _TINY = 1e-6
-# Relative accuracy at which the solution for the peak heights stops.
+# Relative accuracy at which the iteration for the peak heights stops.
 _SOLVED = 1e-4
 # Maximum number of conjugate-gradient iterations for the peak heights.
 _MOST_GRADIENTS = 200

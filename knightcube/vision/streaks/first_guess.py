@@ -143,7 +143,7 @@ class _Boxes:
 
 
 def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
-    """Return cumulative sums along circles of samples, each at most `_CAP` times its region's median."""
+    """Return cumulative sums along circles, of samples limited to `_CAP` times the median of the region."""
     sine = np.sqrt(np.maximum(1.0 - circles.height**2, 1e-12))
     step = _STEP / (pinhole.focal_length * float(sine.max()))
     inside_field = float(np.arccos(np.clip(abs(circles.frame[2, 2]), 0.0, 1.0)))

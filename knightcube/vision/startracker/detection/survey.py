@@ -434,7 +434,7 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
 
 
 def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArray:
-    """Return which bright pixels (m,) are local maxima; of equal neighbours, only the last pixel is one.
+    """Return which bright pixels (m,) are local maxima; of equal neighbours, only the last pixel counts.
 
     The array `index` (m,) contains the increasing indices of the bright pixels in the flattened frame. Pixels
     that are not in `index` are below the noise threshold and never exceed a bright pixel. The outermost
