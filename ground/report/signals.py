@@ -203,7 +203,7 @@ def star_attitudes(run: Run) -> Object:
     covered = (middle >= time[0]) & (middle <= time[-1]) if len(time) > 1 else np.zeros(len(solved), bool)
     error = np.zeros((0, 3))
     if covered.any():
-        # Over the short steps of the truth log, linear interpolation is as good as a great circle.
+        # The time steps of the truth log are short enough for linear interpolation of quaternions.
         columns = [np.interp(middle[covered], time, column) for column in truth["quaternion"].T]
         true = normalise(np.stack(columns, axis=-1))
         error = to_rotation_vector(multiply(solved["quaternion"][covered], conjugate(true)))
@@ -268,7 +268,7 @@ def _rms(values: FloatArray) -> float:
 
 
 def _error_figures(error: FloatArray, packed: FloatArray) -> Object:
-    """Return count and rms of errors e (n, 3), and the mean of e' P^-1 e / 3 over positive definite P."""
+    """Return count and rms of errors e (n, 3), and the mean of e' P^-1 e / 3 for definite covariances P."""
     found: Object = {"compared": len(error), "rms_error": None, "normalised": None}
     if len(error):
         found["rms_error"] = np.sqrt(np.mean(error**2, axis=0)).tolist()

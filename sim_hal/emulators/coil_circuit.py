@@ -287,7 +287,7 @@ class EmulatedIna219:
         self.frozen: dict[int, int] = {}
         self.lag_ns = 0
         self._calibration = 0
-        self._past: deque[tuple[int, int, int]] = deque()  # (time, shunt, bus) of conversions, oldest first
+        self._past: deque[tuple[int, int, int]] = deque()  # times, shunt and bus registers of conversions
         self.brown_out()
 
     def brown_out(self) -> None:
@@ -397,7 +397,7 @@ class EmulatedIna219:
         return old[1:]
 
     def _products(self) -> tuple[int, int, bool]:
-        """Return the registers Current and Power, and whether a value exceeds its register."""
+        """Return the registers Current and Power, and whether one of the values overflows."""
         shunt, volts = self._shown()
         current = abs(shunt) * self._calibration // 4096
         power = current * volts // 5000

@@ -186,7 +186,7 @@ class EmulatedAds1115:
 
 
 _FRESH_NS = 20_000_000
-"""Time (ns) for which one evaluation of the solar currents is used."""
+"""Time (ns) for which computed solar currents are reused."""
 
 
 class EmulatedSolarCells:

@@ -135,8 +135,8 @@ class StarCameraModel:
     def exposure_within(self, span: float) -> float:
         """Return the exposure (s) of each row if all rows together take `span` s.
 
-        With a rolling shutter, the frame takes the number of rows times the line time longer than the
-        exposure. Raises OutOfRange if this readout takes the whole `span`.
+        With a rolling shutter, `span` consists of the exposure and one line time per row. Raises OutOfRange
+        if the line times take the whole `span`.
         """
         readout = self.rows * self.line_time
         if not span > readout:
@@ -250,7 +250,7 @@ def _turns(quaternions: FloatArray) -> FloatArray:
 FAINT_SHARE = 0.25
 """Largest charge (e-) of a pixel that counts as faint, as a fraction of the variance of the background."""
 GREATEST_SKEWNESS = 0.05
-"""Largest skewness of noise drawn as Gaussian, whose distribution then errs by 0.004 (Edgeworth)."""
+"""Largest skewness at which noise is drawn as Gaussian, with an error of 0.004 by the Edgeworth series."""
 
 SLICES, OUTER_SLICES = 1 << 16, 64
 """Number of equally probable slices of the normal distribution, and of outermost slices in each tail."""

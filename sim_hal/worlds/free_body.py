@@ -4,10 +4,8 @@ The flight software assumes nominal properties of the craft. The true properties
 errors drawn from one seed, as a built satellite differs from its design. The torques on the body come from
 the coils, the residual dipole, the gravity gradient, air drag and sunlight.
 
-- The air exerts F = -1/2 rho C_D A (n . v) v on the faces that meet the flow (Wertz 1978, eq. 17.61, with C_D
-  = 2.2).
-- Sunlight exerts F = -P A cos(theta) ((1 - e) s + 2 e cos(theta) n) on the lit faces (Montenbruck & Gill
-  2000, eq. 3.73).
+- The drag on a face that meets the flow is given by Wertz 1978, eq. 17.61, with a drag coefficient of 2.2.
+- The force of sunlight on a lit face is given by Montenbruck & Gill 2000, eq. 3.73.
 - Shading of one face by another is not modelled, because a box has none.
 
 Euler's equations are integrated in principal axes by the classical Runge-Kutta method. Every stage evaluates

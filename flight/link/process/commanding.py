@@ -246,7 +246,7 @@ def _remove(path: Path) -> None:
 
 MOST_ENTRIES = 32
 HIGHEST = 2**63 - 1
-"""Largest number in a stored schedule. As UTC in ns since 1970, this number is a time in the year 2262."""
+"""Largest integer in a stored schedule; as UTC in ns since 1970 it is a time in the year 2262."""
 _LONGEST_FILE = 1 << 16
 
 _Count = Annotated[int, Meta(ge=0, le=HIGHEST)]

@@ -738,7 +738,7 @@ TRANSFER = Packet(
 
 
 _LATENESS = Limits(fault=(0.0, 0.0125))
-"""Nominal delay (s) of a control cycle. A cycle delayed by more than half its period is skipped."""
+"""Nominal range of the delay (s) of a control cycle, which is skipped if delayed by half its period."""
 _EXECUTION = Limits(warning=(0.0, 0.0125), fault=(0.0, 0.025))
 
 CYCLE_TIMING = Packet(
