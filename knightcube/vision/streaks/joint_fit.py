@@ -85,8 +85,8 @@ class WorkBudget:
 _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
-# First displacement (px) of a star without effect on the motion at which the fit's pixels are reselected.
-# Later displacements of stars without effect on the motion are ignored; some are poorly determined.
+# Displacement (px), in iteration 1, of a star without effect on the motion that reselects the fit's pixels.
+# In later iterations, displacements of such faint or blended stars, often poorly known, are ignored.
 _FAINT_DRIFT = 3.2
 # Change of the acceleration, relative to the rotation, after which the fit's pixels are reselected.
 _GROWN = 0.1
