@@ -132,7 +132,7 @@ def derivative(q: FloatArray, rate: FloatArray) -> FloatArray:
 def angle_between(p: FloatArray, q: FloatArray) -> FloatArray:
     """Return the rotation angles (rad) between attitudes p and q (..., 4).
 
-    Angles near 0 and pi are accurate.
+    The computation is also accurate for angles near 0 and pi.
     """
     vector = to_rotation_vector(multiply(p, conjugate(q)))
     return np.asarray(np.linalg.norm(vector, axis=-1))

@@ -70,9 +70,10 @@ class MotionModel:
     Attributes:
         rate: standard deviation of each component of the angular rate before the second sighting, rad/s.
         closing: standard deviation of the ratio (range rate) / range before the second sighting, 1/s.
-        wander: noise density of the tidal acceleration divided by the range, 1/s^3. In low orbit this scaled
-            acceleration reaches 1.5 n^2 = 1.8e-6 1/s^2. With the default density, the errors of direction and
-            rate agree with the covariance in passes at 0.05 to 0.6 deg/s and up to 5,000 km.
+        wander: noise density of the tidal acceleration divided by the range, 1/s^3. In a low orbit with the
+            orbital rate n, the scaled acceleration reaches 1.5 n^2 = 1.8e-6 1/s^2. With the default density,
+            the errors of direction and rate agree with the covariance in passes at 0.05 to 0.6 deg/s and up
+            to 5,000 km.
         residual_wander: noise density of the residual acceleration divided by the range if the gravity
             gradient is known, 1/s^3.
         bend: standard deviation of the unmodelled change per second of (range rate) / range on curved paths,

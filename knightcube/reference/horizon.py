@@ -93,9 +93,9 @@ def fit_circle(points: FloatArray) -> HorizonCircle:
     """Return the least-squares circle through points (n, 2), by equations (2) to (5) of Meller et al.
 
     Each row of the linear system contains a point and the next point; the last row contains the last and the
-    first point. Three points lie exactly on the circle. For more points the radius of the circle is the RMS
-    distance of the points from the centre. Raises NoCircleError for fewer than three points and for collinear
-    points.
+    first point. A circle through three points fits exactly. For more points the radius of the circle is the
+    RMS distance of the points from the centre. Raises NoCircleError for fewer than three points and for
+    collinear points.
     """
     points = np.asarray(points, dtype=float)
     if len(points) < 3:

@@ -468,7 +468,7 @@ class GridTable:
     star: npt.NDArray[np.int32]
 
     def votes(self, cells: IntArray) -> IntArray:
-        """Return the numbers (n,) of given cells (k,) that the patterns of the guide stars occupy."""
+        """Return for each guide star (n,) how many of the given cells (k,) its grid pattern occupies."""
         place, _ = members(self.begin[cells], self.begin[cells + 1])
         return np.bincount(self.star[place], minlength=len(self.aligning))
 

@@ -147,9 +147,9 @@ def _by_eigenvalue(
     """Return the optimal quaternion (4,) by a formula that needs the largest eigenvalue of K.
 
     The error of the polynomial's root is the rounding error divided by the product of the eigenvalue
-    differences, which is large for two close directions. The eigenvalue is therefore improved by the Rayleigh
-    quotient, whose error is quadratic in the error of the quaternion. Raises AttitudeError if the largest
-    eigenvalue is double, so that the attitude is undefined.
+    differences, and is therefore large for two close directions. The eigenvalue is therefore improved by the
+    Rayleigh quotient, whose error is quadratic in the error of the quaternion. Raises AttitudeError if the
+    largest eigenvalue is double, so that the attitude is undefined.
 
     Args:
         profile: (3, 3) attitude profile matrix.

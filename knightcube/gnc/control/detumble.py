@@ -98,7 +98,7 @@ def share_in_rotating_field(field_rate: float, schedule: WindowSchedule) -> floa
 
     The rate along the field can be removed only as the field rotates. With a gain above k = 2 Omega J, where
     Omega is the rotation rate of the field, the spin aligns with the field and remains (Avanzini and
-    Giulietti 2012). Along an orbit the field rotates about twice per revolution.
+    Giulietti 2012). Along an orbit the field rotates about twice per revolution of the satellite.
     """
     return min(2.0 * field_rate * schedule.period_ns * _SECOND, MAXIMUM_SHARE)
 
@@ -141,7 +141,7 @@ class Detumbler:
         self._before = self._field = self._rate = None
 
     def listens(self, time_ns: int) -> bool:
-        """Return whether the coils were off and settled at `time_ns`."""
+        """Return whether at `time_ns` the coils were off and their field had decayed."""
         schedule = self._schedule
         phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
         inside = schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns
@@ -150,7 +150,7 @@ class Detumbler:
     def sample(self, time_ns: int, field: FloatArray) -> None:
         """Accept a field (3,), T, measured at `time_ns`.
 
-        The field is ignored unless the coils were off and settled.
+        The sample is ignored unless the coils were off and their field had decayed.
         """
         if not self.listens(time_ns):
             return

@@ -194,7 +194,7 @@ class _FieldPreview:
         return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
 
     def matrix(self, y: FloatArray, count: int) -> FloatArray:
-        """Return the matrix A(y) (3, 3) of the module's docstring for the first `count` instants."""
+        """Return the matrix A(y) (3, 3) that gives the next costate, for the first `count` instants."""
         weight = self.reach / self.across(y, count)
         return np.asarray(np.tensordot(weight, self.effect[:count], 1) + self.rest * np.eye(3))
 
@@ -217,7 +217,7 @@ OLDEST_NS = 100_000_000
 """Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
 INSTANTS = 150
 DENSER = 1.5
-"""Exponent of the power law by which the times of the field prediction are denser at the start. For a
+"""Exponent of the power law that makes the times of the field prediction denser at the start. For a
 prediction over 1,500 s, the first time step is 1 s and the last 15 s."""
 LEFT = 0.7
 """Residual momentum of a plan, as a fraction of the momentum at which a body counts as detumbled."""
@@ -278,7 +278,7 @@ class FieldDetumbler:
         """Create a detumbler whose rate filter has not started.
 
         The function `expected` predicts the field (n, 3), T, at `braking.instants` after a given time, in the
-        body axes at that time. The function returns None while attitude or orbit are unknown.
+        body axes at that time. The function `expected` returns None while attitude or orbit are unknown.
         """
         self._schedule = schedule
         self._braking = braking
@@ -304,7 +304,7 @@ class FieldDetumbler:
         self._filter.restart()
 
     def listens(self, time_ns: int) -> bool:
-        """Return whether a field measured at `time_ns` is usable, with the coils off and settled."""
+        """Return whether at `time_ns` the coils were off and their field had decayed."""
         schedule = self._schedule
         if not self.trusted and time_ns - self._driven_ns >= schedule.settle_ns:
             return True
@@ -313,7 +313,7 @@ class FieldDetumbler:
         return time_ns >= self._begun_ns and inside
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
-        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled.
+        """Accept a field (3,) T measured at `time_ns`, or ignore it if the field of the coils disturbed it.
 
         The rate (3,), rad/s, is measured by a gyro at the same time as the field. The sample may be older
         than the last command.

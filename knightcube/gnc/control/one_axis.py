@@ -13,12 +13,12 @@ for the angular acceleration w', from which the plant model gives the current.
 
 The tracker extends the controller of Sease's thesis by two features, which the option `as_in_thesis` switches
 off. As the first feature, the estimated disturbance is fed forward, so that a constant torque causes no
-offset. The estimator integrates the acceleration that the model did not predict. Integrator windup cannot
-occur, because the disturbance estimator uses the limited current. As the second feature, the rate at which an
-angle error is reduced is limited, so that the coil can decelerate the body in time and the angle does not
-overshoot. Small errors are reduced at the rate s e with s = K_e / K_e', and errors above A / s^2 at the rate
-sqrt(2 A |e| - (A / s)^2), where A is the available deceleration. The rate limit is that of the proximate
-time-optimal servomechanism (Workman 1987), but with a continuous slope.
+offset. The disturbance estimator integrates the acceleration that the plant model did not predict. Integrator
+windup cannot occur, because the disturbance estimator uses the limited current. As the second feature, the
+rate at which an angle error is reduced is limited, so that the coil can decelerate the body in time and the
+angle does not overshoot. Small errors are reduced at the rate s e with s = K_e / K_e', and errors above A /
+s^2 at the rate sqrt(2 A |e| - (A / s)^2), where A is the available deceleration. The rate limit is that of
+the proximate time-optimal servomechanism (Workman 1987), but with a continuous slope.
 
 The error e = sin(d) is monotonic in d only up to 90 degrees. The angle error d is therefore clamped to
 `largest_error`. With the clamped angle error, the demanded acceleration stays bounded and does not decrease
@@ -205,7 +205,7 @@ _REST_ANGLE = 0.03
 _REST_RATE = 4.0e-3
 _REST_TIME = 1.0
 _TIMEOUT = 60.0
-_REACH = 0.45  # modelled amplitude as a fraction of the angle bound, to allow 1.4 times the modelled response
+_REACH = 0.45  # modelled amplitude, relative to the angle bound; the true amplitude may be 1.4 times as large
 _WEAK = 0.7  # fraction of the modelled torque that is assumed to be available for braking
 _SHORT_PULSE = 1.0
 
@@ -232,8 +232,8 @@ class ExcitationSettings:
     """Amplitudes of the excitation.
 
     Attributes:
-        current_share: current of pulses and tracker, as a fraction of the coil's limit. At the limit itself,
-            the true current would differ from the commanded current.
+        current_share: current of pulses and tracker, as a fraction of the coil's limit. At the current limit
+            itself, the true current would differ from the commanded current.
         largest_q2: largest quaternion component q2 to which the excitation may rotate the body.
         swing: duration of each free oscillation, s.
     """

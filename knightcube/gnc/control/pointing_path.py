@@ -540,8 +540,8 @@ def _counted(wanted: AttitudeReferences, motion: PlannedMotion, criterion: PathC
 def error_jacobians(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
     """Return the derivatives (n + 1, 6, 6) of the attitude and rate errors by small changes of the motion.
 
-    The rotation block is the inverse left Jacobian of the rotation group, for scalar-last quaternions from
-    inertial into body axes.
+    The rotation block of the derivatives is the inverse left Jacobian of the rotation group, for scalar-last
+    quaternions from inertial into body axes.
     """
     turn = to_rotation_vector(multiply(motion.quaternion, conjugate(wanted.quaternion)))
     angle = np.linalg.norm(turn, axis=1)

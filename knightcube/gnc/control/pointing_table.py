@@ -5,11 +5,11 @@ improves a merit function, the cost plus the weighted defects (Nocedal & Wright 
 algorithm 18.3). In contrast to the sweeps of `pointing_path`, intermediate motions need not be feasible. The
 defect of a time step is the difference between the propagated state at the end of the step and the state at
 the next instant. All defects vanish in the course of the iterations (Bock & Plitt 1984, IFAC 9th World
-Congress). Multiple shooting prevents errors from growing along a revolution. Errors could otherwise grow,
-because coils cause no torque about the field and the body may rotate far about the pointing axis. An
-iteration of multiple shooting takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and
-derivatives are computed of this discrete rule. With derivatives of the continuous motion, the iteration would
-stall for bodies that rotate by degrees per time step.
+Congress). Multiple shooting prevents errors from growing along a revolution. Without multiple shooting,
+errors could grow, because coils cause no torque about the field and the body may rotate far about the
+pointing axis. An iteration of multiple shooting takes 0.07 ms per instant. The motion is propagated by the
+midpoint rule, and derivatives are computed of this discrete rule. With derivatives of the continuous motion,
+the iteration would stall for bodies that rotate by degrees per time step.
 
 If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
 the module `pointing_path` instead. The cost of an error at the end of this path follows from a sweep along

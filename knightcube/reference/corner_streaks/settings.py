@@ -47,7 +47,7 @@ class StreakSettings(EndpointSettings):
 
     @classmethod
     def of(cls, detector: DetectorName, **changes: Any) -> StreakSettings:
-        """Return the settings tuned for a corner detector and a point spread of 1 px, with some changes."""
+        """Return the settings tuned for a corner detector and a point spread of 1 px, with given changes."""
         return cls(**{"detector": detector, **_OF_DETECTOR[detector], **changes})
 
 

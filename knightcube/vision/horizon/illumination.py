@@ -7,10 +7,10 @@ terminator.
 
 If no image shows a limb, the Earth fills the field of one camera and the other cameras are dark (Meller et
 al., section 4.1). If the Earth fills the field of one camera, `coarse_nadir` tries nadir directions that
-cover the sphere. For each trial nadir, the function predicts which samples of the images are bright, namely
-samples on the sunlit part of the Earth's disc. The coarse nadir is the mean of the trial directions, weighted
-by their likelihood given the samples, and the covariance of the nadir is the spread of the weighted
-directions. If the direction of the Sun is unknown, any sample on the Earth's disc may be dark.
+cover the sphere. For each trial nadir, `coarse_nadir` predicts that the samples on the sunlit part of the
+Earth's disc are bright. The coarse nadir is the mean of the trial directions, weighted by their likelihood
+given the samples, and the covariance of the nadir is the spread of the weighted directions. If the direction
+of the Sun is unknown, any sample on the Earth's disc may be dark.
 
 The function `why_false` compares an image with the view from a known attitude. An image contradicts the
 attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be. An

@@ -146,7 +146,7 @@ class EdgeSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HorizonSettings:
-    """Settings of the search for the horizon among edges, and its assumed errors.
+    """Settings of the search for the horizon among edges, and assumed errors of altitude and limb.
 
     Attributes:
         edges: settings of the search for edges.

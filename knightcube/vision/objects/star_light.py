@@ -270,7 +270,7 @@ def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> Floa
 def spread_with_slopes(
     path: FloatArray, shares: FloatArray, columns: int, rows: int, sigma: float
 ) -> list[FloatArray]:
-    """Return the image of a streak from `spread_over`, and its derivatives, 1/px, by shifts of the path.
+    """Return the image of a streak of one count, and its derivatives, 1/px, by displacements of the path.
 
     Each of the k displacements moves each of the m points of the path by the given fraction `shares` (k, m)
     of a displacement. For each displacement of the path, the derivatives for a displacement along x and along
@@ -412,7 +412,7 @@ def _eroded(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray:
     least = np.full(seen.shape, np.inf)
     for number, (x, y) in enumerate(np.rint(offsets).astype(int)):
         part = wide[reach + y : reach + y + rows, reach + x : reach + x + columns]
-        # At the end of a streak, the smoothed brightness is half of that along the streak.
+        # At the end of a streak, the smoothed brightness is half the brightness along the streak.
         np.minimum(least, 2.0 * part if number in (0, len(offsets) - 1) else part, out=least)
     return least
 

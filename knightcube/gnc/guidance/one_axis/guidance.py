@@ -116,7 +116,7 @@ class PathGuidance:
         self._aimed_ns = now_ns
 
     def hold(self, angle: float, now_ns: int) -> None:
-        """Hold an angle (rad) from now on, and reject plans that were made earlier.
+        """Command the attitude `angle` (rad) from now on, and reject plans that were made earlier.
 
         Raises UsageError when the angle is not finite.
         """
@@ -141,8 +141,8 @@ class PathGuidance:
     ) -> PlanVerdict:
         """Follow `plan` from `origin_ns` if it satisfies the acceptance rules.
 
-        The arguments `angle` (rad) and `rate` (rad/s) are estimates for the start of the path. The current
-        limit is checked for the estimated `disturbance` (rad/s^2).
+        The arguments `angle` (rad) and `rate` (rad/s) are the estimated state at the start of the path. The
+        current limit is checked for the estimated `disturbance` (rad/s^2).
         """
         reason = (
             self._untimely(origin_ns, now_ns)
@@ -167,7 +167,7 @@ class PathGuidance:
         return GuidanceState.HOLDING if self._path.has_ended(now_ns) else GuidanceState.FOLLOWING
 
     def is_following(self, now_ns: int) -> bool:
-        """Return whether a path is being followed that has not ended."""
+        """Return whether a path is being followed and has not yet ended."""
         return self.state(now_ns) is GuidanceState.FOLLOWING
 
     def is_adrift(self, now_ns: int) -> bool:

@@ -57,8 +57,7 @@ the bang-bang path, whose energy is up to 1 % above the optimum for the same hor
 horizon is about 0.3 % longer than the shortest horizon, and the energy is within 0.25 % of the optimum."""
 
 _SHORTEST_STRETCH = 1.015
-"""Largest factor by which the time cost SHORTEST_COST may stretch a horizon although the requested horizon is
-feasible."""
+"""Largest factor by which a search with SHORTEST_COST may stretch a feasible requested horizon."""
 
 _START_BELOW = 1.7
 _GROW_TO = 1.4
@@ -165,7 +164,7 @@ class HorizonSearch:
     def _at_requested(self, program: PathProgram, trial: Trial, asked: float) -> tuple[PathProgram, Trial]:
         """Return a path over `asked` s instead of a slightly longer path, if a path over `asked` s exists.
 
-        The search starts from the longer path.
+        The search for the shorter path starts from the longer path.
         """
         if not asked * (1.0 + _AT_BOUND) < trial.horizon <= asked * _SHORTEST_STRETCH:
             return program, trial
@@ -325,9 +324,9 @@ def plan(
     shortest feasible horizon on `nodes` nodes, and at most 1.5 % longer than the bang-bang time.
 
     With `time_cost` in W the path minimises energy plus `time_cost` times horizon, over horizons from
-    SHORTEST_WITH_TIME_COST s to `max_stretch` times `horizon`; `horizon` is then the initial guess. The path
-    followed until now is `last`, with an origin relative to the start of the new path. The remainder of this
-    path is the initial guess. The argument `cost` selects which energy is minimised.
+    SHORTEST_WITH_TIME_COST s to `max_stretch` times `horizon`; the argument `horizon` is then the initial
+    guess. The path followed until now is `last`, with an origin relative to the start of the new path. The
+    remainder of this path is the initial guess. The argument `cost` selects which energy is minimised.
 
     Raises PlanningError if an argument is not finite or outside its limits, or if no allowed horizon is
     feasible.

@@ -197,7 +197,7 @@ excess then stays below 1e-3."""
 
 IMPOSED_MARGIN = 2e-4
 """Relative margin by which an imposed limit is tightened, so that peaks between the imposed points keep the
-limit. Without the margin the exchange method converges slowly."""
+limit. Without this margin of the imposed limits, the exchange method converges slowly."""
 
 # NLopt 2.11 raises `nlopt.runtime_error`, and older versions raise Python's RuntimeError.
 _SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))

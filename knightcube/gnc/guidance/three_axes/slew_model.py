@@ -417,7 +417,7 @@ class BoresightEnd:
         return float(self.axis @ shown(q[None], self.direction[None])[0]) > 0.0
 
     def misses(self) -> tuple[FloatArray, FloatArray]:
-        """Return linear part (2, 4) and quadratic part (2, 4, 4) of the sines of the pointing error."""
+        """Return linear (2, 4) and quadratic part (2, 4, 4), in q, of the sines of the pointing error."""
         across = tangent_basis(self.axis)
         return np.zeros((2, 4)), shown_curvature(across, np.broadcast_to(self.direction, (2, 3)))
 

@@ -9,10 +9,10 @@ differences between the integrated states and the next nodes are removed with on
 (multiple shooting with the chord method). The energy of a slew is the heat produced in the coils, J. The
 planner is deterministic and has no side effects.
 
-The function `plan_order` plans a slew in orbit between two pointing targets, which starts within a window of
-time. The direction of the field during the slew changes the energy of the slew by a factor of up to ten along
-an orbit. Slews are therefore planned on a coarse grid for several start times, and the best slew is planned
-on the fine grid.
+The function `plan_order` plans a slew in orbit between two pointing targets, with a start inside a given time
+window. The direction of the field during the slew changes the energy of the slew by a factor of up to ten
+along an orbit. Slews are therefore planned on a coarse grid for several start times, and the best slew is
+planned on the fine grid.
 """
 
 from __future__ import annotations
@@ -286,7 +286,7 @@ class SlewOrder:
 
     Attributes:
         craft: model of the satellite, in body axes.
-        axes: body axes that the targets align.
+        axes: body axis that points to the targets, and body axis from which a roll is measured.
         camera: body axis (3,) that stays outside the exclusion cones.
         start: pointing target that is held until the slew begins; a free roll is taken as zero.
         goal: pointing target at the end; with a free roll, only the direction of the target counts.

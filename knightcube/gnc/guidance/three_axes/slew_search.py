@@ -580,7 +580,7 @@ too much from paths on the fine grid."""
 _WALKS = 1.8
 """Work, relative to the budget of a search, after which the continuation ends with the best path so far."""
 _MAXIMUM_TRIED = 16
-"""Largest number of guesses that are tried for one duration."""
+"""Largest number of initial guesses that are tried for one duration."""
 _LOOK = 8
 """Number of Newton steps from a guess before the constraint violation is checked for the first time."""
 _FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (20, 0.4))
@@ -595,7 +595,7 @@ _WIDENED = 4
 
 
 class SlewSearch:
-    """The search for the path of one slew task. The attribute `tried` counts the guesses."""
+    """The search for the path of one slew task. The attribute `tried` counts the initial guesses."""
 
     def __init__(self, task: SlewTask, coarse: int, budget: int) -> None:
         """Create a search on `coarse` intervals that ends when the work exceeds `budget`."""
