@@ -86,7 +86,7 @@ _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
 # Displacement (px), in iteration 1, of a star without effect on the motion that reselects the fit's pixels.
-# In later iterations, displacements of such faint or blended stars, often poorly known, are ignored.
+# Later iterations ignore the often poorly known displacements of stars without effect on the motion.
 _FAINT_DRIFT = 3.2
 # Change of the acceleration, relative to the rotation, after which the fit's pixels are reselected.
 _GROWN = 0.1
