@@ -2,12 +2,13 @@
 
 The line-of-sight filter uses measured directions only, without ranges. The filter state consists of the
 relative position y (a unit vector) and the relative velocity z, both divided by the present range. Without
-forces z is constant and y moves on a straight line. The model of the motion is therefore linear at any
-angular rate, and only the measurement model is nonlinear. After each step the state is divided by the length
-of y, so that y is a unit vector again. The filter state is the vector form of the modified polar coordinates
-of Aidala and Hammel (1983, IEEE Transactions on Automatic Control 28). The component of the velocity z across
-the line of sight is the angular rate v. The component of the velocity z along the line of sight is s = (range
-rate) / range. Without forces the angular acceleration is -2 s v.
+forces the velocity z is constant and the position y moves on a straight line. The model of the motion is
+therefore linear at any angular rate, and only the measurement model is nonlinear. After each step the filter
+state is divided by the length of the position y, so that y is a unit vector again. The filter state is the
+vector form of the modified polar coordinates of Aidala and Hammel (1983, IEEE Transactions on Automatic
+Control 28). The component of the velocity z across the line of sight is the angular rate v. The component of
+the velocity z along the line of sight is s = (range rate) / range. Without forces the angular acceleration is
+-2 s v.
 
 Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
 gradient gives the relative acceleration of object and observer, to first order in the distance divided by the

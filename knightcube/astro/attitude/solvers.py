@@ -14,9 +14,10 @@ The solvers are:
 - Davenport's q-method: The quaternion is the eigenvector of the largest eigenvalue of the matrix K
   (Michalski, section 3.4.2, eq. 69-75).
 
-- SVD: The attitude follows from the singular value decomposition of B (Michalski, eq. 80-84, corrected: the
-  determinants occur only once, in the middle). The reference is Markley, Attitude determination using vector
-  observations and the singular value decomposition, Journal of the Astronautical Sciences 36 (1988).
+- SVD: The attitude follows from the singular value decomposition of the profile matrix B (Michalski, eq.
+  80-84, corrected: the determinants occur only once, in the middle). The reference is Markley, Attitude
+  determination using vector observations and the singular value decomposition, Journal of the Astronautical
+  Sciences 36 (1988).
 
 - QUEST: The quaternion follows from the Gibbs vector (Michalski, section 3.4.4, eq. 78 and 79). The reference
   is Shuster and Oh, Three-axis attitude determination from vector observations, Journal of Guidance and
@@ -35,8 +36,9 @@ The solvers are:
 - Predictive filter: In each step the filter chooses the body rate that minimises the weighted residuals of
   the directions predicted to first order (Michalski, section 3.4.1, without a formula). For measurements at
   one time, the steps of the predictive filter converge to the solution of Wahba's problem. The predictive
-  filter uses residuals instead of B, which avoids rounding errors. The references are Crassidis and Markley,
-  Journal of Guidance, Control, and Dynamics 20 (1997), and Park and Crassidis, Navigation 53 (2006).
+  filter uses residuals instead of the profile matrix B, which avoids rounding errors. The references are
+  Crassidis and Markley, Journal of Guidance, Control, and Dynamics 20 (1997), and Park and Crassidis,
+  Navigation 53 (2006).
 
 - TRIAD: The attitude follows from the pair of directions whose covariance has the smallest trace, and the
   first direction of the pair is assumed to be exact (Michalski, section 3.4.5). The covariance of the TRIAD
@@ -89,7 +91,7 @@ In a narrow field of view, two of the three differences are of the order of one.
 
 
 def skew_part(profile: FloatArray) -> FloatArray:
-    """Return z (3,), the weighted sum of b x r, from the profile matrix B.
+    """Return z (3,), the weighted sum of the cross products b x r, from the profile matrix B.
 
     The formula is Michalski, eq. 72, in which the second component is corrected to B31 - B13.
     """
@@ -197,11 +199,12 @@ def quest(profile: FloatArray) -> FloatArray:
     """Return the optimal quaternion (4,) by QUEST, from the Gibbs vector M^-1 z.
 
     The matrix is M = l + t - S, with the largest eigenvalue l of K, the trace t of B and S = B + B^T. The
-    adjugate of M is used instead of the inverse, so that a rotation by 180 deg causes no division by zero. A
-    small determinant of M still causes a loss of accuracy. The reference frame is therefore rotated by 180
-    deg such that the determinant is largest and the remaining rotation smallest. The determinant of M is
-    proportional to the square of the quaternion's scalar part. The trace of the profile matrix B would be a
-    cheaper criterion, but does not depend on the roll angle in a narrow field of view.
+    adjugate of the matrix M is used instead of the inverse, so that a rotation by 180 deg causes no division
+    by zero. A small determinant of M still causes a loss of accuracy. The reference frame is therefore
+    rotated by 180 deg such that the determinant is largest and the remaining rotation smallest. The
+    determinant of the matrix M is proportional to the square of the quaternion's scalar part. The trace of
+    the profile matrix B would be a cheaper criterion, but does not depend on the roll angle in a narrow field
+    of view.
     """
 
     def gibbs_matrix(profile: FloatArray, eigenvalue: float) -> FloatArray:
@@ -224,8 +227,8 @@ def esoq2(profile: FloatArray) -> FloatArray:
     The axis is the null vector of the symmetric matrix (t - l)(B + B^T - t - l) - z z^T of rank 2, with the
     largest eigenvalue l of K and the trace t of B. The cross products of the matrix rows are parallel to the
     axis, and the longest cross product is the most accurate. The axis is undefined for small rotations. The
-    reference frame is therefore rotated by 180 deg such that the trace of B is smallest and the remaining
-    rotation largest.
+    reference frame is therefore rotated by 180 deg such that the trace of the profile matrix B is smallest
+    and the remaining rotation largest.
     """
 
     def from_axis(profile: FloatArray, eigenvalue: float) -> FloatArray:
@@ -244,8 +247,8 @@ def esoq2(profile: FloatArray) -> FloatArray:
 def foam(profile: FloatArray) -> FloatArray:
     """Return the optimal quaternion (4,) by FOAM, which has no singularity.
 
-    The attitude matrix is [(k + |B|^2) B + l adj(B)^T - B B^T B] / (k l - det B), with the largest eigenvalue
-    l of K and k = (l^2 - |B|^2)/2.
+    The attitude matrix is [(k + |B|^2) B + l adj(B)^T - B B^T B] / (k l - det B), with the profile matrix B,
+    the largest eigenvalue l of K and k = (l^2 - |B|^2)/2.
     """
 
     def from_attitude_matrix(profile: FloatArray, eigenvalue: float) -> FloatArray:

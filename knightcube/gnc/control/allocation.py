@@ -1,12 +1,12 @@
 """Allocation of a torque to the available coils, with the direction of the torque preserved.
 
 A dipole moment m causes the torque m x B, which has no component along the field B (Wertz 1978, section
-18.1). With three coils, the smallest dipole moment for a torque T normal to B is B x T / B^2. Any dipole
-moment m + lambda B causes the same torque. If one coil has failed, lambda is chosen so that the failed coil
-needs no current, which is possible unless the axis of the failed coil is normal to the field. A requested
-torque that the coils cannot produce is projected onto the space of torques that the coils can produce. If a
-current exceeds its limit, all currents are scaled by one factor, which preserves the direction of the torque
-(the idea of CMU's Argus flight software).
+18.1). With three coils, the smallest dipole moment for a torque T normal to B is B x T / B^2. For any number
+lambda, the dipole moment m + lambda B causes the same torque as m. If one coil has failed, lambda is chosen
+so that the failed coil needs no current, which is possible unless the axis of the failed coil is normal to
+the field. A requested torque that the coils cannot produce is projected onto the space of torques that the
+coils can produce. If a current exceeds its limit, all currents are scaled by one factor, which preserves the
+direction of the torque (the idea of CMU's Argus flight software).
 """
 
 from __future__ import annotations

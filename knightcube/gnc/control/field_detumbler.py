@@ -13,10 +13,10 @@ The coils are switched off again if no sample was accepted for `SILENT_PERIODS` 
 sensor may give only unusable fields.
 
 The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
-momentum obeys h' = m x B, in which inertia and attitude do not appear. By Pontryagin's principle, the dipole
-moment of minimum time has the maximum strength L and the direction of -B x y, where the costate y is a
-constant vector. The momentum can be reduced to at most r within the time T if and only if every vector y
-satisfies
+momentum h obeys h' = m x B, with the dipole moment m and the field B but without inertia and attitude. By
+Pontryagin's principle, the dipole moment of minimum time has the maximum strength L and the direction of -B x
+y, where the costate y is a constant vector. The momentum can be reduced to at most r within the time T if and
+only if every vector y satisfies
 
     h . y <= L integral of |B x y| over T + r |y|,
 
@@ -54,11 +54,12 @@ LIMIT_GAIN = 1.4
 """Assumed mean dipole moment of three coils in a rotating body, relative to the limit of one coil. With all
 coils saturated, the ratio would be 1.5."""
 STEEP = 12.0
-"""Gain of the dipole moment: a coil reaches the dipole limit where |B x y| exceeds the mean of |B x y|
-divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would then reverse
-the coils wherever B x y is small."""
+"""Gain of the dipole moment: a coil reaches the dipole limit where |B x y| (field B, costate y) exceeds its
+mean divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would then
+reverse the coils wherever B x y is small."""
 FLAT = 0.02
-"""Lower bound of |B x y|, relative to the largest |B x y|, that keeps the weights of the iteration finite."""
+"""Lower bound of |B x y| (field B, costate y), relative to the largest, for finite weights of the
+iteration."""
 FINENESS = 60
 """Resolution of the search for the minimum time, as the number of steps per minimum time."""
 

@@ -8,8 +8,8 @@ corrected) are
     e'  = cos(d) (theta_p' - w)
     e'' = cos(d) (theta_p'' - w') - sin(d) (theta_p' - w)^2,     d = theta_p - theta.
 
-The regulator demands e'' = v = -K (e', e), with K from the Riccati equation. The expression for e'' is solved
-for the angular acceleration w', from which the plant model gives the current.
+The regulator demands e'' = v = -K (e', e), with the gain K from the Riccati equation. The expression for the
+second derivative e'' is solved for the angular acceleration w', from which the plant model gives the current.
 
 The tracker extends the controller of Sease's thesis by two features, which the option `as_in_thesis` switches
 off. As the first feature, the estimated disturbance is fed forward, so that a constant torque causes no
@@ -192,9 +192,9 @@ class LqTracker:
 def lq_gains(state_weight: float, input_weight: float) -> tuple[float, float]:
     """Return the gains K_e' (1/s) and K_e (1/s^2) for Q = state_weight I and R = input_weight.
 
-    The plant e'' = v is a double integrator. The Riccati equation of this plant (Sease, eqs. (5.28) to
-    (5.32)) has the solution K_e = sqrt(w) and K_e' = sqrt(w + 2 K_e) with w = Q / R. A general solver would
-    take 0.2 s at the start.
+    The plant e'' = v, with the error e and the control v, is a double integrator. The Riccati equation of
+    this plant (Sease, eqs. (5.28) to (5.32)) has the solution K_e = sqrt(w) and K_e' = sqrt(w + 2 K_e) with w
+    = Q / R. A general solver would take 0.2 s at the start.
     """
     weight = state_weight / input_weight
     error_gain = math.sqrt(weight)

@@ -1,15 +1,15 @@
 """The planning job that computes a table of the pointing law for a pointing target.
 
 Field and torques are predicted along the orbit for a revolution and a quarter, because the gains at the end
-of the table depend on the following revolution. The table covers a third of a revolution. A passing object is
-near for minutes only, so tables for an object are short, have short steps, and are recomputed after each
-sighting.
+of the table depend on the following revolution. The pointing table covers a third of a revolution of the
+orbit. A passing object is near for minutes only, so tables for an object are short, have short steps, and are
+recomputed after each sighting.
 
 From a distant attitude, the body can approach the commanded attitude by a slew of minimum heat. The module
 `slew_plan` plans the slew with the disturbance torques that the attitude filter estimates. The planned dipole
 moments of the slew are used as feedforward. The gains come from linear-quadratic tracking along the slew and
-the following attitude law, and errors at the end of the slew have the highest cost. The table also contains
-the change of the dipole moment per change of the estimated torques.
+the following attitude law, and errors at the end of the slew have the highest cost. The pointing table also
+contains the change of the dipole moment per change of the estimated torques.
 """
 
 from __future__ import annotations

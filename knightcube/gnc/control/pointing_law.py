@@ -26,8 +26,8 @@ from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
 
 LARGEST_ROTATION = math.radians(20.0)
-"""Largest rotation error (rad) used by the law; larger errors are reduced to this error, because the law is
-linear."""
+"""Largest rotation error (rad) used by the law; larger errors are reduced to this error, because the pointing
+law is linear."""
 LARGEST_RATE = math.radians(1.0)
 """Largest rate error (rad/s) used by the law; larger rate errors are reduced to this error."""
 
@@ -57,7 +57,7 @@ class PointingLaw:
 
     @property
     def span(self) -> tuple[float, float]:
-        """First and last time of the table, s."""
+        """First and last time of the pointing table, s."""
         times = self._table.path.times
         return float(times[0]), float(times[-1])
 

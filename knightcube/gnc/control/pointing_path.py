@@ -156,8 +156,9 @@ def sweep(
 ) -> tuple[FloatArray, FloatArray, CostToGo]:
     """Return the feedback gains K (n, controls, 6), the affine parts k, and the cost-to-go at the start.
 
-    The affine part k has the shape (n, controls, columns). The affine part of the error model is `affine` (n,
-    6, columns), and `end` is the cost-to-go after the last step. The computation takes 0.1 ms per step.
+    The affine part k of the controls has the shape (n, controls, columns). The affine part of the error model
+    is `affine` (n, 6, columns), and `end` is the cost-to-go after the last step. The computation takes 0.1 ms
+    per step.
     """
     (count, controls), columns = cost.control.shape, affine.shape[2]
     gain, steady = np.empty((count, controls, 6)), np.empty((count, controls, columns))
@@ -358,8 +359,8 @@ class PlannedMotion:
 class MotionGains:
     """Feedback gains K (n, 4, 6) about a motion, and affine parts k (n, 4, columns) of the control.
 
-    The first column of k is the change of the controls that improves the motion. Each further column of k
-    compensates one disturbance torque.
+    The first column of the affine parts is the change of the controls that improves the motion. Each further
+    column of the affine parts compensates one disturbance torque.
     """
 
     gain: FloatArray

@@ -131,7 +131,7 @@ def rotation_axis(
 
     The sign of the axis is arbitrary. Each pair of streaks defines an axis. The axis with which most streaks
     agree is refined by least squares over the streaks that agree. Up to about half of the streaks may be
-    outliers. The result is deterministic.
+    outliers. No random numbers are used.
 
     Args:
         first: (n, 3) unit vectors to one end of each streak, strongest streak first.

@@ -404,7 +404,7 @@ def _sample_rays(
 ) -> tuple[FloatArray, BoolArray]:
     """Return the directions (m, 3) of the sampled pixels on scan lines, and which of them the lens images.
 
-    The directions are cached, because they are the same in successive frames.
+    The directions are cached, because successive frames have the same directions.
     """
     x, y = np.meshgrid(columns, _sample_places(camera.rows), indexing="ij")
     other_y, other_x = np.meshgrid(rows, _sample_places(camera.columns), indexing="ij")

@@ -58,7 +58,7 @@ class Ellipsoid:
     polar: float
 
     def stretching(self, height: float = 0.0) -> FloatArray:
-        """Return the symmetric matrix L (3, 3) for which |L x| = 1 on the ellipsoid raised by `height` m."""
+        """Return the symmetric L (3, 3) with |L x| = 1 for points x on the ellipsoid raised by `height` m."""
         return self._along_axes(1.0 / (self.equatorial + height), 1.0 / (self.polar + height))
 
     def shape(self, height: float = 0.0) -> FloatArray:

@@ -12,9 +12,9 @@ If no limb passes all tests, the image is refused and the reason is stated.
 
 The function `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four
 cameras). The nadirs of different cameras must agree. An image that gave no nadir, or several nadirs, is
-searched again with the nadir of the other cameras as prior knowledge. One limb is then fitted to the limb
-points of all images. The unknown height of the air displaces every limb outwards, which displaces the nadir
-only if a single side of the limb is visible.
+searched again with the nadir of the other cameras as prior knowledge. One common limb is then fitted to the
+limb points of all images. The unknown height of the air displaces every limb outwards, which displaces the
+nadir only if a single side of the limb is visible.
 """
 
 from __future__ import annotations
@@ -172,9 +172,9 @@ def find_nadir(
 ) -> HorizonSolution:
     """Return the nadir from the Earth's limb in an image, or the reason why no nadir is found.
 
-    The first search reads few columns and rows. If the first search finds a horizon with few edges, more
-    columns and rows are read near this horizon. If the first search finds edges but no horizon, more columns
-    and rows are read in the whole image.
+    The first search reads few columns and rows of the image. If the first search finds a horizon with few
+    edges, more columns and rows are read near this horizon. If the first search finds edges but no horizon,
+    more columns and rows are read in the whole image.
 
     Args:
         image: pixel values (rows, columns) of any integer or floating type; a larger value is brighter.

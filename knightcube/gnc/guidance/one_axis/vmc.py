@@ -52,9 +52,10 @@ ProgramAt = Callable[[float], PathProgram]
 this horizon."""
 
 SHORTEST_COST = 7.0
-"""Time cost, in units of R Imax^2, with which the shortest horizon is found. An infinite time cost would give
-the bang-bang path, whose energy is up to 1 % above the optimum for the same horizon. With SHORTEST_COST, the
-horizon is about 0.3 % longer than the shortest horizon, and the energy is within 0.25 % of the optimum."""
+"""Time cost, relative to the largest coil power R Imax^2, with which the shortest horizon is found. An
+infinite time cost would give the bang-bang path, whose energy is up to 1 % above the optimum for the same
+horizon. With SHORTEST_COST, the horizon is about 0.3 % longer than the shortest horizon, and the energy is
+within 0.25 % of the optimum."""
 
 _SHORTEST_STRETCH = 1.015
 """Largest factor by which a search with SHORTEST_COST may stretch a feasible requested horizon."""

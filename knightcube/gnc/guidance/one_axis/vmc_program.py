@@ -3,8 +3,8 @@
 A path has the values q2 = q_r + v (q_p - q_r) on N nodes, where q_p is the prey path and q_r the reference
 point (Sease, eqs. (5.10) to (5.12)). A path is the polynomial of degree N - 1 through the values on the
 nodes, so q2', q2'' and the current are exact between nodes too. The path control parameter v is 1 at both
-ends. The parameters v_2 and v_(N-1) follow from the boundary rates by q' = D q at the ends (Sease, eq.
-(5.11), corrected). N - 4 path control parameters are free.
+ends. The path control parameters v_2 and v_(N-1) follow from the boundary rates by q' = D q, with the
+differentiation matrix D (Sease, eq. (5.11), corrected). N - 4 path control parameters are free.
 
 The prey path is an affine function of the horizon T, and for a fixed prey path the path is an affine function
 of v - 1. Paths are therefore parametrised as prey(T) + M y with a matrix M and parameters y. Each column of

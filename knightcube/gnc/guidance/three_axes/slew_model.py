@@ -133,7 +133,7 @@ class SlewDynamics:
     """
 
     def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
-        """Store the environment at n times, with e scaled by the root of the gravity gradient."""
+        """Store the environment; scale the direction of the position by the root of the gravity gradient."""
         self._residual = craft.residual / unit
         down, strength = around.gradient()
         vectors = np.stack(
@@ -353,8 +353,8 @@ class Cone:
 class ConeConstraints:
     """Exclusion cones at n times, as inequalities g >= 0 for the attitude.
 
-    The value of g is the cosine of the cone's half angle minus the cosine of the angle between body axis and
-    direction. Each inequality is a quadratic form of the attitude quaternion.
+    The constraint value g is the cosine of the cone's half angle minus the cosine of the angle between body
+    axis and direction. Each inequality is a quadratic form of the attitude quaternion.
     """
 
     def __init__(self, cones: tuple[Cone, ...], margin: FloatArray, times: FloatArray) -> None:

@@ -432,7 +432,7 @@ class HorizonContinuation:
     def __init__(self, task: SlewTask, solver: SlewSolver, budget: float) -> None:
         """Create a continuation that starts no further step when the solver's `work` exceeds `budget`."""
         self._task, self._solver, self._budget = task, solver, budget
-        # Paths on the coarse grid from which no path on the fine grid was found.
+        # Coarse paths from which no path on the fine grid was found.
         self._lost: set[tuple[float, float, float]] = set()
 
     def within(self, start: SolvedPath) -> SolvedPath | None:
@@ -598,7 +598,7 @@ class SlewSearch:
     """The search for the path of one slew task. The attribute `tried` counts the initial guesses."""
 
     def __init__(self, task: SlewTask, coarse: int, budget: int) -> None:
-        """Create a search on `coarse` intervals that ends when the work exceeds `budget`."""
+        """Create a search with guesses on `coarse` intervals that ends when the work exceeds `budget`."""
         self._task, self._budget = task, budget
         self.solver = SlewSolver(task)
         self._walker = HorizonContinuation(task, self.solver, _WALKS * budget)
