@@ -99,10 +99,9 @@ def open_flight(
 ) -> tuple[FlightLoop, FlightLog]:
     """Open logs, devices and workers, and return the loop, which is ready to run, and the flight log.
 
-    The stack closes everything in the opposite order, with the coils at zero. Raises DeviceError for a device
-    that does not answer, unless the flight is `patient`: then it waits in BOOT for its devices, and for a
-    disk that cannot be written. The folders `earlier` of earlier runs serve to detect that the stored state
-    is outdated.
+    The stack closes everything in the opposite order, with the coils at zero. A `patient` flight waits in
+    BOOT for missing devices and for a disk that cannot be written; any other flight raises DeviceError for a
+    missing device. The folders `earlier` of earlier runs serve to detect that the stored state is outdated.
     """
     flight_log = open_log(folder, "flight", rig, config, stack, patient)
     performance_log = open_log(folder, "performance", rig, config, stack, patient)

@@ -243,7 +243,7 @@ class FlownRelease:
             self._done = True
 
     def end(self) -> None:
-        """Reset the count of starts of the release, because it ended by itself."""
+        """Reset the count of starts of the release, because its flight ended in order."""
         if self._path is not None:
             with suppress(OSError):
                 self._write(_proven(self._path))

@@ -599,7 +599,7 @@ def open_unix(path: Path) -> DatagramChannel:
 
 
 def _bound_unix(path: Path) -> socket.socket:
-    """Return a UNIX datagram socket bound to `path`. Raises OSError if it cannot be bound."""
+    """Return a UNIX datagram socket bound to `path`. Raises OSError if the socket cannot be bound."""
     bound = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
         with contextlib.suppress(FileNotFoundError):

@@ -4,9 +4,9 @@ A telecommand frame has a header of 5 bytes, one space packet and a CRC of 2 byt
 of type BD (bypass, data), which the frame layer neither acknowledges nor retransmits, and have no segment
 header. Telemetry frames have a fixed length and contain consecutive space packets. The telemetry frame header
 of 6 bytes contains the first header pointer: the offset of the first packet that begins in the frame. After a
-lost frame, the receiver finds the next packet by this pointer. An incomplete telemetry frame is filled up
-with an idle packet. Telecommand and telemetry frames carry the security header and trailer of CCSDS 355.0-B
-(`flight.link.security`).
+lost frame, the receiver finds the next packet by the first header pointer. An incomplete telemetry frame is
+filled up with an idle packet. Telecommand and telemetry frames carry the security header and trailer of CCSDS
+355.0-B (`flight.link.security`).
 
 In a byte stream (serial line, TCP) each frame follows the attached sync marker 1ACFFC1D (CCSDS 131.0-B), in
 both directions. CLTUs are not created by this software. A radio that transmits CLTUs must create the CLTUs.

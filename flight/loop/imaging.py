@@ -320,7 +320,7 @@ _ROWS = 32
 _FRAMES = 4
 """Number of frame buffers of a camera driver."""
 _LEAST_CHANGES = 0.125
-"""Minimum fraction of pixels in an image row with noise that differ from the next pixel."""
+"""Minimum fraction of pixels that differ from the next pixel, in an image row that contains noise."""
 
 
 class RepeatedRows:

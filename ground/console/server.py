@@ -106,7 +106,7 @@ class Console:
         self.trouble = ""
         newest_ns = self.history.span_ns[1]
         self.history.append(packets)
-        # The packets of one time may be split over two reads, so only the previous read is complete now.
+        # Packets of one time may arrive in two reads, so the page shows only times up to the previous read.
         more = newest_ns > 0 and any(len(rows) for rows in packets.values())
         self.settled_ns = newest_ns if more else self.history.span_ns[1]
         if any(len(rows) for name, rows in packets.items() if name not in _OF_THE_LINK):

@@ -31,7 +31,7 @@ _SILENCE_NS = 1_000_000_000
 _SURE_STUCK = 3
 """Number of consecutive reads with a set ready flag after which the flag is considered stuck."""
 _REACH_NS = 300_000_000
-"""Largest age (ns) of the start of a conversion at the time of reading.
+"""Longest time (ns) from the start of a conversion to the reading of its result.
 
 A conversion of both voltages takes up to 150 ms (136 ms + 10 %), and its result is read within another 150
 ms.

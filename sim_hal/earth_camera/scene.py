@@ -92,9 +92,9 @@ class Atmosphere:
         """Return the fraction of sunlight scattered along lines of sight, before the phase function.
 
         `depth` (...) is the optical depth along the line of sight. `bottom` (...) is the air density at the
-        line's lowest point, relative to the ground. `sunward` (...) is the optical depth from the ground
-        below that point towards the Sun. The scattered light comes from the air above the point where the
-        optical depth along the line reaches one. The transmission of sunlight is averaged over the
+        line's lowest point, relative to the ground. `sunward` (...) is the optical depth towards the Sun,
+        from the ground below the line of sight. The scattered light comes from the air above the point where
+        the optical depth along the line reaches one. The transmission of sunlight is averaged over the
         scattering air.
         """
         x = np.maximum(sunward * bottom / (1.0 + depth), 1e-6)

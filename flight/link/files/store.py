@@ -173,7 +173,7 @@ class Store:
         return self._path(record).with_suffix(".part")
 
     def place(self, record: Incoming) -> None:
-        """Move a completely received file to its final path. Raises FileError if it cannot be moved."""
+        """Move a completely received file to its final path. Raises FileError if the file cannot be moved."""
         assert record.name is not None
         target = self.received / record.name
         try:

@@ -143,7 +143,7 @@ class SegmentStore:
             self._file.close()
 
     def _open_next(self) -> None:
-        """Begin the next segment file. If this fails, the current file remains in use."""
+        """Begin the next segment file. If no file can be created, the current file remains in use."""
         path = self._folder / f"{self._stem}-{self._number + 1:04d}{SUFFIX}"
         self._file = self._opener(path)
         self._path = path
