@@ -126,9 +126,9 @@ def _characteristic(profile: FloatArray) -> tuple[float, float, float]:
 
 
 def largest_eigenvalue(profile: FloatArray) -> float:
-    """Return the largest root of the characteristic polynomial of K.
+    """Return the largest root of the characteristic polynomial of Davenport's matrix K.
 
-    Newton's method starts from 1, the sum of the weights, which is an upper bound of all roots. The
+    Newton's method starts from the sum of the weights, 1, which is an upper bound of all roots. The
     polynomial is convex above the largest root, so that the iteration decreases monotonically towards this
     root. Newton's iteration ends when rounding prevents a further decrease.
     """

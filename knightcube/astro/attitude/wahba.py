@@ -8,7 +8,7 @@ give the uniform weights 1/N of Sease 2013.
 Solvers based on the profile matrix B lose accuracy by rounding. Two directions with a separation of d rad
 change B only by terms of the order d^2, so that the error of the quaternion is the rounding error divided by
 d^2. The function `refine` restores the accuracy from the residuals of the directions, which depend linearly
-on d.
+on the separation d.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _MAXIMUM_STEPS = 100
 _CONVERGED = 1e-11
 """Length (rad) of a Newton step below which the iteration ends.
 
-The remaining error is smaller, because each step is at most a tenth of the previous step.
+The error after the last Newton step is smaller, because each step is at most a tenth of the previous step.
 """
 _ROUNDING = 3e-15
 """Several times the rounding error of the residuals, which limits the smallest meaningful Newton step."""
@@ -300,9 +300,9 @@ def _check_unit_length(both: FloatArray) -> None:
 def _cofactors(gram: FloatArray, n: int, name: str) -> tuple[Rows, float]:
     """Return adjugate and determinant of the information matrix 1 - `gram` (3, 3) for normalised weights.
 
-    The eigenvalues of the information matrix add up to 2 and are at most 1. The determinant is therefore
-    within a factor of two of the smallest eigenvalue. Raises AttitudeError if the smallest eigenvalue is
-    below the rounding error.
+    The eigenvalues of the information matrix add up to 2 and are at most 1. The determinant of the
+    information matrix is therefore within a factor of two of the smallest eigenvalue. Raises AttitudeError if
+    the smallest eigenvalue is below the rounding error.
     """
     rows = (_EYE - gram).tolist()
     cofactors = adjugate(rows)

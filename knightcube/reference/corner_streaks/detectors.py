@@ -3,13 +3,13 @@
 The Harris response and the structure tensor are computed by `knightcube.vision.objects.streak_ends`.
 
 The detector of Trajkovic and Hedley (Fast corner detection, Image and Vision Computing 16, 1998) uses the
-diameters of a small circle around a pixel. At a corner the intensity changes along every diameter. The
-cornerness is therefore the minimum, over all directions, of the sum of the squared intensity changes from the
-centre to both ends of a diameter. Between two neighbouring diameters the intensity is interpolated linearly
-with a parameter t from 0 to 1. With the squared changes r and r' along two neighbouring diameters, the
-squared change between the diameters is A t^2 + 2 B t + C with C = r and A = r' - r - 2B. The coefficient B is
-a sum over the two pairs of neighbouring ends of the two diameters. The coefficient B1 printed in Sease, eq.
-3.12, is corrected, because it combines the wrong pairs of ends.
+diameters of a small circle around a pixel. At a corner the intensity changes along every diameter of the
+circle. The cornerness is therefore the minimum, over all directions, of the sum of the squared intensity
+changes from the centre to both ends of a diameter. Between two neighbouring diameters the intensity is
+interpolated linearly with a parameter t from 0 to 1. With the squared changes r and r' along two neighbouring
+diameters, the squared change between the diameters is A t^2 + 2 B t + C with C = r and A = r' - r - 2B. The
+coefficient B is a sum over the two pairs of neighbouring ends of the two diameters. The coefficient B1
+printed in Sease, eq. 3.12, is corrected, because it combines the wrong pairs of ends.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ direction that is most nearly perpendicular to all chords v2 - v1. The sign of a
 order of the ends (Sease, eq. 3.17-3.19, corrected). The computation with unit vectors has no singularity,
 unlike a computation with the projected centre of rotation. OLAE computes the rotation, and a median-based
 scale of the residuals rejects outliers. The "Combined Indicator" of Sease uses the standard deviation of the
-residuals instead, which outliers increase. A single frame cannot distinguish omega from -omega, so that a
-prior rate must decide.
+residuals, which outliers increase. A single frame cannot distinguish omega from -omega, so that a prior rate
+must decide.
 """
 
 from __future__ import annotations
@@ -129,9 +129,9 @@ def rotation_axis(
 ) -> tuple[FloatArray, BoolArray]:
     """Return the rotation axis (3,) with which most streaks agree, and flags (n,) of the agreeing streaks.
 
-    The sign of the axis is arbitrary. Each pair of streaks defines an axis. The axis with which most streaks
-    agree is refined by least squares over the streaks that agree. Up to about half of the streaks may be
-    outliers. No random numbers are used.
+    The sign of the rotation axis is arbitrary. Each pair of streaks defines a rotation axis. The axis with
+    which most streaks agree is refined by least squares over the streaks that agree. Up to about half of the
+    streaks may be outliers. No random numbers are used.
 
     Args:
         first: (n, 3) unit vectors to one end of each streak, strongest streak first.

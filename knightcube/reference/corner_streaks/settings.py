@@ -54,8 +54,8 @@ class StreakSettings(EndpointSettings):
 _OF_DETECTOR: dict[DetectorName, dict[str, Any]] = {
     # The endpoint biases for point spreads of 0.7 and 1.5 px are -0.14 and 0.40 px with Harris's detector.
     # The biases for point spreads of 0.7 and 1.5 px are 0.34 and 0.71 px with the minimum eigenvalue.
-    # The biases for point spreads of 0.7 and 1.5 px are 1.23 and 1.68 px with Trajkovic-4.
-    # The biases for point spreads of 0.7 and 1.5 px are 0.93 and 1.24 px with Trajkovic-8.
+    # The endpoint biases for point spreads of 0.7 and 1.5 px are 1.23 and 1.68 px with Trajkovic-4.
+    # The endpoint biases for point spreads of 0.7 and 1.5 px are 0.93 and 1.24 px with Trajkovic-8.
     "harris": {},
     # The minimum eigenvalue is proportional to brightness^2, and Harris's response to brightness^4.
     "minimum-eigenvalue": {"peak_relative": 0.2, "intensity_half_width": 4, "endpoint_bias": 0.45},

@@ -1,11 +1,12 @@
 """Attitudes at the start and end of an exposure, and the rate between them (Sease, eq. 3.22-3.29).
 
 The stars are identified by the midpoints of the streaks, which do not depend on a constant bias of the ends.
-The first ends then give the attitude at the start of the exposure, and the second ends the attitude at the
-end, each by ESOQ2. The mean rate is the rotation between the two attitudes divided by the exposure time. A
-fixed star moves as v' = -omega x v, so that Delta = A_end A_start^T = exp(-[omega T x]), and the rotation
-axis follows from Delta^T - Delta (Sease, eq. 3.24, 3.26 and 3.27, corrected). The angle is computed from the
-quaternion, because the arc cosine of the trace (Sease, eq. 3.25) is inaccurate for small angles.
+The ESOQ2 solver computes the attitude at the start of the exposure from the first ends of the streaks, and
+the attitude at the end from the second ends. The mean rate is the rotation between the two attitudes divided
+by the exposure time. A fixed star moves as v' = -omega x v, so that Delta = A_end A_start^T = exp(-[omega T
+x]), and the rotation axis follows from Delta^T - Delta (Sease, eq. 3.24, 3.26 and 3.27, corrected). The angle
+is computed from the quaternion, because the arc cosine of the trace (Sease, eq. 3.25) is inaccurate for small
+angles.
 """
 
 from __future__ import annotations

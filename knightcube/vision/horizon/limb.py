@@ -394,8 +394,8 @@ _SHARPEST, _BROADEST, _WIDTHS = 500.0, 50e3, 61
 def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
     """Return brightness of air and of ground, and their slopes per m, at tangent heights, as (4, n, k).
 
-    The unit of brightness is that of sunlit air of infinite optical depth, and of ground without air. The
-    blur is rounded to the nearest blur of the table; neighbouring blurs of the table differ by 8 %.
+    Brightness is relative to sunlit air of infinite optical depth, and to ground without air. The blur is
+    rounded to the nearest blur of the table; neighbouring blurs of the table differ by 8 %.
 
     Args:
         heights: tangent heights of k samples along n scan lines (n, k), m.
@@ -460,7 +460,7 @@ _LEAST_SAMPLES = 7
 def fit_profiles(
     profiles: FloatArray, steps: FloatArray, metres: FloatArray, blur: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return limb positions on n scan lines, px, their standard deviations, px, and a mask of valid ones.
+    """Return limb positions on n scan lines, px, standard deviations, px, and a mask of valid positions.
 
     Args:
         profiles: brightness along n scan lines (n, m), or NaN for missing samples.

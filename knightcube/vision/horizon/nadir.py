@@ -11,7 +11,7 @@ one limb passes all tests, this limb gives the nadir. If several limbs pass all 
 If no limb passes all tests, the image is refused and the reason is stated.
 
 The function `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four
-cameras). The nadirs of different cameras must agree. An image that gave no nadir, or several nadirs, is
+cameras). The nadirs found by different cameras must agree. An image that gave no nadir, or several nadirs, is
 searched again with the nadir of the other cameras as prior knowledge. One common limb is then fitted to the
 limb points of all images. The unknown height of the air displaces every limb outwards, which displaces the
 nadir only if a single side of the limb is visible.

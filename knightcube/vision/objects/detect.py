@@ -18,9 +18,9 @@ alone explain the pixels (`star_light`). Regions with more than two corners (pea
 which Sease discards, may be stars or an object that crosses a star. Bright points in an image whose stars are
 streaks are objects that the camera tracks (Sease, Figure 4.5). Saturated regions, regions with large
 indicators, and regions in which objects and stars may merge are searched again after the stars are
-subtracted. The search needs only the rotation of the camera during the exposure. The maximum-likelihood
-estimate of the rotation from the streaks is more accurate than an estimate from the streak ends, and succeeds
-in more images.
+subtracted. The search for objects needs only the rotation of the camera during the exposure. The
+maximum-likelihood estimate of the rotation from the streaks is more accurate than an estimate from the streak
+ends, and succeeds in more images.
 """
 
 from __future__ import annotations
