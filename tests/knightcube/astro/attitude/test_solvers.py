@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -57,6 +57,7 @@ def _least_eigenvalue(seen: Sight) -> float:
     sigma=st.floats(1e-7, 1e-3),
     angle=st.one_of(st.none(), st.floats(0.0, 1e-6), st.floats(np.pi - 1e-6, np.pi)),
 )
+@example(seed=9904, n=2, half_field=0.02, sigma=1e-7, angle=None)
 def test_all_optimal_solvers_agree_to_a_tenth_of_a_nanoradian(
     seed: int, n: int, half_field: float | None, sigma: float, angle: float | None
 ) -> None:
@@ -66,8 +67,8 @@ def test_all_optimal_solvers_agree_to_a_tenth_of_a_nanoradian(
     fixes = {name: _by(name, seen) for name in OPTIMAL}
     for fix in fixes.values():
         assert angle_between(fix.quaternion, fixes[DEFAULT].quaternion) < 1e-10
-        # Rounding of the directions, 1e-16, is divided by sigma in each residual.
-        assert fix.loss == pytest.approx(fixes[DEFAULT].loss, rel=1e-6, abs=1e-9 + 1e-14 / sigma)
+        # Attitudes of different solvers differ by some 1e-15 rad, which changes the loss by this over sigma.
+        assert fix.loss == pytest.approx(fixes[DEFAULT].loss, rel=1e-6, abs=1e-9 + 3e-15 / sigma)
         assert fix.quaternion[3] >= 0.0
         assert np.linalg.norm(fix.quaternion) == pytest.approx(1.0, abs=1e-14)
 
