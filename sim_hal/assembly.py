@@ -22,8 +22,10 @@ from hal.drivers.ads1115 import StringWiring
 from hal.drivers.coils import CoilSettings, wirings
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
+from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.vision.camera.lens import Lens, Pinhole
 from sim_hal.clock import EmulatedDevice, FaultTimeline, SerialEnd, TimedSimulation
+from sim_hal.description_errors import NO_ERRORS, description_errors
 from sim_hal.emulators.camera import EmulatedCamera, Expose, no_objects
 from sim_hal.emulators.coil_circuit import CoilCircuit, EmulatedIna219
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
@@ -134,7 +136,11 @@ def assemble(
             from sim_hal.star_camera.objects import from_orbit  # noqa: PLC0415 - see above
 
             make = from_orbit(make, world, config.camera)
-        camera = emulated_camera(config.camera, section.sky, world.motion, make, now_ns, objects)
+        misaligned = from_rotation_vector(description_errors(config, section).camera)
+        mounting = multiply(np.array(config.camera.mounting), misaligned)
+        camera = emulated_camera(
+            config.camera, section.sky, world.motion, make, now_ns, objects, mounting=mounting
+        )
     orbit = OrbitDevices()
     if config.gps or config.solar_strings or config.wide_cameras:
         orbit = assemble_orbit(config, section, world, now_ns, gps_line, expose_wide)
@@ -192,14 +198,16 @@ def _unit(
     now_ns: int,
 ) -> Vn100Emulator:
     """Return the inertial unit, whose magnetometer has a bias and also measures the field of the coils."""
-    coil_field, bias = np.array(section.coil_field), np.array(section.imu.field_bias)
+    errors = description_errors(config, section)
+    coil_field, bias = np.array(section.coil_field), np.array(section.imu.field_bias) + errors.field_bias
     sense = world.motion
-    if coil_field.any() or bias.any():
+    if coil_field.any() or bias.any() or errors is not NO_ERRORS:
 
         def sense(time_ns: int) -> BodyMotion:
             # The unit averages its magnetometer over one control period, so the mean coil currents are used.
             motion = world.motion(time_ns)
-            return replace(motion, field_body=motion.field_body + coil_field @ circuit.currents() + bias)
+            field = errors.field @ (motion.field_body + coil_field @ circuit.currents()) + bias
+            return replace(motion, field_body=field, rate=errors.gyro @ motion.rate)
 
     imu = section.imu
     profile = NoiseProfile() if imu.profile == "bounds" else PROFILES[imu.profile]
@@ -229,11 +237,14 @@ def emulated_camera(
     expose: Expose,
     now_ns: Callable[[], int],
     objects: SkyObjects | None,
+    *,
+    mounting: FloatArray | None = None,
 ) -> EmulatedCamera:
-    """Return the star camera on a body that moves as the function `motion` describes."""
+    """Return the star camera on a moving body; `mounting` (4,) is by default that of the configuration."""
+    mounting = np.array(camera.mounting) if mounting is None else mounting
     readout_ns, scan_ns = round(sky.readout * 1e9), round(sky.line_time * camera.rows * 1e9)
     tracks = no_objects if objects is None else objects.tracks
-    return EmulatedCamera(motion, expose, now_ns, readout_ns, np.array(camera.mounting), scan_ns, tracks)
+    return EmulatedCamera(motion, expose, now_ns, readout_ns, mounting, scan_ns, tracks)
 
 
 def line_generator(seed: int, *line: int) -> np.random.Generator:
@@ -337,15 +348,28 @@ def assemble_orbit(
         )
         wired = [StringWiring(one.address, one.channel, one.volt_per_ampere) for one in strings]
         cells = EmulatedSolarCells(orbiting(world, "solar_strings"), model, wired, now_ns, currents)
+    misaligned = description_errors(config, section).horizon
     wide = tuple(
-        _horizon_camera(camera, (section.seed, _ORBIT_STREAM, index), world, now_ns, expose or inline_wide)
+        _horizon_camera(
+            camera,
+            (section.seed, _ORBIT_STREAM, index),
+            world,
+            now_ns,
+            expose or inline_wide,
+            misaligned[index] if len(misaligned) else np.zeros(3),
+        )
         for index, camera in enumerate(config.wide_cameras)
     )
     return OrbitDevices(gps, cells, wide)
 
 
 def _horizon_camera(
-    camera: WideCamera, seed: tuple[int, ...], world: World, now_ns: Callable[[], int], expose: ExposeWide
+    camera: WideCamera,
+    seed: tuple[int, ...],
+    world: World,
+    now_ns: Callable[[], int],
+    expose: ExposeWide,
+    misaligned: FloatArray,
 ) -> EmulatedCamera:
     from sim_hal.earth_camera import EarthScene  # noqa: PLC0415 - see above
     from sim_hal.worlds.orbit import sun_position  # noqa: PLC0415 - see above
@@ -361,7 +385,8 @@ def _horizon_camera(
         )
         return expose(model, scene, (*seed, sequence))
 
-    return EmulatedCamera(world.motion, exposed, now_ns, READOUT_NS, np.array(camera.mounting))
+    mounting = multiply(np.array(camera.mounting), from_rotation_vector(misaligned))
+    return EmulatedCamera(world.motion, exposed, now_ns, READOUT_NS, mounting)
 
 
 def wide_model(camera: WideCamera, seed: int = 0) -> EarthCameraModel:

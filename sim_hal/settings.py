@@ -85,12 +85,17 @@ class Disturbances(Section, frozen=True, kw_only=True):
 
 
 class FreeBodySection(Section, frozen=True, kw_only=True):
-    """The section `free_body`; `craft` is a key of `sim_hal.worlds.free_body.CRAFTS` or a `CraftSection`."""
+    """The section `free_body`; `craft` is a key of `sim_hal.worlds.free_body.CRAFTS` or a `CraftSection`.
+
+    `errors` is the largest error of the description of body, coils and sensors in the flight configuration,
+    as a multiple of the accuracies that the configuration states (`sim_hal.description_errors`).
+    """
 
     craft: Literal["knightcube", "cubesat_3u"] | CraftSection = "knightcube"
     orbit: OrbitSection = OrbitSection()
     release: TipOff = TipOff()
     disturbances: Disturbances = Disturbances()
+    errors: Annotated[float, Meta(ge=0.0, le=3.0)] = 1.0
 
 
 class Release(Section, frozen=True, kw_only=True):

@@ -179,7 +179,7 @@ class FrameMeasurer:
         turn = self._body_to_camera.T
         covariance = turn @ fix.covariance @ turn.T + self._off_middle(frame, found.motion)
         quaternion = multiply(conjugate(self._settings.mounting), fix.quaternion)
-        return AttitudeMeasurement(middle_ns(frame), quaternion, covariance)
+        return AttitudeMeasurement(middle_ns(frame), quaternion, covariance, by_stars=True)
 
     def rate_in_body(self, found: FrameMotion | None) -> tuple[FloatArray, FloatArray]:
         """Return the rate (3,) and its covariance (3, 3) in body axes, or NaN without a rate."""

@@ -78,7 +78,7 @@ class StatePart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Learned(StatePart, frozen=True):
     """Parameters learned in flight: `values` (n,) and the rows of their covariance (n, n), in SI units."""
 
-    values: Annotated[tuple[float, ...], Meta(min_length=1, max_length=16)]
+    values: Annotated[tuple[float, ...], Meta(min_length=1, max_length=64)]
     covariance: tuple[tuple[float, ...], ...]
 
     @staticmethod

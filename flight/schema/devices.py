@@ -30,6 +30,20 @@ _KNOWN = CameraKnowledge()
 ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
 
 
+class UnitAccuracy(Section, frozen=True, kw_only=True):
+    """Largest errors of the inertial unit, within which the true errors are assumed uniform.
+
+    `gyro_scale` is the relative error of the scale factor of each gyro, `gyro_alignment` (rad) the
+    misalignment of each gyro toward each other axis. `field_matrix` is the error of each element of the
+    magnetometer's matrix, and `field_bias` (T) the bias of each axis.
+    """
+
+    gyro_scale: Annotated[float, Meta(ge=0.0, le=0.1)] = 3e-3
+    gyro_alignment: Annotated[float, Meta(ge=0.0, le=0.1)] = 2e-3
+    field_matrix: Annotated[float, Meta(ge=0.0, le=0.2)] = 0.01
+    field_bias: NotNegative = 5e-7
+
+
 class InertialUnitSection(Section, frozen=True, kw_only=True):
     """The inertial unit, a VN-100, and its serial line.
 
@@ -46,6 +60,7 @@ class InertialUnitSection(Section, frozen=True, kw_only=True):
     max_age: Positive = 0.1
     angle_noise: Positive = 2.02e-3
     rate_noise: Positive = 1.01e-4
+    accuracy: UnitAccuracy = UnitAccuracy()
 
 
 class Coils(Section, frozen=True, kw_only=True):
@@ -91,13 +106,15 @@ class CameraAccuracy(Section, frozen=True, kw_only=True):
     The error `focal_length` is relative, `centre` is in px along x and y, `distortion` is the displacement of
     an image corner relative to its distance from the centre, and `line_time` is in s. A zero means that the
     value is exact, as in an emulated camera. Without `accuracy.line_time`, the `line_time` of the camera
-    section is considered exact.
+    section is considered exact. The angle `mounting_deg` is the largest rotation of the
+    camera about each body axis from its `mounting`; the true rotation is assumed to be uniform within it.
     """
 
     focal_length: NotNegative = _KNOWN.focal_length
     centre: NotNegative = _KNOWN.centre
     distortion: NotNegative = _KNOWN.distortion
     line_time: NotNegative | None = _KNOWN.line_time
+    mounting_deg: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.1
 
 
 class StarTrackerSection(Section, frozen=True, kw_only=True):
@@ -232,7 +249,9 @@ class WideCamera(Section, frozen=True, kw_only=True):
     A logarithmic `response` maps `decades` decades of intensity to the counts above `pedestal`; all
     wide-angle cameras must have the same response. All cameras are triggered together, with the shortest
     `period` of the cameras or, while the attitude is known to 0.05 deg, with the shortest `fine_period`. The
-    angle `lens_error_deg` is the residual error of the calibrated lens and mounting.
+    angle `lens_error_deg` is the residual error of the calibrated lens. The angle
+    `mounting_deg` is the largest rotation of a camera about each body axis from its `mounting`; the true
+    rotation is assumed to be uniform within it.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -249,6 +268,7 @@ class WideCamera(Section, frozen=True, kw_only=True):
     fine_period: Annotated[float, Meta(ge=2.0)] = 60.0
     max_age: Positive = 30.0
     lens_error_deg: NotNegative = 0.02
+    mounting_deg: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.1
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
     def counts_per_decade(self) -> float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
+import msgspec
 from msgspec import Meta
 
 from flight.schema.document import ConfigError
@@ -21,6 +22,20 @@ In a low orbit the field is 1.5e-5 to 6.5e-5 T, and the coils may add as much.
 ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 
 
+class CraftAccuracy(Section, frozen=True, kw_only=True):
+    """Largest errors of the description of the satellite; the true errors are assumed uniform within them.
+
+    `moments` is the relative error of the principal moments of inertia, and `axes_deg` the rotation of the
+    principal axes about each body axis. `coil_gain` is the relative error of the dipole of each coil, and
+    `coil_axes_deg` the misalignment of its axis.
+    """
+
+    moments: Annotated[float, Meta(ge=0.0, le=0.3)] = 0.1
+    axes_deg: Annotated[float, Meta(ge=0.0, le=30.0)] = 5.0
+    coil_gain: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.2
+    coil_axes_deg: Annotated[float, Meta(ge=0.0, le=30.0)] = 3.0
+
+
 class Craft(Section, frozen=True, kw_only=True):
     """The model of the satellite that the flight application uses.
 
@@ -30,6 +45,7 @@ class Craft(Section, frozen=True, kw_only=True):
 
     inertia: tuple[Positive, Positive, Positive]
     dipole_per_ampere: Positive
+    accuracy: CraftAccuracy = CraftAccuracy()
 
 
 class FieldDetumble(Detumble, frozen=True, kw_only=True):
@@ -49,6 +65,21 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
     spin_up: Annotated[float, Meta(ge=1.0)] = 2.0
 
 
+BlockName = Literal[
+    "gyro_bias",
+    "dipole",
+    "sunlit_dipole",
+    "field_bias",
+    "torques",
+    "inertia",
+    "coils",
+    "gyro_matrix",
+    "field_matrix",
+    "camera",
+]
+"""A block of the filter's error state whose role can be configured."""
+
+
 class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     """The attitude filter of a satellite in orbit (`knightcube.gnc.estimation.free_filter`).
 
@@ -59,7 +90,9 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     sqrt(s). The values `torque_start` and `torque_walk` should be smaller for a light satellite, because
     plans extrapolate an estimated torque along the field for an hour. From one boot to the next, the gyro
     bias may change by 10 deg/h, and the residual dipole by the fraction `changed` of its initial standard
-    deviation.
+    deviation. The mapping `roles` gives blocks of the error state another role: `estimated`, `considered` (the
+    block is not corrected, but its uncertainty is part of every covariance) or `fixed` (the block is known
+    exactly).
     """
 
     bias_walk: NotNegative = 2.0e-6
@@ -69,6 +102,7 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     changed: Share = 0.05
     torque_start: Positive = 3.0e-9
     torque_walk: Positive = 5.0e-12
+    roles: dict[BlockName, Literal["estimated", "considered", "fixed"]] = msgspec.field(default_factory=dict)
 
 
 class ExclusionCones(Section, frozen=True, kw_only=True):

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import NamedTuple
 
@@ -35,6 +35,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.sun import DAY
 from sim_hal.clock import NEVER
+from sim_hal.description_errors import NO_ERRORS, DescriptionErrors, description_errors
 from sim_hal.settings import CraftSection, Disturbances, FreeBodySection, TipOff
 from sim_hal.worlds.orbit import Environment, air_flow, elements, julian_date
 from sim_hal.worlds.world import BodyMotion, Floats, OrbitEnvironment, OrbitTruth, WorldInputs, WorldTruth
@@ -399,6 +400,7 @@ class FreeBody:
         seed: int = 1,
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
+        description: DescriptionErrors = NO_ERRORS,
     ) -> None:
         """Create the world with a body that is held still until its release.
 
@@ -406,7 +408,7 @@ class FreeBody:
         """
         errors, tip_off, weather = generators(seed)
         multiples = section.disturbances
-        self.craft = built_craft(section, errors)
+        self.craft = differing(built_craft(section, errors), description)
         self.utc_start = julian_date(utc)
         self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS - start_ns
         orbit = elements(section.orbit, self.utc_start)
@@ -593,6 +595,18 @@ def built_craft(section: FreeBodySection, errors: np.random.Generator) -> TrueCr
     return build(craft, section.disturbances, errors)
 
 
+def differing(craft: TrueCraft, errors: DescriptionErrors) -> TrueCraft:
+    """Return the craft with the errors of its description."""
+    x, y, z = (np.array(craft.inertia) * errors.moments).tolist()
+    turn = quaternion.from_rotation_vector(errors.axes)
+    return replace(
+        craft,
+        inertia=(x, y, z),
+        to_principal=quaternion.multiply(craft.to_principal, turn),
+        coil_dipole=errors.coils @ craft.coil_dipole,
+    )
+
+
 def coil_supply(inputs: WorldInputs) -> CoilSupply:
     """Return the true resistance and supply voltage of the coils of a configuration."""
     coils, truth = inputs.config.coils, inputs.section.truth
@@ -608,4 +622,12 @@ def make(inputs: WorldInputs) -> FreeBody:
     if section.free_body is None:
         raise ConfigError("simulation.free_body", "is missing: the world free_body needs it")
     supply = coil_supply(inputs)
-    return FreeBody(section.free_body, currents, supply, section.seed, section.utc, inputs.start_ns)
+    return FreeBody(
+        section.free_body,
+        currents,
+        supply,
+        section.seed,
+        section.utc,
+        inputs.start_ns,
+        description_errors(inputs.config, section),
+    )

@@ -31,7 +31,7 @@ def defaults_of(*modules: ModuleType) -> Defaults:
             found[name] = {
                 field.name: msgspec.to_builtins(field.default)
                 for field in msgspec.structs.fields(kind)
-                if field.default not in {None, msgspec.NODEFAULT, ()}
+                if field.default not in (None, msgspec.NODEFAULT, (), {})
                 and not isinstance(field.default, msgspec.Struct)
                 and (field.name, repr(field.default)) not in inherited
             }

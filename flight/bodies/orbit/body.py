@@ -50,10 +50,12 @@ from knightcube.gnc.control.field_detumbler import FieldDetumbler, FieldDetumble
 from knightcube.gnc.control.pointing_job import SlewRequest
 from knightcube.gnc.control.pointing_table import PointingWeights
 from knightcube.gnc.control.sun_acquisition import SunAcquisition, SunAcquisitionSettings
+from knightcube.gnc.estimation.error_state import Role
 from knightcube.gnc.estimation.estimate import Estimate, Knowledge
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from knightcube.gnc.estimation.free_filter import FreeFilterSettings
 from knightcube.gnc.estimation.measurements import MeanRateMeasurement
+from knightcube.gnc.estimation.rigid_body import BodyErrors
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.tracker import Track
 from knightcube.vision.solar_cells import SolarStringModel
@@ -328,6 +330,27 @@ def fastest_rate(config: OrbitConfig) -> float:
 
 _FIELD_ERROR = 5.0e-8
 """Standard deviation of the magnetic field model, T per axis."""
+_FIELD_BIAS_WALK = 3.0e-10
+"""Random walk of the magnetometer's bias, T per sqrt(s)."""
+_UNIFORM = 1.0 / math.sqrt(3.0)
+"""Standard deviation of a uniformly distributed error whose largest value is one."""
+
+
+def description_errors(config: OrbitConfig) -> BodyErrors:
+    """Return the configured accuracies of the satellite's description."""
+    craft, unit = config.craft.accuracy, config.inertial_unit.accuracy
+    camera = 0.0 if config.camera is None else math.radians(config.camera.accuracy.mounting_deg)
+    return BodyErrors(
+        moments=craft.moments,
+        axes=math.radians(craft.axes_deg),
+        gyro_scale=unit.gyro_scale,
+        gyro_alignment=unit.gyro_alignment,
+        coil_gain=craft.coil_gain,
+        coil_axes=math.radians(craft.coil_axes_deg),
+        field_matrix=unit.field_matrix,
+        camera=camera,
+        horizon=math.radians(max((one.mounting_deg for one in config.wide_cameras), default=0.0)),
+    )
 
 
 def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
@@ -337,7 +360,10 @@ def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
         gyro=(section.bias_start, section.bias_walk),
         coil_noise=section.current_noise * config.craft.dipole_per_ampere / math.sqrt(CONTROL_RATE_HZ),
         torque=(section.torque_start, section.torque_walk),
+        magnet=(_UNIFORM * config.inertial_unit.accuracy.field_bias, _FIELD_BIAS_WALK),
         field=_FIELD_ERROR,
+        errors=description_errors(config),
+        roles={name: Role(role) for name, role in section.roles.items()},
         gate_sigma=section.gate_sigma,
     )
 
@@ -352,9 +378,10 @@ def _filter(
 ) -> tuple[OrbitFilter, list[str]]:
     """Return the attitude filter, and the reasons why learned states were rejected."""
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
-    slow, problems = start_from(learned, filter_settings(config), section.changed, utc)
+    inertia, free = np.diag(craft.inertia), filter_settings(config)
+    slow, problems = start_from(learned, free.error_state(inertia), section.changed, utc)
     settings = OrbitFilterSettings(
-        inertia=np.diag(craft.inertia),
+        inertia=inertia,
         dipole_per_ampere=craft.dipole_per_ampere,
         dipole_limit=config.coils.current_limit * craft.dipole_per_ampere,
         gyro_noise=unit.rate_noise,
@@ -363,7 +390,7 @@ def _filter(
         settle_ns=round(config.detumble.settle * SECOND_NS),
         history_ns=round(section.history * SECOND_NS),
         slow=slow,
-        free=filter_settings(config),
+        free=free,
     )
     return OrbitFilter(settings, environment.at), problems
 
@@ -432,6 +459,7 @@ def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
         model_error=2.0e-4,
         torsion=1e-6,
         damping=1e-4,
+        errors=description_errors(config),
         settle_ns=settle_ns,
     )
     slow = replace(response, bin_samples=80, bins=20, model_error=3.0e-5)

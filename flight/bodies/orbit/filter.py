@@ -7,12 +7,13 @@ only while the coils are off and their field has decayed. Within the step under 
 propagated by the model. A measurement of a past time, such as a star fix, is applied at its own time: the
 filter returns to the beginning of the step with this time, and repeats all steps since then.
 
-The learned states are stored for the next boot in two parts, without their cross-covariance:
-`attitude-errors` holds the biases of gyro and magnetometer and the rotation of the principal axes,
-`attitude-torques` the residual dipole in shadow and in sunlight and the torques. A third entry, `learned-at`,
-is the time (UTC, s) for which the learned states were estimated. At the next boot, the covariance of each
-state grows by its random walk over the elapsed time, and by a fraction of its initial standard deviation,
-because switching a sensor off and on changes its bias.
+The learned states are stored for the next boot in three parts, without their cross-covariance:
+`attitude-errors` holds the biases and matrices of gyro and magnetometer and the misalignment of the star
+camera, `attitude-torques` the residual dipole in shadow and in sunlight and the torques, and `body` the
+inertia and the matrix of the coils. Another entry, `learned-at`, is the time (UTC, s) for which the learned
+states were estimated. At the next boot, the covariance of each state grows by its random walk over the
+elapsed time, and by a fraction of its initial covariance, because switching a sensor off and on changes its
+bias.
 """
 
 from __future__ import annotations
@@ -34,13 +35,19 @@ from knightcube.astro.arrays import FloatArray, IntArray, cross_product
 from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
 from knightcube.gnc.estimation import estimate as form
 from knightcube.gnc.estimation import free_filter as states
+from knightcube.gnc.estimation.error_state import ErrorState
 from knightcube.gnc.estimation.estimate import FIELD_BIAS, Estimate, Knowledge, Parameters
 from knightcube.gnc.estimation.free_filter import (
-    AXES,
+    CAMERA,
+    COILS,
     DIPOLE,
+    FIELD_MATRIX,
     GYRO,
+    GYRO_MATRIX,
+    INERTIA,
     MAGNET,
     PLAUSIBLE,
+    SLOW,
     SUNLIT,
     TORQUES,
     FilterEnvironment,
@@ -48,6 +55,7 @@ from knightcube.gnc.estimation.free_filter import (
     FreeFilterSettings,
     FreeMemory,
     SlowStates,
+    plausible,
 )
 from knightcube.gnc.estimation.measurements import (
     AttitudeMeasurement,
@@ -304,7 +312,13 @@ class StepReplay:
         `doubted` states whether the earlier estimates were contradicted.
         """
         first = self.steps[place]
-        self.free.start(attitude.quaternion, attitude.covariance, first.gyro, doubted=doubted)
+        self.free.start(
+            attitude.quaternion,
+            attitude.covariance,
+            first.gyro,
+            by_stars=attitude.by_stars,
+            doubted=doubted,
+        )
         for k in range(place + 1):
             self.steps[k].before = None
             self.steps[k].late.clear()
@@ -365,6 +379,7 @@ class StepReplay:
         for k in range(first, len(self.steps)):
             step = self.steps[k]
             step.before = self.free.memory()
+            self.free.begin_mean()
             time_ns = step.begin_ns
             for measurement in step.late:
                 self._advance(step, time_ns, measurement.time_ns)
@@ -404,7 +419,8 @@ class StepReplay:
         """Apply a measurement to the estimate at its time, and return whether it passed the gate."""
         free = self.free
         if isinstance(measurement, AttitudeMeasurement):
-            return free.attitude(measurement.quaternion, measurement.covariance)
+            stars = measurement.by_stars
+            return free.attitude(measurement.quaternion, measurement.covariance, by_stars=stars)
         if isinstance(measurement, MeanRateMeasurement):
             since = 0.5 * (measurement.time_ns - measurement.since_ns) / SECOND_NS
             return free.mean_rate(measurement.rate, measurement.covariance, since * free.acceleration)
@@ -636,7 +652,7 @@ class OrbitFilter:
 
     @property
     def slow(self) -> SlowStates:
-        """The slow states: sensor biases, residual dipoles, torques and principal axes."""
+        """The slow states of body, coils and sensors."""
         return self._free.slow
 
     @property
@@ -792,7 +808,7 @@ class OrbitFeed:
         return self._filter.begin(attitude)
 
 
-ERRORS, SOURCES, LEARNED_AT = "attitude-errors", "attitude-torques", "learned-at"
+ERRORS, SOURCES, BODY, LEARNED_AT = "attitude-errors", "attitude-torques", "body", "learned-at"
 UNKNOWN_AGE = 86_400.0
 """Largest assumed age (s) of learned states, also assumed if the clock was set back."""
 
@@ -802,7 +818,11 @@ def _places(*parts: slice) -> IntArray:
     return np.concatenate([np.arange(part.start, part.stop) for part in parts]) - GYRO.start
 
 
-PARTS = {ERRORS: _places(GYRO, MAGNET, AXES), SOURCES: _places(DIPOLE, SUNLIT, TORQUES)}
+PARTS = {
+    ERRORS: _places(GYRO, MAGNET, GYRO_MATRIX, FIELD_MATRIX, CAMERA),
+    SOURCES: _places(DIPOLE, SUNLIT, TORQUES),
+    BODY: _places(INERTIA, COILS),
+}
 
 
 def learned_of(slow: SlowStates, utc: float) -> dict[str, Learned]:
@@ -812,28 +832,31 @@ def learned_of(slow: SlowStates, utc: float) -> dict[str, Learned]:
 
 
 def start_from(
-    learned: Mapping[str, Learned], settings: FreeFilterSettings, changed: float, utc: float
+    learned: Mapping[str, Learned], layout: ErrorState, changed: float, utc: float
 ) -> tuple[SlowStates, list[str]]:
-    """Return the filter's prior at a time (UTC, s), and the reasons why learned states were rejected.
+    """Return the prior of the slow states at a time (UTC, s), and why learned states were rejected.
 
     Switching off and on may have changed a state by the fraction `changed` of its initial deviation.
     """
-    start, walks = settings.of_slow(0), settings.of_slow(1)
-    prior = SlowStates(np.zeros(len(start)), np.diag(start**2))
+    initial, walks = layout.prior[SLOW, SLOW], layout.walks[SLOW]
+    prior = SlowStates(np.zeros(len(initial)), initial.copy())
     if LEARNED_AT not in learned:
         return prior, []
     age = utc - learned[LEARNED_AT].values[0]
     if not 0.0 <= age <= UNKNOWN_AGE:
         age = UNKNOWN_AGE
-    grown = walks**2 * age + (changed * start) ** 2
+    grown = age * np.diag(walks) + changed**2 * initial
     problems = []
     for name, at in PARTS.items():
         if name not in learned:
             continue
         values, covariance = learned[name].arrays()
-        if values.shape != at.shape or not settings.plausible(values, at).all():
+        if values.shape != at.shape:
+            problems.append(f"{name} has {len(values)} values instead of {len(at)}")
+            continue
+        if not plausible(values, initial.diagonal()[at]).all():
             problems.append(f"{name} {values.tolist()}: not within {PLAUSIBLE:g} sigma of what is expected")
             continue
         prior.values[at] = values
-        prior.covariance[np.ix_(at, at)] = covariance + np.diag(grown[at])
+        prior.covariance[np.ix_(at, at)] = covariance + grown[np.ix_(at, at)]
     return prior, problems

@@ -1,31 +1,42 @@
-"""The navigation filter of a free satellite: attitude, rate, biases, residual dipole and torques.
+"""The navigation filter of a free satellite whose body and sensors are not exactly known.
 
-A multiplicative extended Kalman filter integrates Euler's equation with the coils' dipole moment, the gravity
-gradient and the estimated disturbances, in steps of a second or two. Gyro samples are treated as
-measurements. The filter propagates a late attitude to the present with the present rate, whose error enters
-the innovation. This is accurate for some seconds, because the rate of a body that rotates slowly enough for
-star images is nearly constant in that time. The module `attitude_filter` instead applies each late sample at
-its own time. A filter step with one gyro sample takes 0.3 ms.
+A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
+gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. Unlike
+`attitude_filter`, which replays each late sample at its own time, a late attitude is propagated to the
+present with the present rate, and its innovation includes the error of that rate. This is accurate for some
+seconds, in which the rate of a body that is slow enough for star images is nearly constant.
 
-The residual dipole moment has a constant part and a part proportional to the sunlight. The sizes of the
-disturbance torques of `knightcube.astro.earth.disturbance` are states of the filter. A small rotation of the
-principal axes from the assumed axes is a further state. In a fast spinning long body, wrong principal axes
-cause the largest unknown torque, which would otherwise be attributed to the gyro bias.
+Besides attitude and rate the error state (`error_state`) holds the errors of the satellite's description:
 
-The error of the field model is correlated over minutes and is modelled as a first-order Gauss-Markov process
-in body axes. While the attitude is known accurately, the standard deviation of this error is estimated by
-expectation maximisation (Dempster, Laird & Rubin 1977), from the squared estimate and its variance.
+- inertia: the errors of the inertia tensor, relative to the trace. Euler's equation is linear in them. A
+  tumble about more than one axis shows the ratios of the moments and the principal axes (Psiaki 2005, JGCD
+  28(4)); the common scale is observable only against the dipole of the coils.
+- coils: the matrix of gains and misalignments of the coils, which adds to the commanded dipole.
+- gyro_matrix, field_matrix: scale factors and misalignments of gyro and magnetometer (Pittelkau 2001, JGCD
+  24(6)).
+- camera: the misalignment of the star camera. The attitude of the star camera is therefore known more
+  accurately than that of the body axes.
+- horizon: the misalignment of the horizon cameras that measure Sun and nadir. Other cameras are used when
+  the body has rotated, so this misalignment is a Gauss-Markov process with a long memory.
+- gyro and magnetometer bias, the residual dipole (a constant part and a part proportional to the sunlight),
+  and the sizes of the disturbance torques of `knightcube.astro.earth.disturbance`.
+
+The error of the field model is a vector that keeps its sign for minutes: a Gauss-Markov process of first
+order in body axes. While the attitude is known accurately, the standard deviation of this error is estimated
+by expectation maximisation (Dempster, Laird & Rubin 1977), from the squared estimate and its variance.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from knightcube.astro import chi_square
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_matrix, tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, cross_matrix, cross_product, tangent_basis
 from knightcube.astro.earth.disturbance import SIZES, Pressures, box_areas, shapes
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.quaternion import (
@@ -35,24 +46,56 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
+from knightcube.gnc.estimation.error_state import ErrorState, Role, StateBlock, slices, with_role
 from knightcube.gnc.estimation.estimate import Knowledge
+from knightcube.gnc.estimation.rigid_body import BodyErrors, inertia_covariance
 
-ATTITUDE, RATE, GYRO, DIPOLE, SUNLIT, MAGNET = (slice(3 * k, 3 * k + 3) for k in range(6))
-TORQUES = slice(18, 18 + SIZES)
-AXES = slice(18 + SIZES, 21 + SIZES)
-SLOW = slice(GYRO.start, AXES.stop)
-FIELD = slice(21 + SIZES, 24 + SIZES)
-STATES = 24 + SIZES
-"""Indices of the components of the error state. The slice SLOW contains the slowly varying states, from GYRO
-to AXES."""
+BLOCKS = {
+    "attitude": 3,
+    "rate": 3,
+    "gyro_bias": 3,
+    "dipole": 3,
+    "sunlit_dipole": 3,
+    "field_bias": 3,
+    "torques": SIZES,
+    "inertia": 6,
+    "coils": 9,
+    "gyro_matrix": 9,
+    "field_matrix": 9,
+    "camera": 3,
+    "horizon": 3,
+    "field_error": 3,
+}
+"""Sizes of the blocks of the error state, in order. Matrices (3, 3) are stored row by row."""
+(
+    ATTITUDE,
+    RATE,
+    GYRO,
+    DIPOLE,
+    SUNLIT,
+    MAGNET,
+    TORQUES,
+    INERTIA,
+    COILS,
+    GYRO_MATRIX,
+    FIELD_MATRIX,
+    CAMERA,
+    HORIZON,
+    FIELD,
+) = slices(BLOCKS)
+"""Indices of the blocks of the error state."""
+SLOW = slice(GYRO.start, CAMERA.stop)
+"""Indices of the slowly varying states, which are kept for the next boot."""
+STATES = FIELD.stop
+"""Size of the error state."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterEnvironment:
-    """The environment of the satellite at one time, ICRS axes.
+    """The environment of the satellite at one time, ICRS.
 
-    `field` (3,) is the magnetic field (T), `position` (3,) the position (m), `pressures` the pressures of air
-    and sunlight, and `sunlit` the visible fraction of the Sun's disk.
+    `field` (3,) T, `position` (3,) m, `pressures` of air and light, and the visible share `sunlit` of the
+    Sun.
     """
 
     field: FloatArray
@@ -62,49 +105,50 @@ class FilterEnvironment:
 
 
 class FreeMotion:
-    """Euler's equation of a satellite in orbit, with principal axes that can be corrected."""
+    """Euler's equation of a satellite in orbit, whose inertia differs from the assumed one."""
 
     def __init__(self, inertia: FloatArray) -> None:
-        """Create the equation for an assumed inertia tensor (3, 3) kg m^2 in body axes."""
+        """`inertia` (3, 3) kg m^2, body axes, is the assumed one."""
         self._assumed: FloatArray = np.asarray(inertia, dtype=float)
-        moments = np.linalg.eigvalsh(self._assumed)
-        self.largest_difference = float(moments[-1] - moments[0])
-        """Largest difference between two principal moments of inertia, kg m^2."""
+        self._trace = float(np.trace(self._assumed))
         self._areas = box_areas(self._assumed)
-        self._rotation: FloatArray = np.zeros(3)
-        self._set_inertia(self._assumed)
+        self._error: FloatArray = np.full(6, math.nan)
+        self.correct(np.zeros(6))
 
-    def rotate_axes(self, rotation: FloatArray) -> None:
-        """Set the principal axes to the assumed axes rotated by a rotation vector (3,) rad, body axes."""
-        if np.array_equal(rotation, self._rotation):
+    def correct(self, error: FloatArray) -> None:
+        """Add to the assumed inertia the error (6,): xx, yy, zz, yz, zx, xy, relative to the trace."""
+        if np.array_equal(error, self._error):
             return
-        self._rotation = rotation.copy()
-        back = attitude_matrix(from_rotation_vector(rotation))
-        self._set_inertia(np.asarray(back.T @ self._assumed @ back, dtype=float))
-
-    def _set_inertia(self, inertia: FloatArray) -> None:
-        self.inertia: FloatArray = inertia
-        self.inverse: FloatArray = np.asarray(np.linalg.inv(inertia), dtype=float)
+        self._error = error.copy()
+        xx, yy, zz, yz, zx, xy = (self._trace * error).tolist()
+        self.inertia: FloatArray = self._assumed + np.array(((xx, xy, zx), (xy, yy, yz), (zx, yz, zz)))
+        self.inverse: FloatArray = np.asarray(np.linalg.inv(self.inertia), dtype=float)
         self.by_torque: FloatArray = self.inverse @ self.inverse
-        """Covariance (3, 3) of the angular acceleration per variance of each torque component."""
+        """Covariance (3, 3) of the acceleration per variance of the torque."""
 
     def acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
         """Return the angular acceleration (3,) rad/s^2 at a rate (3,) rad/s under a torque (3,) N m."""
-        return np.asarray(self.inverse @ (torque - cross_matrix(rate) @ (self.inertia @ rate)))
+        return np.asarray(self.inverse @ (torque - cross_product(rate, self.inertia @ rate)))
 
     def stiffness(self, rate: FloatArray) -> FloatArray:
-        """Return the derivative (3, 3) of the angular acceleration with respect to the rate (3,) rad/s."""
+        """Return the derivative (3, 3) of the acceleration by the rate (3,) rad/s."""
         return np.asarray(
             self.inverse @ (cross_matrix(self.inertia @ rate) - cross_matrix(rate) @ self.inertia)
         )
 
     def torque(
-        self, quaternion: FloatArray, dipole: FloatArray, sizes: FloatArray, around: FilterEnvironment
+        self,
+        quaternion: FloatArray,
+        driven: FloatArray,
+        dipole: FloatArray,
+        sizes: FloatArray,
+        around: FilterEnvironment,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the torque (3,) N m, and the error dynamics (6, 33) without the columns of rate and axes.
+        """Return the torque (3,) N m, and the error dynamics without the gyroscopic torque.
 
-        `dipole` (3,) A m^2 is the sum of the coils' and the residual dipole moment. `sizes` (9,) are the
-        sizes (N m) of the disturbance torques.
+        `driven` (3,), A m^2, is the commanded dipole of the coils, and `dipole` (3,) that of coils and
+        residual dipole. `sizes` (9,), N m, are the sizes of the disturbance torques. The rows (6, STATES) of
+        the dynamics are those of attitude and rate.
         """
         to_body = attitude_matrix(quaternion)
         field, position = to_body @ around.field, to_body @ around.position
@@ -120,55 +164,71 @@ class FreeMotion:
         flow[3:6, ATTITUDE] = self.inverse @ (cross_matrix(dipole) @ across + stiffness)
         flow[3:6, DIPOLE] = -self.inverse @ across
         flow[3:6, SUNLIT] = around.sunlit * flow[3:6, DIPOLE]
+        flow[3:6, COILS] = flow[3:6, DIPOLE] @ by_matrix(driven)
         flow[3:6, TORQUES] = self.inverse @ shape
-        flow[3:6, AXES] = strength * self.inverse @ upright @ self._by_rotation(up)
+        flow[3:6, INERTIA] = self._trace * strength * self.inverse @ upright @ by_inertia(up)
         return torque, flow
 
-    def by_axes(self, rate: FloatArray, acceleration: FloatArray) -> FloatArray:
-        """Return the derivative (3, 3) of the gyroscopic acceleration by a rotation of the principal axes."""
-        return np.asarray(
-            -self.inverse @ (cross_matrix(rate) @ self._by_rotation(rate) + self._by_rotation(acceleration))
-        )
+    def by_inertia(self, rate: FloatArray, acceleration: FloatArray) -> FloatArray:
+        """Return the derivative (3, 6) of the acceleration by the inertia's error, without gravity."""
+        changed = by_inertia(acceleration) + cross_matrix(rate) @ by_inertia(rate)
+        return np.asarray(-self._trace * self.inverse @ changed)
 
-    def _by_rotation(self, vector: FloatArray) -> FloatArray:
-        """Return the derivative (3, 3) of J v by a small rotation d of J, which adds d x J v - J (d x v)."""
-        return np.asarray(self.inertia @ cross_matrix(vector) - cross_matrix(self.inertia @ vector))
+
+def by_inertia(vector: FloatArray) -> FloatArray:
+    """Return the derivative (3, 6) of J v by the elements xx, yy, zz, yz, zx, xy of J, for a vector (3,)."""
+    x, y, z = vector.tolist()
+    return np.array(((x, 0.0, 0.0, 0.0, z, y), (0.0, y, 0.0, z, 0.0, x), (0.0, 0.0, z, y, x, 0.0)))
+
+
+def by_matrix(vector: FloatArray) -> FloatArray:
+    """Return the derivative (3, 9) of M v by the elements of M (3, 3), row by row, for a vector (3,)."""
+    rows = np.zeros((3, 3, 3))
+    rows[_AXES, _AXES] = vector
+    return rows.reshape(3, 9)
+
+
+_AXES = np.arange(3)
 
 
 LASTING = 20.0
-"""Correlation time (s) of coil and inertia errors, for the white noise that models these errors."""
+"""Correlation time (s) of unmodelled errors of the coils, which scales the white noise that models them."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
-"""Expected sizes of the constant, air and sunlight torques, relative to the size of the air torque. The
-expected constant torque is small, because wrong principal axes have their own states. At one attitude the
-torques cannot be distinguished. Air torque that is attributed to the constant torque is wrong at every other
+"""Expected sizes of the torques, relative to the size of the torque by air. The constant torque is small,
+because the inertia has its own states. At one attitude the torques cannot be
+distinguished, and a torque by air that is attributed to the constant torque is wrong at every other
 attitude."""
 PLAUSIBLE = 4.0
-"""Largest plausible value of a slow state, in initial standard deviations of the state."""
+"""Largest plausible deviation of a slow state, in standard deviations at the start."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeFilterSettings:
     """Noise and limits of the filter.
 
-    Each pair of values holds the initial standard deviation of a state and its random walk per sqrt(s).
+    A pair of values is the standard deviation at the start and the random walk per sqrt(s).
 
     Attributes:
         gyro: rad/s, gyro bias.
-        dipole, sunlit: constant and sunlit part of the residual dipole moment, A m^2.
-        magnet: magnetometer bias, T.
-        field: initial standard deviation per axis of the field model's error, T.
-        field_memory: correlation time of the field model's error, s.
-        torque: size of the air torque, N m; it also scales the other disturbance torques.
-        torque_noise: white noise of all unmodelled torques, N m sqrt(s).
-        coil_error: relative error of the coils' dipole moment in any direction, correlated over tens of
-            seconds.
-        coil_noise: white noise of each coil's dipole moment while the coils are driven, A m^2 sqrt(s).
-        axes: rotation of the principal axes from the assumed axes, rad.
-        inertia_error: relative error of the gyroscopic torque, without the effect of wrong principal axes.
-        rate_start: standard deviation of the initial rate apart from the gyro bias, rad/s.
-        fine, coarse: largest standard deviation of the worst axis of a fine and of a coarse attitude, rad.
-        gate_sigma: a measurement less likely than a deviation of this many sigma in one component is
-            rejected.
+        dipole, sunlit: A m^2, residual dipole: constant part, and part in sunlight.
+        magnet: T, magnetometer bias.
+        field: T per axis, error of the field model before it is learned.
+        field_memory: s, correlation time of the error of the field model.
+        torque: N m, size of the torque by air; the sizes of the other torques follow from the ratios of this
+            module.
+        torque_noise: N m sqrt(s), white noise of all other torques.
+        coil_error: relative error of the coils' dipole for tens of seconds, in any direction, in addition to
+            the constant matrix of the coils.
+        coil_noise: A m^2 sqrt(s), white noise of each coil while the coils are driven.
+        coil_walk: random walk of the matrix of the coils per sqrt(s), for example by their temperature.
+        inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s). It bounds the
+            accuracy that is claimed for the inertia, where flexible parts matter that Euler's equation of a
+            rigid body does not contain.
+        errors: largest errors of the description of body and sensors.
+        roles: roles of blocks of the error state, by name, that differ from the default.
+        rate_start: rad/s, error of the first rate.
+        fine, coarse: rad, largest sigma of the worst axis of a fine and of a coarse attitude.
+        gate_sigma: gate; a measurement less likely than this many sigma of one component is refused.
     """
 
     gyro: tuple[float, float] = (1e-3, 2e-6)
@@ -179,44 +239,68 @@ class FreeFilterSettings:
     field_memory: float = 600.0
     torque: tuple[float, float] = (3e-9, 5e-12)
     torque_noise: float = 1e-9
-    coil_error: float = 0.04
+    coil_error: float = 0.005
     coil_noise: float = 0.0
-    axes: tuple[float, float] = (0.03, 0.0)
-    inertia_error: float = 0.003
+    coil_walk: float = 1e-4
+    inertia_walk: float = 1e-5
+    errors: BodyErrors = dataclasses.field(default_factory=BodyErrors)
+    roles: Mapping[str, Role] = dataclasses.field(default_factory=dict)
     rate_start: float = 1e-3
     fine: float = math.radians(0.1)
     coarse: float = math.radians(5.0)
     gate_sigma: float = 5.0
 
-    def of_slow(self, which: int) -> FloatArray:
-        """Return the initial deviations (`which` = 0) or the random walks (1) of the slow states (24,)."""
+    def error_state(self, inertia: FloatArray) -> ErrorState:
+        """Return the declared error state of a body of `inertia` (3, 3) kg m^2."""
         start, walk = self.torque
-        torques = [(share * start, walk) for share in (CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE)]
-        pairs = [self.gyro, self.dipole, self.sunlit, self.magnet, *torques, self.axes]
-        return np.repeat([pair[which] for pair in pairs], 3)
+        torques = np.repeat([CONSTANT_SHARE * start, AIR_SHARE * start, LIGHT_SHARE * start], 3)
+        errors, ones = self.errors, np.ones(3)
+        blocks = [
+            StateBlock("attitude", np.zeros(3)),
+            StateBlock("rate", np.zeros(3)),
+            StateBlock("gyro_bias", self.gyro[0] * ones, self.gyro[1]),
+            StateBlock("dipole", self.dipole[0] * ones, self.dipole[1]),
+            StateBlock("sunlit_dipole", self.sunlit[0] * ones, self.sunlit[1]),
+            StateBlock("field_bias", self.magnet[0] * ones, self.magnet[1]),
+            StateBlock("torques", torques, walk),
+            StateBlock("inertia", inertia_covariance(inertia, errors), self.inertia_walk),
+            StateBlock("coils", _matrix_errors(errors.coil_gain, errors.coil_axes), self.coil_walk),
+            StateBlock("gyro_matrix", _matrix_errors(errors.gyro_scale, errors.gyro_alignment)),
+            StateBlock("field_matrix", _matrix_errors(errors.field_matrix, errors.field_matrix)),
+            StateBlock("camera", _UNIFORM * errors.camera * ones),
+            StateBlock("horizon", _UNIFORM * errors.horizon * ones),
+            StateBlock("field_error", self.field * ones),
+        ]
+        return ErrorState(with_role(blocks, self.roles))
 
-    def plausible(self, values: FloatArray, at: IntArray | slice = slice(None)) -> BoolArray:
-        """Return whether each value (k,) of the slow states with the indices `at` is plausible."""
-        return np.asarray(np.abs(values) <= PLAUSIBLE * self.of_slow(0)[at])
+
+_UNIFORM = 1.0 / math.sqrt(3.0)
+"""Standard deviation of a uniformly distributed error whose largest value is one."""
+
+
+def _matrix_errors(scale: float, alignment: float) -> FloatArray:
+    """Return the standard deviations (9,) of a matrix, from largest errors on and off the diagonal."""
+    return _UNIFORM * np.where(np.eye(3, dtype=bool), scale, alignment).ravel()
 
 
 LARGEST_ROTATION = 0.1
-"""Largest rotation (rad) of the body in one integration step."""
+"""Largest rotation (rad) in a step of integration."""
 FIELD_LEARNED = 2_000.0
-"""Averaging time (s) of the estimated variance of the field model's error."""
+"""Time (s) over which the size of the field model's error is averaged."""
+HORIZON_MEMORY = 3_000.0
+"""Correlation time (s) of the misalignment of the horizon cameras in use."""
 MINIMUM_FIELD_ERROR = 1e-8
-"""Minimum standard deviation (T per axis) of the field model's error, as large as the magnetometer's own
-errors."""
+"""Minimum error (T per axis) of the field model, equal to the variation of the magnetometer's own errors."""
 CURRENTS = 1e-7
-"""Field (T per axis) of auroral currents; it is added to the noise so that no measurement is rejected because
-of it."""
+"""Error (T per axis) of the field model due to auroral currents, which must not cause the rejection of a
+measurement."""
 _EYE: FloatArray = np.eye(3)
 _FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlowStates:
-    """The values (24,) of the slowly varying states and their covariance (24, 24)."""
+    """The slow states: `values` (n,) and their covariance (n, n), in the order of `SLOW`."""
 
     values: FloatArray
     covariance: FloatArray
@@ -224,7 +308,7 @@ class SlowStates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeMemory:
-    """A copy of the filter's estimate; the attributes have the names that they have in the filter."""
+    """A copy of the estimate: the attributes of the filter with the same names."""
 
     quaternion: FloatArray
     rate: FloatArray
@@ -235,95 +319,116 @@ class FreeMemory:
 
 
 class FreeFilter:
-    """The navigation filter; `refused` counts the measurements that did not pass the gate.
+    """Owns the estimate. `refused` counts the measurements that did not pass the gate.
 
     Attributes:
-        quaternion: attitude (4,), from ICRS into body axes.
-        rate: body rate (3,) in body axes, rad/s.
-        acceleration: angular acceleration (3,) of the last step in body axes, rad/s^2.
-        covariance: covariance (33, 33) of the error state, in the order ATTITUDE, RATE, ..., FIELD.
-        field_error: standard deviation per axis of the field model's error, T.
-        changes: number of times that the estimate changed.
+        layout: the declared error state.
+        quaternion: (4,) ICRS into body.
+        rate: (3,) rad/s, body axes.
+        acceleration: (3,) rad/s^2, body axes, of the last step.
+        covariance: (STATES, STATES) of the error state (ATTITUDE, RATE, ...).
+        field_error: T per axis, standard deviation of the field model's error.
+        changes: number of changes of the estimate.
     """
 
     def __init__(
         self, inertia: FloatArray, settings: FreeFilterSettings, slow: SlowStates | None = None
     ) -> None:
-        """Create a filter for the assumed inertia tensor (3, 3) kg m^2 in body axes.
+        """Use `inertia` (3, 3) kg m^2, body axes.
 
-        The prior of the slow states is `slow`, or follows from the settings by default.
+        `slow` is the prior of the slow states, by default the settings.
         """
         self.motion = FreeMotion(inertia)
+        self.layout = settings.error_state(inertia)
         self._settings = settings
         tail = math.erfc(settings.gate_sigma / math.sqrt(2.0))
-        self._walks = settings.of_slow(1) ** 2
         self._gates = {n: chi_square.bound(tail, n) for n in (1, 2, 3)}
         self._constants: FloatArray = np.zeros(STATES)
         self.acceleration: FloatArray = np.zeros(3)
         self._slope: FloatArray = np.zeros((3, STATES))  # derivative of the acceleration by the states
+        self._lag: FloatArray = np.zeros(3)  # integral (rad) of the present rate less the past rate
+        self._since = 0.0  # time (s) over which `_lag` is integrated
         self.started = False
         self.refused = 0
         self.changes = 0
         self.quaternion: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
         self.rate: FloatArray = np.zeros(3)
-        self.covariance: FloatArray = np.zeros((STATES, STATES))
-        self.covariance[SLOW, SLOW] = np.diag(settings.of_slow(0) ** 2)
+        self.covariance: FloatArray = self.layout.prior.copy()
         self.field_error = settings.field
         self._reset_field()
         if slow is not None:
             self._constants[SLOW], self.covariance[SLOW, SLOW] = slow.values, slow.covariance
 
     def start(
-        self, quaternion: FloatArray, covariance: FloatArray, gyro: FloatArray, *, doubted: bool = False
+        self,
+        quaternion: FloatArray,
+        covariance: FloatArray,
+        gyro: FloatArray,
+        *,
+        by_stars: bool = False,
+        doubted: bool = False,
     ) -> None:
-        """Start from an attitude (4,) with covariance (3, 3) rad^2 in body axes, and a gyro rate (3,) rad/s.
+        """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro rate (3,) rad/s.
 
-        The slow states are kept. If measurements contradicted the estimate (`doubted`), the covariance of the
-        slow states is reset to the settings, and implausible values are set to zero.
+        The attitude is that of the star camera if `by_stars`, else that of the horizon cameras. The slow
+        states are kept. If the estimate was contradicted (`doubted`), their covariance is reset to the values
+        of the settings, and implausible values are set to zero.
         """
         self.changes += 1
         if doubted:
-            slow, known = self._constants[SLOW], self._settings.of_slow(0)
-            slow[~self._settings.plausible(slow)] = 0.0
-            self.covariance[SLOW, SLOW] = np.diag(known**2)
+            slow, prior = self._constants[SLOW], self.layout.prior[SLOW, SLOW]
+            slow[~plausible(slow, prior.diagonal())] = 0.0
+            self.covariance[SLOW, SLOW] = prior
             self.field_error = max(self.field_error, self._settings.field)
             self._reset_field()
-        self.covariance[:6] = self.covariance[:, :6] = 0.0
-        self.covariance[ATTITUDE, ATTITUDE] = covariance
-        bias = self.covariance[GYRO, GYRO]
-        self.covariance[RATE, RATE] = bias + self._settings.rate_start**2 * _EYE
-        # The gyro measures the sum of rate and bias, so the errors of both estimates are opposite.
-        self.covariance[RATE, GYRO] = self.covariance[GYRO, RATE] = -bias
-        self.quaternion, self.rate = quaternion, gyro - self._constants[GYRO]
+        # The error of the first attitude and rate by the errors of the states that map them to readings.
+        first = np.zeros((6, STATES))
+        misaligned = CAMERA if by_stars else HORIZON
+        self.quaternion = multiply(from_rotation_vector(-self._constants[misaligned]), quaternion)
+        first[ATTITUDE, misaligned] = -_EYE
+        self.rate = np.linalg.solve(_EYE + self._matrix(GYRO_MATRIX), gyro - self._constants[GYRO])
+        first[RATE, GYRO], first[RATE, GYRO_MATRIX] = -_EYE, -by_matrix(self.rate)
+        whole = self.covariance
+        whole[:6] = first @ whole
+        whole[:, :6] = whole[:6].T
+        whole[:6, :6] = whole[:6] @ first.T
+        whole[ATTITUDE, ATTITUDE] += covariance
+        whole[RATE, RATE] += self._settings.rate_start**2 * _EYE
+        self.begin_mean()
         self.started = True
 
     @property
     def knowledge(self) -> Knowledge:
-        """Accuracy class of the attitude estimate."""
+        """Accuracy with which the attitude is known."""
         if not self.started or (sigma := self.worst_sigma) > self._settings.coarse:
             return Knowledge.LOST
         return Knowledge.FINE if sigma <= self._settings.fine else Knowledge.COARSE
 
     @property
     def worst_sigma(self) -> float:
-        """Standard deviation of the attitude about the least certain axis, rad."""
+        """Standard deviation of the attitude of the body about its worst axis, rad."""
         covariance = self.covariance
         return math.sqrt(max(covariance[0, 0], covariance[1, 1], covariance[2, 2]))
 
     @property
+    def camera_covariance(self) -> FloatArray:
+        """Covariance (3, 3) rad^2 of the attitude of the star camera, body axes."""
+        return np.asarray(_CAMERA_ROWS @ self.covariance @ _CAMERA_ROWS.T)
+
+    @property
     def slow(self) -> SlowStates:
-        """Values and covariance of the slowly varying states."""
+        """The slow states and their covariance."""
         return SlowStates(self._constants[SLOW].copy(), self.covariance[SLOW, SLOW].copy())
 
     def memory(self) -> FreeMemory:
-        """Return a copy of the estimate that `recall` can restore."""
+        """Return a copy of the estimate, for `recall`."""
         constants, covariance = self._constants.copy(), self.covariance.copy()
         return FreeMemory(
             self.quaternion, self.rate, self.acceleration, constants, covariance, self.field_error
         )
 
     def recall(self, then: FreeMemory) -> None:
-        """Restore an earlier estimate from the copy `then`."""
+        """Restore an earlier estimate from its copy `then`."""
         self.changes += 1
         self.quaternion, self.rate, self.acceleration = then.quaternion, then.rate, then.acceleration
         self._constants, self.covariance = then.constants.copy(), then.covariance.copy()
@@ -336,92 +441,128 @@ class FreeFilter:
 
     @property
     def magnet_bias(self) -> FloatArray:
-        """Magnetometer bias (3,) in body axes, T."""
+        """Magnetometer bias (3,) T, body axes."""
         return self._constants[MAGNET].copy()
 
     @property
     def torque_sizes(self) -> FloatArray:
-        """Sizes (9,) of the disturbance torques, N m."""
+        """Sizes (9,) N m of the disturbance torques."""
         return self._constants[TORQUES].copy()
 
     @property
-    def axes_rotation(self) -> FloatArray:
-        """Rotation vector (3,) of the principal axes from the assumed axes, in body axes, rad."""
-        return self._constants[AXES].copy()
+    def inertia(self) -> FloatArray:
+        """Estimated inertia (3, 3) kg m^2, body axes."""
+        self.motion.correct(self._constants[INERTIA])
+        return self.motion.inertia.copy()
+
+    @property
+    def coil_matrix(self) -> FloatArray:
+        """Matrix (3, 3) from the commanded to the estimated dipole of the coils."""
+        return _EYE + self._matrix(COILS)
+
+    @property
+    def camera_misalignment(self) -> FloatArray:
+        """Rotation vector (3,) rad of the star camera from its assumed mounting, body axes."""
+        return self._constants[CAMERA].copy()
 
     def residual_dipole(self, sunlit: float) -> FloatArray:
-        """Return the residual dipole moment (3,) A m^2, body axes, for a visible fraction of the Sun."""
+        """Return the residual dipole (3,) A m^2, body axes, for the visible share `sunlit` of the Sun."""
         return np.asarray(self._constants[DIPOLE] + sunlit * self._constants[SUNLIT])
 
     def advance(
         self, seconds: float, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0
     ) -> None:
-        """Propagate by `seconds`, a second or two, under the coils' dipole moment (3,) A m^2 in body axes.
+        """Propagate by `seconds`, a second or two, under the commanded dipole (3,) A m^2, body axes.
 
-        `doubt` (A m^2) is the standard deviation per axis of the dipole moment if it may differ from the
-        command.
+        `doubt` A m^2 is the standard deviation per axis of the dipole, if it may differ from the command.
         """
         speed = math.sqrt(float(self.rate @ self.rate))
         steps = max(1, math.ceil(speed * seconds / LARGEST_ROTATION))
         for _ in range(steps):
             self._step(seconds / steps, dipole, around, doubt)
 
+    def begin_mean(self) -> None:
+        """Begin the interval over which the next gyro rate is a mean."""
+        self._lag, self._since = np.zeros(3), 0.0
+
     def gyro(
         self, rate: FloatArray, covariance: FloatArray, change: FloatArray | None = None, since: float = 0.0
     ) -> bool:
         """Apply a gyro rate (3,) rad/s with its covariance (3, 3); return whether it passed the gate.
 
-        For a mean over a past interval, `since` (s) is the age of the middle of the interval. `change` (3,)
-        rad/s is then the change of the rate since that time by the acceleration of the last step.
+        For a mean over the past, `change` (3,) rad/s is the change of the rate since the middle of the mean,
+        `since` s ago, by the acceleration of the last step. The curvature of the rate since `begin_mean` is
+        added here.
         """
-        rows = -since * self._slope
-        rows[:, RATE] += _EYE
+        matrix = _EYE + self._matrix(GYRO_MATRIX)
+        then = self.rate
+        if change is not None:
+            then = then - change
+            if self._since > 0.0:
+                then = then - (self._lag / self._since - 0.5 * self._since * self.acceleration)
+        rows = -since * (matrix @ self._slope)
+        rows[:, RATE] += matrix
         rows[:, GYRO] += _EYE
-        value = rate - self.rate - self._constants[GYRO]
-        return self._update(value if change is None else value + change, rows, covariance)
+        rows[:, GYRO_MATRIX] += by_matrix(then)
+        return self._update(rate - matrix @ then - self._constants[GYRO], rows, covariance)
 
     def mean_rate(self, rate: FloatArray, covariance: FloatArray, change: FloatArray) -> bool:
-        """Apply a rate (3,) rad/s measured without the gyro, such as from streaks, with covariance (3, 3).
+        """Apply a rate (3,) rad/s by the star camera, free of gyro bias, with its covariance (3, 3).
 
-        `change` (3,) rad/s is the change of the body rate since the measurement.
+        `change` (3,) rad/s is the change of the rate since then.
         """
         rows = np.zeros((3, STATES))
-        rows[:, RATE] = _EYE
-        return self._update(rate + change - self.rate, rows, covariance)
+        rows[:, RATE], rows[:, CAMERA] = _EYE, cross_matrix(self.rate)
+        turned = attitude_matrix(from_rotation_vector(self._constants[CAMERA])) @ self.rate
+        return self._update(rate + change - turned, rows, covariance)
 
-    def attitude(self, quaternion: FloatArray, covariance: FloatArray, age: float = 0.0) -> bool:
-        """Apply an attitude (4,) that is `age` s old, with covariance (3, 3) rad^2, present body axes."""
+    def attitude(
+        self, quaternion: FloatArray, covariance: FloatArray, age: float = 0.0, *, by_stars: bool = True
+    ) -> bool:
+        """Apply an attitude (4,) of the star camera, or else of the horizon cameras, measured `age` s ago.
+
+        `covariance` (3, 3) rad^2 is in the present body axes.
+        """
         since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self.acceleration)
         rows = np.zeros((3, STATES))
-        # The rotation since the measurement is computed from the rate and has its error.
+        # The rotation since the measurement has the error of the rate.
         rows[:, ATTITUDE], rows[:, RATE] = _EYE, -age * _EYE
-        error = multiply(multiply(since, quaternion), conjugate(self.quaternion))
+        misaligned = CAMERA if by_stars else HORIZON
+        rows[:, misaligned] = _EYE
+        expected = multiply(from_rotation_vector(self._constants[misaligned]), self.quaternion)
+        error = multiply(multiply(since, quaternion), conjugate(expected))
         return self._update(to_rotation_vector(error), rows, covariance)
 
     def direction(self, observed: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
-        """Apply a direction given in body axes and ICRS, with covariance (3, 3) rad^2 in body axes."""
+        """Apply a direction: unit vectors (3,) in body axes and ICRS, covariance (3, 3) rad^2, body axes."""
         expected = attitude_matrix(self.quaternion) @ reference
         across = tangent_basis(expected)
         rows = np.zeros((2, STATES))
-        rows[:, ATTITUDE] = across @ cross_matrix(expected)
-        return self._update(across @ observed, rows, across @ covariance @ across.T)
+        rows[:, ATTITUDE] = rows[:, HORIZON] = across @ cross_matrix(expected)
+        offset = rows[:, HORIZON] @ self._constants[HORIZON]
+        return self._update(across @ observed - offset, rows, across @ covariance @ across.T)
 
     def field(self, measured: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
-        """Apply a measured field (3,) T in body axes, given the modelled field (3,) T in ICRS axes."""
+        """Apply the field (3,) T, body axes, with its model (3,) T, ICRS, and covariance (3, 3) T^2."""
         expected = attitude_matrix(self.quaternion) @ reference
+        matrix = _EYE + self._matrix(FIELD_MATRIX)
         rows = np.zeros((3, STATES))
-        rows[:, ATTITUDE], rows[:, MAGNET], rows[:, FIELD] = cross_matrix(expected), _EYE, _EYE
+        rows[:, ATTITUDE], rows[:, FIELD_MATRIX] = matrix @ cross_matrix(expected), by_matrix(expected)
+        rows[:, MAGNET] = rows[:, FIELD] = _EYE
         bias = self._constants[MAGNET] + self._constants[FIELD]
-        return self._update(measured - expected - bias, rows, covariance + CURRENTS**2 * _EYE)
+        return self._update(measured - matrix @ expected - bias, rows, covariance + CURRENTS**2 * _EYE)
+
+    def _matrix(self, at: slice) -> FloatArray:
+        return self._constants[at].reshape(3, 3)
 
     def _reset_field(self) -> None:
-        """Reset the estimated error of the field model, but keep its standard deviation."""
+        """Forget the error of the field model except for its size."""
         self._constants[FIELD] = 0.0
         self.covariance[FIELD] = self.covariance[:, FIELD] = 0.0
         self.covariance[FIELD, FIELD] = self.field_error**2 * _EYE
 
     def _propagate_field_error(self, dt: float) -> None:
-        """Propagate the error of the field model, and estimate its variance while the attitude is fine."""
+        """Let the error of the field model decay, and learn its size while the attitude is fine."""
         covariance, error = self.covariance, self._constants[FIELD]
         if self.worst_sigma <= self._settings.fine:
             square = (float(error @ error) + float(covariance[FIELD, FIELD].trace())) / 3.0
@@ -433,48 +574,60 @@ class FreeFilter:
         covariance[:, FIELD] *= kept
         covariance.reshape(-1)[_FIELD_DIAGONAL] += (1.0 - kept**2) * self.field_error**2
 
-    def _step(self, dt: float, dipole: FloatArray, around: FilterEnvironment, doubt: float) -> None:
-        """Propagate state and covariance by one step of the midpoint rule."""
+    def _propagate_horizon(self, dt: float) -> None:
+        """Let the misalignment of the horizon cameras change to that of other cameras."""
+        kept = math.exp(-dt / HORIZON_MEMORY)
+        self._constants[HORIZON] *= kept
+        self.covariance[HORIZON] *= kept
+        self.covariance[:, HORIZON] *= kept
+        self.covariance[HORIZON, HORIZON] += (1.0 - kept**2) * self.layout.prior[HORIZON, HORIZON]
+
+    def _step(self, dt: float, driven: FloatArray, around: FilterEnvironment, doubt: float) -> None:
+        """Take one step of the midpoint rule, with its covariance."""
         self.changes += 1
-        motion = self.motion
-        motion.rotate_axes(self._constants[AXES])
-        middle = multiply(from_rotation_vector(0.5 * dt * self.rate), self.quaternion)
-        whole = dipole + self.residual_dipole(around.sunlit)
-        torque, flow = motion.torque(middle, whole, self._constants[TORQUES], around)
-        half = self.rate + 0.5 * dt * motion.acceleration(self.rate, torque)
+        motion, rate = self.motion, self.rate
+        motion.correct(self._constants[INERTIA])
+        middle = multiply(from_rotation_vector(0.5 * dt * rate), self.quaternion)
+        whole = self.coil_matrix @ driven + self.residual_dipole(around.sunlit)
+        torque, flow = motion.torque(middle, driven, whole, self._constants[TORQUES], around)
+        first = motion.acceleration(rate, torque)
+        half = rate + 0.5 * dt * first
         acceleration = motion.acceleration(half, torque)
         flow[0:3, ATTITUDE], flow[0:3, RATE] = -cross_matrix(half), _EYE
         flow[3:6, RATE] = motion.stiffness(half)
-        flow[3:6, AXES] += motion.by_axes(half, acceleration)
+        flow[3:6, INERTIA] += motion.by_inertia(half, acceleration)
         self._slope = flow[3:6].copy()
-        rotation = from_rotation_vector(dt * (self.rate + 0.5 * dt * acceleration))
+        after = rate + dt * acceleration
+        # The integral of a rate whose acceleration changes linearly from `first` over the middle.
+        swept = dt * (0.5 * (rate + after) - dt / 6.0 * (acceleration - first))
+        # The rate changes its direction during the step (Bortz 1971, to second order).
+        rotation = from_rotation_vector(swept + dt * dt / 12.0 * cross_product(rate, after))
+        self._lag = self._lag + self._since * (after - rate) + dt * after - swept
+        self._since += dt
         self.quaternion = multiply(rotation, self.quaternion)
         self.acceleration = acceleration
-        self.rate = self.rate + dt * acceleration
+        self.rate = after
         flow *= dt
         flow += 0.5 * (flow[:, :6] @ flow)
         flow[:, :6] += np.eye(6)
         covariance = self.covariance
         covariance[:6] = flow @ covariance
         covariance[:, :6] = covariance @ flow.T
-        density = dt * self.rate_noise(dipole, around, doubt)
+        density = dt * self.rate_noise(driven, around, doubt)
         covariance[RATE, RATE] += density
         covariance[ATTITUDE, ATTITUDE] += dt * dt / 3.0 * density
         covariance[ATTITUDE, RATE] += 0.5 * dt * density
         covariance[RATE, ATTITUDE] += 0.5 * dt * density
-        covariance.reshape(-1)[:: STATES + 1][SLOW] += dt * self._walks
+        covariance.reshape(-1)[:: STATES + 1] += dt * self.layout.walks
         self._propagate_field_error(dt)
+        self._propagate_horizon(dt)
 
     def rate_noise(self, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0) -> FloatArray:
-        """Return the noise density (3, 3) rad^2/s^3 of the acceleration for a dipole moment of the coils."""
+        """Return the noise density (3, 3) rad^2/s^3 of the acceleration for the coils' dipole (3,) A m^2."""
         settings, motion, square = self._settings, self.motion, float(dipole @ dipole)
         coils = LASTING * (settings.coil_error**2 * square / 3.0 + doubt**2)
         coils += settings.coil_noise**2 if square else 0.0
-        # The error of the gyroscopic torque is correlated while the body rotates by less than two radians.
-        speed = math.sqrt(float(self.rate @ self.rate))
-        gyroscopic = speed**2 * settings.inertia_error * motion.largest_difference
-        lasting = LASTING if LASTING * speed < 2.0 else 2.0 / speed
-        density = (settings.torque_noise**2 + lasting * gyroscopic**2) * motion.by_torque
+        density = settings.torque_noise**2 * motion.by_torque
         if coils:
             field = attitude_matrix(self.quaternion) @ around.field
             across = motion.inverse @ cross_matrix(field)
@@ -482,18 +635,25 @@ class FreeFilter:
         return np.asarray(density)
 
     def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:
-        """Correct by an innovation (k,), if it passes the gate, and return whether it passed."""
+        """Correct by an innovation (k,), rows (k, STATES) and noise (k, k); return whether it passed."""
         cross = self.covariance @ rows.T
         weight = np.linalg.inv(rows @ cross + noise)
         if not 0.0 <= float(value @ weight @ value) <= self._gates[len(value)]:  # a NaN does not pass
             self.refused += 1
             return False
         self.changes += 1
-        gain = cross @ weight
+        self.covariance, gain = self.layout.kalman_update(self.covariance, cross @ weight, cross)
         error = gain @ value
-        covariance = self.covariance - gain @ cross.T
-        self.covariance = 0.5 * (covariance + covariance.T)
         self.quaternion = multiply(from_rotation_vector(error[ATTITUDE]), self.quaternion)
         self.rate = self.rate + error[RATE]
         self._constants[6:] += error[6:]
         return True
+
+
+_CAMERA_ROWS: FloatArray = np.zeros((3, STATES))
+_CAMERA_ROWS[:, ATTITUDE] = _CAMERA_ROWS[:, CAMERA] = _EYE
+
+
+def plausible(values: FloatArray, variances: FloatArray) -> BoolArray:
+    """Return which `values` (k,) of slow states are plausible under their `variances` (k,) at the start."""
+    return np.asarray(np.abs(values) <= PLAUSIBLE * np.sqrt(variances))

@@ -26,12 +26,16 @@ class _AtOneTime:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeMeasurement(_AtOneTime):
-    """A measured attitude (4,) from reference into body axes, with covariance (3, 3) rad^2 in body axes."""
+    """A measured attitude (4,) from reference into body axes, with covariance (3, 3) rad^2 in body axes.
+
+    `by_stars` marks an attitude of the star camera, whose misalignment is not part of the covariance.
+    """
 
     time_ns: int
     quaternion: FloatArray
     covariance: FloatArray
     latency: float | None = None
+    by_stars: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -328,19 +328,31 @@ _NEGLIGIBLE = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class BodyErrors:
-    """Largest errors of the description of a body; random errors are drawn uniformly up to these values.
+    """Largest errors of the description of a body and its devices.
+
+    Random errors are drawn uniformly up to these values.
 
     Attributes:
         moments: largest relative error of the principal moments of inertia.
         axes: largest rotation of the principal axes about each body axis, rad.
         gyro_scale: largest relative error of the gyro's scale factors.
         gyro_alignment: largest misalignment of each gyro axis toward each other axis, rad.
+        coil_gain: largest relative error of the dipole of each coil.
+        coil_axes: largest misalignment of each coil toward each other axis, rad.
+        field_matrix: largest error of each element of the magnetometer's matrix.
+        camera: largest rotation of the star camera about each body axis, rad.
+        horizon: largest rotation of each horizon camera about each body axis, rad.
     """
 
     moments: float = 0.1
     axes: float = math.radians(5.0)
     gyro_scale: float = 3e-3
     gyro_alignment: float = 2e-3
+    coil_gain: float = 0.2
+    coil_axes: float = math.radians(3.0)
+    field_matrix: float = 0.01
+    camera: float = math.radians(0.1)
+    horizon: float = math.radians(0.1)
 
 
 def rate_products(rates: FloatArray) -> FloatArray:
@@ -360,13 +372,8 @@ def coefficient_modes(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
     violate the triangle inequality are omitted. The random bodies are drawn with a fixed seed.
     """
     generator = np.random.default_rng(0)
-    moments, axes = np.linalg.eigh(inertia)
-    drawn = moments * (1.0 + errors.moments * generator.uniform(-1.0, 1.0, (_DRAWS, 3)))
-    drawn = drawn[2.0 * drawn.max(axis=1) < drawn.sum(axis=1)]
-    count = len(drawn)
-    rotations = from_rotation_vector(errors.axes * generator.uniform(-1.0, 1.0, (count, 3)))
-    principal = attitude_matrix(rotations) @ axes
-    tensors = np.einsum("nij,nj,nkj->nik", principal, drawn, principal)
+    tensors = _random_tensors(inertia, errors, generator)
+    count = len(tensors)
     gyro = errors.gyro_alignment * generator.uniform(-1.0, 1.0, (count, 3, 3))
     gyro[:, range(3), range(3)] = 1.0 + errors.gyro_scale * generator.uniform(-1.0, 1.0, (count, 3))
     back = np.linalg.inv(gyro)
@@ -375,6 +382,26 @@ def coefficient_modes(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
     variances, vectors = np.linalg.eigh(changes.T @ changes / count)
     kept = variances > _NEGLIGIBLE * variances[-1]
     return np.asarray((vectors[:, kept] * np.sqrt(variances[kept])).T.reshape(-1, 3, 6))
+
+
+def inertia_covariance(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
+    """Return the covariance (6, 6) of the elements xx, yy, zz, yz, zx, xy of a tensor, relative to its trace.
+
+    It is that of random tensors near an assumed `inertia` (3, 3), drawn with a fixed seed.
+    """
+    tensors = _random_tensors(inertia, errors, np.random.default_rng(0))
+    changes = (tensors - inertia)[:, _FIRST, _SECOND] / np.trace(inertia)
+    return np.asarray(changes.T @ changes / len(changes))
+
+
+def _random_tensors(inertia: FloatArray, errors: BodyErrors, generator: np.random.Generator) -> FloatArray:
+    """Return random tensors (n, 3, 3) near `inertia` (3, 3) that satisfy the triangle inequality."""
+    moments, axes = np.linalg.eigh(inertia)
+    drawn = moments * (1.0 + errors.moments * generator.uniform(-1.0, 1.0, (_DRAWS, 3)))
+    drawn = drawn[2.0 * drawn.max(axis=1) < drawn.sum(axis=1)]
+    rotations = from_rotation_vector(errors.axes * generator.uniform(-1.0, 1.0, (len(drawn), 3)))
+    principal = attitude_matrix(rotations) @ axes
+    return np.einsum("nij,nj,nkj->nik", principal, drawn, principal)
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flight.bodies.orbit.filter import (
+    BODY,
     ERRORS,
     LEARNED_AT,
     PARTS,
@@ -25,8 +26,11 @@ from knightcube.gnc.estimation.free_filter import (
     SlowStates,
 )
 
+INERTIA = np.diag([0.0066, 0.0333, 0.0333])
 SETTINGS = FreeFilterSettings()
-START, WALK = SETTINGS.of_slow(0), SETTINGS.of_slow(1)
+LAYOUT = SETTINGS.error_state(INERTIA)
+PRIOR = LAYOUT.prior[SLOW, SLOW]
+START, WALK = np.sqrt(PRIOR.diagonal()), np.sqrt(LAYOUT.walks[SLOW])
 THEN, CHANGED = 1.78e9, 0.05
 
 
@@ -51,7 +55,7 @@ def grown(age: float) -> FloatArray:
 
 def test_states_come_back_with_a_covariance_grown_by_their_age() -> None:
     for age in (0.0, 3_600.0):
-        prior, problems = start_from(stored(known()), SETTINGS, CHANGED, THEN + age)
+        prior, problems = start_from(stored(known()), LAYOUT, CHANGED, THEN + age)
         assert not problems
         assert np.array_equal(prior.values, known().values)
         assert np.allclose(np.diag(prior.covariance), grown(age), rtol=1e-12)
@@ -61,35 +65,51 @@ def test_states_come_back_with_a_covariance_grown_by_their_age() -> None:
 
 
 def test_a_clock_put_back_counts_as_a_day() -> None:
-    prior, problems = start_from(stored(known()), SETTINGS, CHANGED, THEN - 5.0)
+    prior, problems = start_from(stored(known()), LAYOUT, CHANGED, THEN - 5.0)
     assert not problems
     assert np.allclose(np.diag(prior.covariance), grown(UNKNOWN_AGE), rtol=1e-12)
 
 
 def test_without_a_time_or_far_from_what_is_expected_nothing_is_believed() -> None:
-    nothing = SlowStates(np.zeros(len(START)), np.diag(START**2))
+    nothing = SlowStates(np.zeros(len(START)), PRIOR)
     timeless = {name: one for name, one in stored(known()).items() if name != LEARNED_AT}
     wild = stored(SlowStates(5.0 * START, known().covariance))
     for learned, refused in (({}, 0), (timeless, 0), (wild, len(PARTS))):
-        prior, problems = start_from(learned, SETTINGS, CHANGED, THEN)
+        prior, problems = start_from(learned, LAYOUT, CHANGED, THEN)
         assert len(problems) == refused
         assert np.array_equal(prior.values, nothing.values)
         assert np.array_equal(prior.covariance, nothing.covariance)
     part = {**stored(known()), ERRORS: wild[ERRORS]}
-    prior, problems = start_from(part, SETTINGS, CHANGED, THEN)
+    prior, problems = start_from(part, LAYOUT, CHANGED, THEN)
     assert len(problems) == 1
+    assert "sigma of what is expected" in problems[0]
     assert np.array_equal(prior.values[PARTS[SOURCES]], known().values[PARTS[SOURCES]])
 
 
 def test_the_filter_starts_from_them_and_a_contradiction_takes_their_claim_away() -> None:
-    prior, _ = start_from(stored(known()), SETTINGS, CHANGED, THEN)
-    found = FreeFilter(np.diag([0.0066, 0.0333, 0.0333]), SETTINGS, prior)
+    prior, _ = start_from(stored(known()), LAYOUT, CHANGED, THEN)
+    found = FreeFilter(INERTIA, SETTINGS, prior)
     gyro = np.array([1e-3, 2e-3, 3e-3])
     still, sure = np.array([0.0, 0.0, 0.0, 1.0]), 1e-8 * np.eye(3)
     found.start(still, sure, gyro)
     assert np.allclose(found.gyro_bias, 0.5e-3)
-    assert np.allclose(found.rate, gyro - 0.5e-3)
+    assert np.allclose(found.rate, gyro - 0.5e-3, rtol=0.01), "by the gyro's matrix too"
     assert np.allclose(found.covariance[SLOW, SLOW], prior.covariance)
     found.start(still, sure, gyro, doubted=True)
-    assert np.allclose(np.diag(found.covariance)[SLOW], START**2)
+    assert np.allclose(found.covariance[SLOW, SLOW], PRIOR)
     assert np.allclose(found.gyro_bias, 0.5e-3), "as a guess it stays"
+
+
+def test_states_of_another_version_with_another_number_of_values_are_rejected() -> None:
+    learned = stored(known())
+    shorter = Learned.of(np.zeros(9), np.eye(9))
+    prior, problems = start_from({**learned, ERRORS: shorter}, LAYOUT, CHANGED, THEN)
+    assert problems == [f"{ERRORS} has 9 values instead of 27"]
+    assert np.array_equal(prior.values[PARTS[ERRORS]], np.zeros(27))
+
+
+def test_the_inertia_of_the_next_boot_may_have_changed_without_losing_its_correlations() -> None:
+    prior, _ = start_from(stored(known()), LAYOUT, 1.0, THEN)
+    at = PARTS[BODY]
+    grown = prior.covariance[np.ix_(at, at)] - known().covariance[np.ix_(at, at)]
+    np.testing.assert_allclose(grown, PRIOR[np.ix_(at, at)], rtol=1e-9, atol=1e-15)

@@ -5,10 +5,24 @@ from __future__ import annotations
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import compose, exponential
 from knightcube.gnc.estimation.estimate import FilterState, Parameters
+from knightcube.gnc.estimation.rigid_body import BodyErrors
 
 STATE = FilterState(
     exponential(0.3, -0.5, 0.8), (0.2, -0.3, 0.1), (1e-3, 0.0, -2e-3), (0.01, 0.02, -0.03), Parameters()
 )
+
+NO_ERRORS = BodyErrors(
+    moments=0.0,
+    axes=0.0,
+    gyro_scale=0.0,
+    gyro_alignment=0.0,
+    coil_gain=0.0,
+    coil_axes=0.0,
+    field_matrix=0.0,
+    camera=0.0,
+    horizon=0.0,
+)
+"""A description of body and devices that is exact."""
 
 
 def moved(state: FilterState, error: FloatArray) -> FilterState:

@@ -1,0 +1,84 @@
+"""The errors of a flight configuration's description of the satellite, drawn from a seed.
+
+The flight software knows moments of inertia, coils and sensors to the accuracies that its configuration
+states. The simulated satellite therefore differs from the description: each error is drawn uniformly and
+independently within a multiple of its accuracy. Moments that violate the triangle inequality are drawn again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.schema.orbit import OrbitConfig
+from flight.schema.sections import Config
+from knightcube.astro.arrays import FloatArray
+from sim_hal.settings import Simulation
+
+_STREAM = 0xD1FF
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DescriptionErrors:
+    """The true values of a satellite relative to its description.
+
+    Attributes:
+        moments: (3,) ratios of the true to the described principal moments of inertia.
+        axes: (3,) rotation vector of the principal axes, rad, body axes.
+        coils: (3, 3) from the described to the true dipole.
+        gyro: (3, 3) from the true rate to the rate that the gyro measures, without its bias.
+        field: (3, 3) from the true to the measured magnetic field, without the bias.
+        field_bias: (3,) T.
+        camera: (3,) rotation vector of the star camera from its described mounting, rad, body axes.
+        horizon: (n, 3) rotation vectors of the horizon cameras, in the same way.
+    """
+
+    moments: FloatArray
+    axes: FloatArray
+    coils: FloatArray
+    gyro: FloatArray
+    field: FloatArray
+    field_bias: FloatArray
+    camera: FloatArray
+    horizon: FloatArray
+
+
+NO_ERRORS = DescriptionErrors(
+    np.ones(3), np.zeros(3), np.eye(3), np.eye(3), np.eye(3), np.zeros(3), np.zeros(3), np.zeros((0, 3))
+)
+
+
+def description_errors(config: Config, section: Simulation) -> DescriptionErrors:
+    """Return the errors of the seed of `section`; a body that is not in orbit has none."""
+    body = section.free_body
+    if body is None or body.errors == 0.0 or not isinstance(config, OrbitConfig):
+        return NO_ERRORS
+    generator = np.random.default_rng([section.seed, _STREAM])
+    craft, unit = config.craft.accuracy, config.inertial_unit.accuracy
+
+    def drawn(bound: float, *shape: int) -> FloatArray:
+        return body.errors * bound * generator.uniform(-1.0, 1.0, shape)
+
+    def matrix(scale: float, alignment: float) -> FloatArray:
+        errors = drawn(alignment, 3, 3)
+        np.fill_diagonal(errors, drawn(scale, 3))
+        return np.eye(3) + errors
+
+    inertia = np.array(config.craft.inertia)
+    while True:
+        moments = 1.0 + drawn(craft.moments, 3)
+        if 2.0 * float((moments * inertia).max()) < float((moments * inertia).sum()):
+            break
+    camera = 0.0 if config.camera is None else math.radians(config.camera.accuracy.mounting_deg)
+    return DescriptionErrors(
+        moments=moments,
+        axes=drawn(math.radians(craft.axes_deg), 3),
+        coils=matrix(craft.coil_gain, math.radians(craft.coil_axes_deg)),
+        gyro=matrix(unit.gyro_scale, unit.gyro_alignment),
+        field=matrix(unit.field_matrix, unit.field_matrix),
+        field_bias=drawn(unit.field_bias, 3),
+        camera=drawn(camera, 3),
+        horizon=np.array([drawn(math.radians(one.mounting_deg), 3) for one in config.wide_cameras]),
+    )
