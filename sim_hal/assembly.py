@@ -25,7 +25,7 @@ from knightcube.astro.catalogue import load
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.vision.camera.lens import Lens, Pinhole
 from sim_hal.clock import EmulatedDevice, FaultTimeline, SerialEnd, TimedSimulation
-from sim_hal.description_errors import NO_ERRORS, description_errors
+from sim_hal.description_errors import NO_ERRORS, description_errors, true_description
 from sim_hal.emulators.camera import EmulatedCamera, Expose, no_objects
 from sim_hal.emulators.coil_circuit import CoilCircuit, EmulatedIna219
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
@@ -148,7 +148,7 @@ def assemble(
         coils.bus.attach(part)
     faults = FaultTimeline()
     if truth is not None:
-        truth.watch(world)
+        truth.watch(world, true_description(config, section, world))
     # Devices with events at the same time run in the order of this list.
     devices: list[EmulatedDevice | None] = [unit, camera, orbit.gps, *orbit.wide, faults, truth]
     simulation = TimedSimulation(world.advance_to, [device for device in devices if device is not None])

@@ -90,9 +90,9 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     sqrt(s). The values `torque_start` and `torque_walk` should be smaller for a light satellite, because
     plans extrapolate an estimated torque along the field for an hour. From one boot to the next, the gyro
     bias may change by 10 deg/h, and the residual dipole by the fraction `changed` of its initial standard
-    deviation. The mapping `roles` gives blocks of the error state another role: `estimated`, `considered` (the
-    block is not corrected, but its uncertainty is part of every covariance) or `fixed` (the block is known
-    exactly).
+    deviation. The mapping `roles` gives blocks of the error state another role: `estimated`, `considered`
+    (the block is not corrected, but its uncertainty is part of every covariance) or `fixed` (the block is
+    known exactly).
     """
 
     bias_walk: NotNegative = 2.0e-6

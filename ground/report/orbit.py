@@ -139,9 +139,7 @@ def knowledge(run: Run) -> Object | None:
     fine = level[np.maximum(at, 0)] == FINE
     error, sigma = errors.error[fine], errors.sigma[fine]
     size = np.linalg.norm(errors.error, axis=1)
-    stars = run["stars"]
-    accepted = np.concatenate([[-math.inf], seconds(stars[stars["accepted"] == 1])])
-    age = errors.times - accepted[np.searchsorted(accepted, errors.times, side="right") - 1]
+    age = stars_age(run, errors.times)
     last = packets[-1]
     return {
         "share": {name: float(np.mean(level == k)) for k, name in enumerate(("lost", "coarse", "fine"))},
@@ -155,7 +153,73 @@ def knowledge(run: Run) -> Object | None:
         "fixes_refused": int(last["fixes_refused"]),
         "restarts": int(last["restarts"]),
         "dipole_error_share": dipole_errors(run),
+        "star_camera": star_camera_knowledge(run),
+        "description": learned_description(run),
     }
+
+
+def stars_age(run: Run, times: FloatArray) -> FloatArray:
+    """Return the age (n,) s of the newest accepted star attitude at `times` (n,) s; infinite before one."""
+    stars = run["stars"]
+    accepted = np.concatenate([[-math.inf], seconds(stars[stars["accepted"] == 1])])
+    return np.asarray(times - accepted[np.searchsorted(accepted, times, side="right") - 1])
+
+
+def camera_errors(run: Run) -> AttitudeErrors:
+    """Return the errors of the estimated attitude of the star camera, about the body axes.
+
+    They do not contain the misalignment of the star camera, to which the attitude of the body is uncertain.
+    The result is empty without description packets of the estimate and of the truth.
+    """
+    errors, packets, true = attitude_errors(run), run["description"], run["true_description"]
+    if not len(packets) or not len(true) or not len(errors.times):
+        return AttitudeErrors(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+    # The misalignment changes slowly; the attitude of the same cycle is compared.
+    at = np.searchsorted(errors.times, seconds(packets))
+    inside = at < len(errors.times)
+    packets, at = packets[inside], at[inside]
+    misaligned = true["camera"][0].astype(float) - packets["camera"].astype(float)
+    error = errors.error[at] + misaligned
+    return AttitudeErrors(errors.times[at], error, packets["camera_attitude_sigma"].astype(float))
+
+
+def star_camera_knowledge(run: Run) -> Object | None:
+    """Return the rms error with stars and the NEES of an axis of the star camera's attitude.
+
+    Returns None without description packets of the estimate and of the truth.
+    """
+    found = camera_errors(run)
+    if not len(found.times):
+        return None
+    with_stars = stars_age(run, found.times) < WITH_STARS_S
+    return {
+        "with_stars_error_rms_rad": _rms(np.linalg.norm(found.error[with_stars], axis=1)),
+        "nees_per_axis": float(np.mean((found.error / found.sigma) ** 2)),
+    }
+
+
+def learned_description(run: Run) -> list[Object]:
+    """Return the errors of the learned inertia, coils and sensors, with the rms of their uncertainty.
+
+    `first_error` is the rms error of the first estimate, `error` that of the last one.
+
+    The inertia is judged by its elements divided by the trace, because the coils alone show the scale. The
+    result is empty without description packets of the estimate and of the truth.
+    """
+    packets, true = run["description"], run["true_description"]
+    if not len(packets) or not len(true):
+        return []
+    last, real = packets[-1], true[0]
+    rows = []
+    for name in ("inertia", "coils", "gyro", "field", "camera"):
+        found, target = last[name].astype(float), real[name].astype(float)
+        sigma, first = last[f"{name}_sigma"].astype(float), packets[0][name].astype(float)
+        if name == "inertia":
+            sigma = sigma / found[:3].sum()
+            found, target, first = (one / one[:3].sum() for one in (found, target, first))
+        errors = {"first_error": _rms(first - target), "error": _rms(found - target), "sigma": _rms(sigma)}
+        rows.append({"name": name, **errors})
+    return rows
 
 
 def dipole_errors(run: Run) -> dict[str, float]:
@@ -286,7 +350,9 @@ def requirements(
         slowed_at = [one["begin_s"] + one["duration_s"] for one in periods if one["slowed"]]
         fine_at = known["fine_after_s"]
         fine = [math.inf if math.isnan(fine_at) else max(0.0, fine_at - at) for at in slowed_at]
-        error = [math.degrees(known["with_stars_error_rms_rad"])]
+        # Stars show the attitude of the star camera; that of the body is known to the camera's mounting.
+        camera = known.get("star_camera") or known
+        error = [math.degrees(camera["with_stars_error_rms_rad"])]
         rows.append(("time from detumbling to fine attitude", fine, limits.fine_within, "s"))
         rows.append(("attitude error with stars, rms", error, limits.knowledge_deg, "deg"))
     for target in pointed["targets"] if pointed else []:

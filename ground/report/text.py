@@ -137,7 +137,18 @@ def _knowledge(found: Object | None) -> list[str]:
     if found is None:
         return []
     share = ", ".join(f"{name} {number(part, 1, 100.0)} %" for name, part in found["share"].items())
-    dipole = found["dipole_error_share"]
+    dipole, camera = found["dipole_error_share"], found["star_camera"]
+    own: list[str] = []
+    if camera is not None:
+        error, nees = number(camera["with_stars_error_rms_rad"], 4, DEGREES), number(camera["nees_per_axis"])
+        own = [f"  error of the star camera's attitude {error} deg rms with stars, NEES per axis {nees}"]
+    learned = [
+        f"  {one['name']}: error {one['first_error']:.2g} at the start, {one['error']:.2g} at the end, "
+        f"one sigma {one['sigma']:.2g}"
+        for one in found["description"]
+    ]
+    if learned:
+        learned.insert(0, "  learned description, rms (inertia relative to the trace, camera in rad):")
     return [
         "Attitude knowledge",
         f"  {share}; first fine at {number(found['fine_after_s'], 1)} s",
@@ -146,6 +157,8 @@ def _knowledge(found: Object | None) -> list[str]:
         f"maximum {number(found['fine_error_worst_rad'], 4, DEGREES)} deg; "
         f"maximum {number(found['worst_sigmas'], 1)} sigma per axis, "
         f"NEES per axis {number(found['nees_per_axis'])}",
+        *own,
+        *learned,
         "  error of the residual dipole in the last ten minutes: "
         f"{number(dipole['sunlight'], 0, 100.0)} % in sunlight, "
         f"{number(dipole['shadow'], 0, 100.0)} % in shadow",

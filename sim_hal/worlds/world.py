@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from flight.link.telemetry.definitions import ORBIT_TRUTH, TRUTH
+from flight.link.telemetry.definitions import ORBIT_TRUTH, TRUE_DESCRIPTION, TRUTH
 from flight.link.telemetry.packets import Packer
 from flight.schema.document import ConfigError
 from flight.schema.sections import Config
@@ -242,16 +242,21 @@ class TruthRecorder:
         self._log = log
         self._packer = Packer()
         self._world: World | None = None
+        self._description: Mapping[str, FloatArray] | None = None
         self._epoch_ns = 0
         self._due_ns = NEVER
 
-    def watch(self, world: World) -> None:
-        """Set the world whose state is recorded."""
+    def watch(self, world: World, description: Mapping[str, FloatArray] | None = None) -> None:
+        """Set the world whose state is recorded, and the true description of its satellite, if known."""
         self._world = world
+        self._description = description
 
     def begin(self, epoch_ns: int) -> None:
         """Begin recording at mission time zero, which is `epoch_ns`."""
         self._epoch_ns = self._due_ns = epoch_ns
+        if self._description is not None:
+            fields = {name: value.ravel().tolist() for name, value in self._description.items()}
+            self._log.write(self._packer.pack(TRUE_DESCRIPTION, 0, **fields))
 
     def next_event_ns(self) -> int:
         """Return the time (ns) at which the next record is due."""

@@ -27,7 +27,7 @@ from flight.bodies.orbit.guidance import (
 from flight.bodies.streak_methods import corner_estimator
 from flight.link import events
 from flight.link.modes import Mode
-from flight.link.telemetry.definitions import NAVIGATION, SPIN
+from flight.link.telemetry.definitions import DESCRIPTION, NAVIGATION, SPIN
 from flight.loop import facts
 from flight.loop.body import BodyControl, BodyEstimation, BodyKind, ControlOutput, FlightBody, Target
 from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
@@ -64,6 +64,8 @@ SPIN_EVERY = 10
 """Number of control cycles from one spin packet to the next."""
 NAVIGATION_EVERY = 40
 """Number of control cycles from one navigation packet to the next."""
+DESCRIPTION_EVERY = 400
+"""Number of control cycles from one description packet to the next."""
 LEVELS = (Knowledge.LOST, Knowledge.COARSE, Knowledge.FINE)
 """Knowledge of the attitude, in the order of the numbers in the navigation packet."""
 _NAN3 = [math.nan] * 3
@@ -113,6 +115,8 @@ class OrbitView:
             text = f"{self._knowledge.value} -> {known.value}"
             self._events.report(events.ATTITUDE_KNOWLEDGE, now_ns, text)
             self._knowledge = known
+        if output.cycle.slot % DESCRIPTION_EVERY == 0 and estimate is not None:
+            self._record_description(now_ns)
         if output.cycle.slot % NAVIGATION_EVERY:
             return
         doubt = found.field_doubt
@@ -131,6 +135,12 @@ class OrbitView:
             field_bias=_NAN3 if estimate is None else estimate.field_bias.tolist(),
             residual_dipole=_NAN3 if estimate is None else found.residual_dipole.tolist(),
         )
+
+    def _record_description(self, now_ns: int) -> None:
+        """Record the estimated inertia, coils and sensors."""
+        values = self._filter.description()
+        fields = {name: values[name].ravel().tolist() for name in values}
+        self._recorder.record(DESCRIPTION, now_ns, **fields)
 
     def announce(self, target: Target, now_ns: int) -> None:
         """Report a new target as an event."""

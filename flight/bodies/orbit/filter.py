@@ -655,6 +655,10 @@ class OrbitFilter:
         """The slow states of body, coils and sensors."""
         return self._free.slow
 
+    def description(self) -> dict[str, FloatArray]:
+        """Return the estimated inertia, coils and sensors by the field names of the description packet."""
+        return self._free.description()
+
     @property
     def magnet_bias(self) -> FloatArray:
         """The magnetometer's bias (3,), T, body axes."""
@@ -815,7 +819,7 @@ UNKNOWN_AGE = 86_400.0
 
 def _places(*parts: slice) -> IntArray:
     """Return the indices, within the slow states, of parts of the filter's state."""
-    return np.concatenate([np.arange(part.start, part.stop) for part in parts]) - GYRO.start
+    return np.asarray(np.concatenate([np.arange(part.start, part.stop) for part in parts]) - GYRO.start)
 
 
 PARTS = {

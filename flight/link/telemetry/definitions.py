@@ -494,6 +494,39 @@ NAVIGATION = Packet(
     ),
 )
 
+_INERTIA = "inertia tensor xx yy zz yz zx xy, body axes"
+_COILS = "matrix from the commanded to the actual dipole, row by row"
+_GYRO = "matrix from the rate to the rate that the gyro measures, row by row"
+_FIELD = "matrix from the magnetic field to the field that the magnetometer measures, row by row"
+_CAMERA = "rotation vector of the star camera from its configured mounting, body axes"
+_ONE_SIGMA = "standard deviations of "
+
+DESCRIPTION = Packet(
+    "description",
+    0x118,
+    "0.1 Hz",
+    "Estimated inertia, coils and sensors of a satellite in orbit, with their standard deviations",
+    (
+        Field("inertia", "f8", "kg m^2", _INERTIA, 6),
+        Field("inertia_sigma", "f4", "kg m^2", _ONE_SIGMA + "inertia", 6),
+        Field("coils", "f8", "-", _COILS, 9),
+        Field("coils_sigma", "f4", "-", _ONE_SIGMA + "coils", 9),
+        Field("gyro", "f8", "-", _GYRO, 9),
+        Field("gyro_sigma", "f4", "-", _ONE_SIGMA + "gyro", 9),
+        Field("field", "f8", "-", _FIELD, 9),
+        Field("field_sigma", "f4", "-", _ONE_SIGMA + "field", 9),
+        Field("camera", "f8", "rad", _CAMERA, 3),
+        Field("camera_sigma", "f4", "rad", _ONE_SIGMA + "camera", 3),
+        Field(
+            "camera_attitude_sigma",
+            "f4",
+            "rad",
+            "standard deviations of the attitude of the star camera about the body axes",
+            3,
+        ),
+    ),
+)
+
 DIRECTIONS = Packet(
     "directions",
     0x117,
@@ -541,6 +574,20 @@ ORBIT_TRUTH = Packet(
         Field("gravity_torque", "f8", "N m", "torque of the gravity gradient, body axes", 3),
         Field("drag_torque", "f8", "N m", "torque of air drag, body axes", 3),
         Field("sunlight_torque", "f8", "N m", "torque of solar pressure, body axes", 3),
+    ),
+)
+
+TRUE_DESCRIPTION = Packet(
+    "true_description",
+    0x142,
+    "at the start, simulation of an orbit only",
+    "True inertia, coils and sensors of the simulated satellite, which sim_hal writes",
+    (
+        Field("inertia", "f8", "kg m^2", _INERTIA, 6),
+        Field("coils", "f8", "-", _COILS, 9),
+        Field("gyro", "f8", "-", _GYRO, 9),
+        Field("field", "f8", "-", _FIELD, 9),
+        Field("camera", "f8", "rad", _CAMERA, 3),
     ),
 )
 
@@ -790,6 +837,7 @@ PACKETS: tuple[Packet, ...] = (
     ATTITUDE,
     SPIN,
     NAVIGATION,
+    DESCRIPTION,
     DIRECTIONS,
     TARGET,
     MODE,
@@ -808,6 +856,7 @@ PACKETS: tuple[Packet, ...] = (
     TRANSFER,
     TRUTH,
     ORBIT_TRUTH,
+    TRUE_DESCRIPTION,
     CYCLE_TIMING,
     RATE_GROUP,
     JOB_TIMING,

@@ -94,7 +94,7 @@ class ErrorState:
         return 0.5 * (covariance + covariance.T), gain
 
 
-def with_role(blocks: Sequence[StateBlock], roles: dict[str, Role]) -> list[StateBlock]:
+def with_role(blocks: Sequence[StateBlock], roles: Mapping[str, Role]) -> list[StateBlock]:
     """Return the blocks with other roles by name. Raises UsageError for a name without a block."""
     unknown = sorted(roles.keys() - {block.name for block in blocks})
     if unknown:

@@ -110,7 +110,8 @@ class FreeMotion:
     def __init__(self, inertia: FloatArray) -> None:
         """`inertia` (3, 3) kg m^2, body axes, is the assumed one."""
         self._assumed: FloatArray = np.asarray(inertia, dtype=float)
-        self._trace = float(np.trace(self._assumed))
+        self.trace = float(np.trace(self._assumed))
+        """Trace of the assumed inertia, kg m^2."""
         self._areas = box_areas(self._assumed)
         self._error: FloatArray = np.full(6, math.nan)
         self.correct(np.zeros(6))
@@ -120,7 +121,7 @@ class FreeMotion:
         if np.array_equal(error, self._error):
             return
         self._error = error.copy()
-        xx, yy, zz, yz, zx, xy = (self._trace * error).tolist()
+        xx, yy, zz, yz, zx, xy = (self.trace * error).tolist()
         self.inertia: FloatArray = self._assumed + np.array(((xx, xy, zx), (xy, yy, yz), (zx, yz, zz)))
         self.inverse: FloatArray = np.asarray(np.linalg.inv(self.inertia), dtype=float)
         self.by_torque: FloatArray = self.inverse @ self.inverse
@@ -166,13 +167,13 @@ class FreeMotion:
         flow[3:6, SUNLIT] = around.sunlit * flow[3:6, DIPOLE]
         flow[3:6, COILS] = flow[3:6, DIPOLE] @ by_matrix(driven)
         flow[3:6, TORQUES] = self.inverse @ shape
-        flow[3:6, INERTIA] = self._trace * strength * self.inverse @ upright @ by_inertia(up)
+        flow[3:6, INERTIA] = self.trace * strength * self.inverse @ upright @ by_inertia(up)
         return torque, flow
 
     def by_inertia(self, rate: FloatArray, acceleration: FloatArray) -> FloatArray:
         """Return the derivative (3, 6) of the acceleration by the inertia's error, without gravity."""
         changed = by_inertia(acceleration) + cross_matrix(rate) @ by_inertia(rate)
-        return np.asarray(-self._trace * self.inverse @ changed)
+        return np.asarray(-self.trace * self.inverse @ changed)
 
 
 def by_inertia(vector: FloatArray) -> FloatArray:
@@ -189,6 +190,8 @@ def by_matrix(vector: FloatArray) -> FloatArray:
 
 
 _AXES = np.arange(3)
+_ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
+"""Rows and columns of the elements xx, yy, zz, yz, zx, xy of a tensor."""
 
 
 LASTING = 20.0
@@ -386,7 +389,8 @@ class FreeFilter:
         misaligned = CAMERA if by_stars else HORIZON
         self.quaternion = multiply(from_rotation_vector(-self._constants[misaligned]), quaternion)
         first[ATTITUDE, misaligned] = -_EYE
-        self.rate = np.linalg.solve(_EYE + self._matrix(GYRO_MATRIX), gyro - self._constants[GYRO])
+        measured = gyro - self._constants[GYRO]
+        self.rate = np.asarray(np.linalg.solve(_EYE + self._matrix(GYRO_MATRIX), measured), dtype=float)
         first[RATE, GYRO], first[RATE, GYRO_MATRIX] = -_EYE, -by_matrix(self.rate)
         whole = self.covariance
         whole[:6] = first @ whole
@@ -450,20 +454,32 @@ class FreeFilter:
         return self._constants[TORQUES].copy()
 
     @property
-    def inertia(self) -> FloatArray:
-        """Estimated inertia (3, 3) kg m^2, body axes."""
-        self.motion.correct(self._constants[INERTIA])
-        return self.motion.inertia.copy()
-
-    @property
     def coil_matrix(self) -> FloatArray:
         """Matrix (3, 3) from the commanded to the estimated dipole of the coils."""
         return _EYE + self._matrix(COILS)
 
-    @property
-    def camera_misalignment(self) -> FloatArray:
-        """Rotation vector (3,) rad of the star camera from its assumed mounting, body axes."""
-        return self._constants[CAMERA].copy()
+    def description(self) -> dict[str, FloatArray]:
+        """Return the estimated description of body and sensors, and its standard deviations.
+
+        `inertia` (6,) kg m^2 holds xx, yy, zz, yz, zx and xy. `coils`, `gyro` and `field` (9,) are matrices,
+        row by row. `camera` (3,) rad is the rotation vector of the star camera. The standard deviations have
+        the same names with `_sigma`. `camera_attitude_sigma` (3,) rad is that of the attitude of the star
+        camera, which is known more accurately than the attitude of the body.
+        """
+        self.motion.correct(self._constants[INERTIA])
+        sigma = np.sqrt(self.covariance.diagonal())
+        found = {
+            "inertia": self.motion.inertia[_ROWS, _COLUMNS],
+            "inertia_sigma": self.motion.trace * sigma[INERTIA],
+        }
+        for name, at in (("coils", COILS), ("gyro", GYRO_MATRIX), ("field", FIELD_MATRIX)):
+            found |= {name: _EYE.ravel() + self._constants[at], f"{name}_sigma": sigma[at]}
+        own = np.sqrt(self.camera_covariance.diagonal())
+        return found | {
+            "camera": self._constants[CAMERA].copy(),
+            "camera_sigma": sigma[CAMERA],
+            "camera_attitude_sigma": own,
+        }
 
     def residual_dipole(self, sunlit: float) -> FloatArray:
         """Return the residual dipole (3,) A m^2, body axes, for the visible share `sunlit` of the Sun."""

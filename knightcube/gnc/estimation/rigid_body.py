@@ -401,7 +401,7 @@ def _random_tensors(inertia: FloatArray, errors: BodyErrors, generator: np.rando
     drawn = drawn[2.0 * drawn.max(axis=1) < drawn.sum(axis=1)]
     rotations = from_rotation_vector(errors.axes * generator.uniform(-1.0, 1.0, (len(drawn), 3)))
     principal = attitude_matrix(rotations) @ axes
-    return np.einsum("nij,nj,nkj->nik", principal, drawn, principal)
+    return np.asarray(np.einsum("nij,nj,nkj->nik", principal, drawn, principal))
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:

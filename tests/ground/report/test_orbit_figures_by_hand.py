@@ -111,6 +111,8 @@ def test_knowledge_counts_errors_while_fine_and_shortly_after_stars() -> None:
     assert found["worst_sigmas"] == pytest.approx(6.0, rel=1e-5)
     assert found["nees_per_axis"] == pytest.approx((4 + 9 + 36) / 9, rel=1e-5)
     assert (found["refused"], found["fixes_refused"], found["restarts"]) == (4, 5, 6)
+    assert found["star_camera"] is None
+    assert found["description"] == []
     assert orbit.knowledge(packed_run(attitude=attitude)) is None
     assert math.isnan(found["dipole_error_share"]["sunlight"])
     errors = orbit.attitude_errors(run)
@@ -199,6 +201,38 @@ def test_an_object_has_the_figures_of_its_own_packets() -> None:
         "rate_least_rad_s": pytest.approx(5e-3), "rate_most_rad_s": pytest.approx(7e-3),
         "magnitude": 5.0, "sighting_sigma_rad": pytest.approx(2e-5),
     }  # fmt: skip
+
+
+def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it() -> None:
+    tilt = np.array([1e-3, 0.0, -1e-3])
+    unit = np.eye(3).ravel().tolist()
+    matrices = {name: unit for name in ("coils", "gyro", "field")}
+    sigmas = {f"{name}_sigma": [0.1] * 9 for name in matrices}
+    inertia = [0.3, 0.3, 0.4, 0.0, 0.0, 0.1]
+    doubled = [2.0 * one for one in inertia]
+    # The estimate of the body is off by the whole misalignment, that of the star camera by 1e-4 rad about x.
+    body = from_rotation_vector(tilt + np.array([1e-4, 0.0, 0.0])).tolist()
+    run = packed_run(
+        navigation=[(0.0, {"knowledge": 2})],
+        attitude=[(t, {"quaternion": body, "angle_sigma": [2e-3] * 3}) for t in (0.5, 10.5, 40.5)],
+        stars=[(10.0, {"accepted": 1})],
+        truth=[(t, {"quaternion": UPRIGHT}) for t in (0.5, 10.5, 40.5)],
+        description=[
+            (t, {**matrices, **sigmas, "inertia": doubled, "inertia_sigma": [0.02] * 6, "camera": [0.0] * 3,
+                 "camera_sigma": [2e-3] * 3, "camera_attitude_sigma": [1e-4] * 3})
+            for t in (0.5, 10.5, 40.5)
+        ],
+        true_description=[(0.0, {**matrices, "inertia": inertia, "camera": (-tilt).tolist()})],
+    )  # fmt: skip
+    found = orbit.knowledge(run)
+    assert found is not None
+    error = math.sqrt(2.1e-3**2 + 2e-3**2)
+    assert found["with_stars_error_rms_rad"] == pytest.approx(math.sqrt(1.1e-3**2 + 1e-3**2), rel=1e-4)
+    assert found["star_camera"]["with_stars_error_rms_rad"] == pytest.approx(error, rel=1e-3)
+    rows = {row["name"]: row for row in found["description"]}
+    assert rows["inertia"]["error"] == pytest.approx(0.0, abs=1e-12), "only the ratio to the trace counts"
+    assert rows["inertia"]["sigma"] == pytest.approx(0.01, rel=1e-6)
+    assert rows["camera"]["error"] == pytest.approx(np.sqrt(np.mean(tilt**2)), rel=1e-6)
 
 
 def test_every_requirement_is_judged_by_its_figure() -> None:

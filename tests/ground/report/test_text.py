@@ -130,6 +130,8 @@ def test_knowledge_is_in_degrees_and_percent() -> None:
         "with_stars_error_rms_rad": 0.002 * DEGREE, "fine_error_worst_rad": 0.03 * DEGREE,
         "worst_sigmas": 3.14, "nees_per_axis": 1.049, "refused": 5, "fixes_refused": 6, "restarts": 7,
         "dipole_error_share": {"sunlight": 0.126, "shadow": 0.054},
+        "star_camera": {"with_stars_error_rms_rad": 0.003 * DEGREE, "nees_per_axis": 0.987},
+        "description": [{"name": "inertia", "first_error": 0.0123, "error": 0.00045, "sigma": 0.00067}],
     }  # fmt: skip
     [text, _] = blocks(knowledge=found)
     assert text.splitlines() == [
@@ -137,6 +139,9 @@ def test_knowledge_is_in_degrees_and_percent() -> None:
         "  lost 10.0 %, fine 90.0 %; first fine at 61.2 s",
         "  error while fine 0.0100 deg rms over three axes (0.0020 with stars), maximum 0.0300 deg; "
         "maximum 3.1 sigma per axis, NEES per axis 1.05",
+        "  error of the star camera's attitude 0.0030 deg rms with stars, NEES per axis 0.99",
+        "  learned description, rms (inertia relative to the trace, camera in rad):",
+        "  inertia: error 0.012 at the start, 0.00045 at the end, one sigma 0.00067",
         "  error of the residual dipole in the last ten minutes: 13 % in sunlight, 5 % in shadow",
         "  5 measurements and 6 fixes refused, 7 restarts",
     ]
