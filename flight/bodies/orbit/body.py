@@ -442,6 +442,7 @@ def _detumbler(
         field_sigma=section.field_noise,
         torque_walk=section.torque_noise,
         gyro_sigma=config.estimation.bias_start,
+        errors=description_errors(config),
     )
     braking = FieldDetumblerSettings(
         limit=_limit(config),

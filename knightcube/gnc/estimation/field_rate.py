@@ -4,11 +4,11 @@ Relative to a rotating body, the field direction moves on a cone about the rate 
 field direction therefore gives all three components of the rate, including the component along the field.
 Only a spin exactly along the field is not observable until the field direction has changed, which it does by
 about two revolutions per orbit. A gyro sample resolves a spin along the field at once. The states, in body
-axes, are the rate w, the field B, the inertial time derivative v of the field, and a small rotation a of the
-principal axes from the assumed principal axes. For a fast spinning long body, principal axes that are wrong
-by 2 deg cause the largest error of the torque model. The equations of motion are
+axes, are the rate w, the field B, the inertial time derivative v of the field, and the errors j of the six
+elements of the inertia tensor. In a fast tumble, an inertia that is wrong by a few per cent causes the
+largest error of the torque model. The equations of motion are
 
-    J(a) w' = m x B - w x J(a) w,    B' = v - w x B,    v' = -w x v,    a' = 0.
+    J(j) w' = m x B - w x J(j) w,    B' = v - w x B,    v' = -w x v,    j' = 0.
 
 The dipole moment m of the coils is known, so the coils may be driven between field measurements. The filter
 also integrates the rotation since its start, so the initial body axes can serve as an inertial frame.
@@ -16,13 +16,14 @@ also integrates the rotation since its start, so the initial body axes can serve
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.rigid_body import BodyErrors, by_inertia, inertia_covariance, tensor
 from knightcube.astro.quaternion import (
     Quaternion,
     Vector,
@@ -36,8 +37,8 @@ from knightcube.astro.quaternion import (
     times,
 )
 
-RATE, FIELD, CHANGE, AXES = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-SIZE = 12
+RATE, FIELD, CHANGE, INERTIA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 15)
+SIZE = 15
 LARGEST_ROTATION = 0.15
 """Largest rotation (rad) of the body in one integration step."""
 _AGREEING = 3
@@ -58,9 +59,8 @@ class FieldRateSettings:
         change_start: initial standard deviation of the field's inertial time derivative, T/s.
         change_walk: random walk of the field's inertial time derivative, T/s per sqrt(s).
         torque_walk: random walk of the rate per axis due to unmodelled torques, rad/s per sqrt(s).
-        axes_sigma: initial standard deviation of the rotation of the principal axes from those of `inertia`,
-            rad.
-        inertia_error: relative error of the gyroscopic torque, without the effect of wrong principal axes.
+        errors: largest errors of the description of the body, of which those of the inertia are used.
+        inertia_walk: random walk of the inertia, relative to its trace, per sqrt(s).
         gate_sigma: a measurement less likely than a deviation of this many sigma in one component is
             rejected.
         refusals: number of consecutively rejected measurements after which the filter restarts, or the gyro
@@ -76,8 +76,8 @@ class FieldRateSettings:
     change_start: float = 8e-8
     change_walk: float = 4e-9
     torque_walk: float
-    axes_sigma: float = 0.03
-    inertia_error: float = 0.003
+    errors: BodyErrors = dataclasses.field(default_factory=BodyErrors)
+    inertia_walk: float = 1e-5
     gate_sigma: float = 5.0
     refusals: int = 5
     longest_gap: float = 0.2
@@ -103,12 +103,9 @@ class FieldRate:
 
     def __init__(self, settings: FieldRateSettings) -> None:
         self._settings = settings
-        inertia = np.asarray(settings.inertia, dtype=float)
-        self._inverse = np.linalg.inv(inertia)
-        self._inertia_rows, self._inverse_rows = rows_of(inertia), rows_of(self._inverse)
-        moments = np.linalg.eigvalsh(inertia)
-        self._differences = float(moments[-1] - moments[0]) / np.diag(inertia)
-        # This bound of chi-square is exceeded about as rarely as `gate_sigma` by one normal component.
+        self._assumed = np.asarray(settings.inertia, dtype=float)
+        self._trace = float(np.trace(self._assumed))
+        self._prior = inertia_covariance(self._assumed, settings.errors)
         self._gate = (settings.gate_sigma + 1.0) ** 2
         self.restarts = 0
         self.restart()
@@ -122,7 +119,7 @@ class FieldRate:
         self._rotation: Quaternion = (0.0, 0.0, 0.0, 1.0)
         self._rate: Vector | None = None
         self._field = self._change = _NONE
-        self._rotate_axes(np.asarray(self._settings.inertia, dtype=float), (0.0, 0.0, 0.0))
+        self._set_inertia(np.zeros(6))
         self._covariance = np.zeros((SIZE, SIZE))
 
     @property
@@ -152,7 +149,7 @@ class FieldRate:
 
     @property
     def inverse(self) -> FloatArray:
-        """Inverse (3, 3) of the inertia tensor with the estimated principal axes."""
+        """Inverse (3, 3) of the estimated inertia tensor, 1/(kg m^2)."""
         return self._inverse
 
     @property
@@ -162,7 +159,7 @@ class FieldRate:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance (12, 12) of the rate, the field, its derivative and the principal axes."""
+        """Covariance (15, 15) of the rate, the field, its derivative and the inertia."""
         return self._covariance
 
     def advance(self, dipole: FloatArray, seconds: float) -> None:
@@ -232,26 +229,26 @@ class FieldRate:
         self.restarts += 1
 
     def _correct(self, gain: FloatArray, innovation: FloatArray, measured: slice) -> None:
-        """Correct the state by a gain (12, 3) and an innovation (3,) of the components `measured`."""
+        """Correct the state by a gain (15, 3) and an innovation (3,) of the components `measured`."""
         assert self._rate is not None
         change = (gain @ innovation).tolist()
         self._rate = added(self._rate, change[RATE])
         self._field = added(self._field, change[FIELD])
         self._change = added(self._change, change[CHANGE])
-        self._rotate_axes(self._inertia, change[AXES])
+        self._set_inertia(self._error + np.array(change[INERTIA]))
         covariance = self._covariance - gain @ self._covariance[measured]
         self._covariance = 0.5 * (covariance + covariance.T)
         self._update_unexplained()
 
     def _update_unexplained(self) -> None:
-        """Set the relative error of the gyroscopic torque to the uncertainty of the principal axes.
+        """Set the standard deviation of the gyroscopic torque, relative to its size, by the inertia's error.
 
-        Otherwise the covariance of the linearised filter would become too small while the principal axes are
-        poorly known. The least certain axis is omitted, because a rotation about the axis of a symmetric body
-        is not observable.
+        Otherwise the covariance of the linearised filter would become too small while the inertia is poorly
+        known. The least certain combination of elements is omitted: it is the common scale of the tensor, on
+        which the gyroscopic acceleration does not depend.
         """
-        unknown = float(np.linalg.eigvalsh(self._covariance[AXES, AXES])[1])
-        self._unexplained = max(self._settings.inertia_error, math.sqrt(unknown))
+        unknown = float(np.linalg.eigvalsh(self._covariance[INERTIA, INERTIA])[-2])
+        self._unexplained = math.sqrt(max(unknown, 0.0)) * self._trace / np.diag(self._inertia)
 
     def _start(self, field: FloatArray) -> None:
         """Start with the rate across the field once three consecutive field samples agree."""
@@ -287,14 +284,13 @@ class FieldRate:
         )
         self._covariance[FIELD, FIELD] = settings.field_sigma**2 * np.eye(3)
         self._covariance[CHANGE, CHANGE] = settings.change_start**2 * np.eye(3)
-        self._covariance[AXES, AXES] = settings.axes_sigma**2 * np.eye(3)
+        self._covariance[INERTIA, INERTIA] = self._prior
         self._update_unexplained()
 
-    def _rotate_axes(self, inertia: FloatArray, vector: Sequence[float]) -> None:
-        """Set the inertia to `inertia` with the principal axes rotated by a rotation vector (3,) rad."""
-        x, y, z = vector
-        rotation = np.array(matrix(exponential(x, y, z))).T
-        self._inertia = rotation @ inertia @ rotation.T
+    def _set_inertia(self, error: FloatArray) -> None:
+        """Set the errors (6,) of the elements of the assumed inertia, relative to its trace."""
+        self._error = error
+        self._inertia = self._assumed + self._trace * tensor(error)
         self._inverse = np.linalg.inv(self._inertia)
         self._inertia_rows, self._inverse_rows = rows_of(self._inertia), rows_of(self._inverse)
 
@@ -320,9 +316,9 @@ class FieldRate:
         # The error of the gyroscopic torque is correlated while the body rotates by less than about a radian.
         speed = math.sqrt(middle[0] ** 2 + middle[1] ** 2 + middle[2] ** 2)
         walks = covariance.reshape(-1)[:: SIZE + 1]
-        gyroscopic = self._unexplained * self._differences
-        walks[RATE] += dt * (settings.torque_walk**2 + speed**3 * gyroscopic**2)
+        walks[RATE] += dt * (settings.torque_walk**2 + speed**3 * self._unexplained**2)
         walks[CHANGE] += dt * settings.change_walk**2
+        walks[INERTIA] += dt * settings.inertia_walk**2
         self._covariance = covariance
 
     def _acceleration(self, rate: Vector, field: Vector, dipole: Vector) -> Vector:
@@ -330,18 +326,16 @@ class FieldRate:
         return times(self._inverse_rows, _difference(cross(dipole, field), cross(rate, momentum)))
 
     def _flow(self, rate: Vector, field: Vector, change: Vector, dipole: Vector, dt: float) -> FloatArray:
-        """Return the Jacobian (12, 12) of the change of the states during dt with respect to the states."""
+        """Return the Jacobian (15, 15) of the change of the states during dt with respect to the states."""
         cross_rate = np.array(skew(rate))
         momentum = times(self._inertia_rows, rate)
         torque = _difference(cross(dipole, field), cross(rate, momentum))
         flow = np.zeros((SIZE, SIZE))
         gyroscopic = np.array(skew(momentum))
         flow[RATE, RATE] = self._inverse @ (gyroscopic - cross_rate @ self._inertia)
-        # A small rotation d of the axes changes J w by d x J w - J (d x w), and J^-1 T in the same way.
-        by_rotation = self._inverse @ (
-            np.array(skew(torque)) - cross_rate @ (self._inertia @ cross_rate - gyroscopic)
-        )
-        flow[RATE, AXES] = by_rotation - skew(times(self._inverse_rows, torque))
+        acceleration = np.array(times(self._inverse_rows, torque))
+        changed = by_inertia(acceleration) + cross_rate @ by_inertia(np.array(rate))
+        flow[RATE, INERTIA] = -self._trace * self._inverse @ changed
         flow[RATE, FIELD] = self._inverse @ np.array(skew(dipole))
         flow[FIELD, RATE] = skew(field)
         flow[FIELD, FIELD] = flow[CHANGE, CHANGE] = -cross_rate

@@ -48,7 +48,7 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.gnc.estimation.error_state import ErrorState, Role, StateBlock, slices, with_role
 from knightcube.gnc.estimation.estimate import Knowledge
-from knightcube.gnc.estimation.rigid_body import BodyErrors, inertia_covariance
+from knightcube.gnc.estimation.rigid_body import BodyErrors, by_inertia, inertia_covariance, tensor
 
 BLOCKS = {
     "attitude": 3,
@@ -121,8 +121,7 @@ class FreeMotion:
         if np.array_equal(error, self._error):
             return
         self._error = error.copy()
-        xx, yy, zz, yz, zx, xy = (self.trace * error).tolist()
-        self.inertia: FloatArray = self._assumed + np.array(((xx, xy, zx), (xy, yy, yz), (zx, yz, zz)))
+        self.inertia: FloatArray = self._assumed + self.trace * tensor(error)
         self.inverse: FloatArray = np.asarray(np.linalg.inv(self.inertia), dtype=float)
         self.by_torque: FloatArray = self.inverse @ self.inverse
         """Covariance (3, 3) of the acceleration per variance of the torque."""
@@ -174,12 +173,6 @@ class FreeMotion:
         """Return the derivative (3, 6) of the acceleration by the inertia's error, without gravity."""
         changed = by_inertia(acceleration) + cross_matrix(rate) @ by_inertia(rate)
         return np.asarray(-self.trace * self.inverse @ changed)
-
-
-def by_inertia(vector: FloatArray) -> FloatArray:
-    """Return the derivative (3, 6) of J v by the elements xx, yy, zz, yz, zx, xy of J, for a vector (3,)."""
-    x, y, z = vector.tolist()
-    return np.array(((x, 0.0, 0.0, 0.0, z, y), (0.0, y, 0.0, z, 0.0, x), (0.0, 0.0, z, y, x, 0.0)))
 
 
 def by_matrix(vector: FloatArray) -> FloatArray:

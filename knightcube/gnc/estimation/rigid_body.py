@@ -384,6 +384,18 @@ def coefficient_modes(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
     return np.asarray((vectors[:, kept] * np.sqrt(variances[kept])).T.reshape(-1, 3, 6))
 
 
+def tensor(elements: FloatArray) -> FloatArray:
+    """Return the symmetric tensor (3, 3) of the elements (6,) xx, yy, zz, yz, zx, xy."""
+    xx, yy, zz, yz, zx, xy = elements.tolist()
+    return np.array(((xx, xy, zx), (xy, yy, yz), (zx, yz, zz)))
+
+
+def by_inertia(vector: FloatArray) -> FloatArray:
+    """Return the derivative (3, 6) of J v by the elements xx, yy, zz, yz, zx, xy of J, for a vector (3,)."""
+    x, y, z = vector.tolist()
+    return np.array(((x, 0.0, 0.0, 0.0, z, y), (0.0, y, 0.0, z, 0.0, x), (0.0, 0.0, z, y, x, 0.0)))
+
+
 def inertia_covariance(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
     """Return the covariance (6, 6) of the elements xx, yy, zz, yz, zx, xy of a tensor, relative to its trace.
 

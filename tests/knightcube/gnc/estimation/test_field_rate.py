@@ -8,7 +8,8 @@ from scipy.integrate import solve_ivp
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, derivative, from_rotation_vector
-from knightcube.gnc.estimation.field_rate import AXES, RATE, FieldRate, FieldRateSettings
+from knightcube.gnc.estimation.field_rate import INERTIA as INERTIA_ERROR
+from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])
 FIELD, TURN = np.array([1e-5, 2e-5, 3e-5]), np.array([0.0, 1.5e-3, -1.5e-3])
@@ -60,14 +61,20 @@ def test_all_three_components_of_the_rate_are_found_and_the_claim_is_honest(degr
     assert found.restarts == 0
 
 
-def test_principal_axes_that_are_turned_are_found_from_the_spin() -> None:
+@pytest.mark.parametrize("seed", range(3))
+def test_an_inertia_off_by_several_per_cent_is_found_from_the_tumble(seed: int) -> None:
     turned = attitude_matrix(from_rotation_vector(np.array([0.0, 0.03, -0.02])))
-    inertia = turned.T @ INERTIA @ turned
-    found, last = follow(np.radians([10.0, 1.0, -1.0]), inertia, 100.0)
-    believed = INERTIA @ found.rate
-    true = inertia @ last[:3]
-    assert np.linalg.norm(found.momentum - true) < 0.5 * np.linalg.norm(believed - true)
-    assert np.all(np.sqrt(np.diag(found.covariance)[AXES])[1:] < 0.015)
+    inertia = turned.T @ (INERTIA @ np.diag([1.08, 0.94, 1.03])) @ turned
+    found, last = follow(np.radians([8.0, 4.0, -5.0]), inertia, 100.0, seed)
+    error = found.rate - last[:3]
+    assert found.restarts == 0
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(last[:3])
+    assert float(error @ np.linalg.solve(found.covariance[RATE, RATE], error)) < 16.3
+    estimated = np.linalg.inv(found.inverse)
+    ratios = np.abs(estimated / np.trace(estimated) - inertia / np.trace(inertia))
+    assert ratios.max() < 0.3 * np.abs(INERTIA / np.trace(INERTIA) - inertia / np.trace(inertia)).max()
+    scale = np.concatenate([np.diag(INERTIA), np.zeros(3)]) / np.linalg.norm(INERTIA)
+    assert np.sqrt(scale @ found.covariance[INERTIA_ERROR, INERTIA_ERROR] @ scale) > 0.01
 
 
 def test_a_spin_along_the_field_shows_no_rate_but_claims_no_knowledge_of_it() -> None:
