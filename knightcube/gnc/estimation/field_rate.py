@@ -41,6 +41,8 @@ RATE, FIELD, CHANGE, INERTIA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 1
 SIZE = 15
 LARGEST_ROTATION = 0.15
 """Largest rotation (rad) of the body in one integration step."""
+_LINEARISED = 0.2
+"""Fraction of the inertia's standard deviation that is added as noise, because the filter is linearised."""
 _AGREEING = 3
 """Number of consecutive consistent field samples that start the filter."""
 _EYE: FloatArray = np.eye(SIZE)
@@ -248,7 +250,8 @@ class FieldRate:
         which the gyroscopic acceleration does not depend.
         """
         unknown = float(np.linalg.eigvalsh(self._covariance[INERTIA, INERTIA])[-2])
-        self._unexplained = math.sqrt(max(unknown, 0.0)) * self._trace / np.diag(self._inertia)
+        error = _LINEARISED * math.sqrt(max(unknown, 0.0))
+        self._unexplained = error * self._trace / np.diag(self._inertia)
 
     def _start(self, field: FloatArray) -> None:
         """Start with the rate across the field once three consecutive field samples agree."""

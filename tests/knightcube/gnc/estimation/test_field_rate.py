@@ -68,7 +68,7 @@ def test_an_inertia_off_by_several_per_cent_is_found_from_the_tumble(seed: int) 
     found, last = follow(np.radians([8.0, 4.0, -5.0]), inertia, 100.0, seed)
     error = found.rate - last[:3]
     assert found.restarts == 0
-    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(last[:3])
+    assert np.linalg.norm(error) < 0.03 * np.linalg.norm(last[:3])
     assert float(error @ np.linalg.solve(found.covariance[RATE, RATE], error)) < 16.3
     estimated = np.linalg.inv(found.inverse)
     ratios = np.abs(estimated / np.trace(estimated) - inertia / np.trace(inertia))
