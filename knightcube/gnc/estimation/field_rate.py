@@ -23,7 +23,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.rigid_body import BodyErrors, by_inertia, inertia_covariance, tensor
 from knightcube.astro.quaternion import (
     Quaternion,
     Vector,
@@ -36,6 +35,7 @@ from knightcube.astro.quaternion import (
     skew,
     times,
 )
+from knightcube.gnc.estimation.rigid_body import BodyErrors, by_inertia, inertia_covariance, tensor
 
 RATE, FIELD, CHANGE, INERTIA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 15)
 SIZE = 15
