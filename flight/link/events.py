@@ -100,7 +100,10 @@ COIL_RECOVERED = _info(31, "coil-recovered", "the PWM chip accepts commands agai
 COIL_BROKEN = _fault(
     34, "coil-broken", "a coil does not carry the commanded current and is isolated", Reaction.ISOLATE
 )
-COIL_TRUSTED = _info(35, "coil-trusted", "a coil is used again by command")
+COIL_TRUSTED = _info(35, "coil-trusted", "an isolated coil is used again, by command or for a trial")
+COIL_CORRECTED = _warning(
+    143, "coil-corrected", "a coil is used with another sign or gain, because the motion shows it"
+)
 COIL_SUSPECT = _warning(
     36, "coil-suspect", "the supply current does not match the commanded currents; the faulty coil is unknown"
 )

@@ -27,11 +27,16 @@ monitor. If the commands change continuously, as in the windows of B-dot detumbl
 force during an ADC sample is ambiguous. While commands change continuously, all coils are commanded to zero
 every few seconds as a check, even without a suspicion.
 
-A reversed coil draws the same supply current as a healthy coil, so the current monitor cannot confirm a
-verdict of reversal. In a tumble, the angular acceleration depends more on the inertia than on the coils. A
-coil that looks reversed in a tumble is therefore not isolated. A coil that looks reversed in a tumble is kept
-at zero current, and is used and judged again when the body is slower than `tumble_rate`, or after ten
-minutes.
+A reversed coil draws the same supply current as a healthy coil, so only the motion can show it. A coil that
+turns the body the wrong way is not isolated: it is used with the opposite sign. A coil whose torque is too
+small is used with its estimated gain. The class `CoilCorrection` holds sign and gain of each coil, and
+converts between the currents on the wire, which determine the supply current, and the effective currents,
+which determine the torque. A correction made in a tumble is reviewed when the body is slower than
+`tumble_rate`: the motion then confirms the coil's sign or changes it again. A coil whose sign changes more
+than twice in ten minutes is kept at zero current until the body is slow, or for ten minutes.
+
+A verdict on a broken coil is not final. While the body is slow, a broken coil is used again for a trial ten
+minutes after its verdict, and at most three times. If the fault persists, the coil is found broken again.
 
 The error bounds are 3.5 mA for each coil's current (Sease thesis, chapter 5), the error of the resistance,
 and 18 % for a single ADC sample of the chopped current (`hal.drivers.ina219`).
@@ -55,6 +60,7 @@ from flight.loop.coil_response import (
     CoilCommands,
     CoilFault,
     CoilResponse,
+    Finding,
     MotionWitness,
     Predicted,
     ResponseSettings,
@@ -299,8 +305,9 @@ class CoilMonitorSettings:
         probe_half_ns: half the period (ns) of the probe's square wave.
         response: settings for judging coils by the body's motion; None if the motion is not used.
         slow: as `response`, but with longer bins, which reveal missing torque at small currents.
-        tumble_rate: body rate (rad/s) above which a coil that looks reversed is not isolated but kept at zero
-            current.
+        tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
+        trial_after_ns: time (ns) from the verdict on a coil to its next trial.
+        trials: largest number of trials of each coil.
     """
 
     full_current: tuple[float, float, float]
@@ -316,6 +323,8 @@ class CoilMonitorSettings:
     response: ResponseSettings | None = None
     slow: ResponseSettings | None = None
     tumble_rate: float = math.inf
+    trial_after_ns: int = 600_000_000_000
+    trials: int = 3
 
 
 _UNSEEN_NS = 600_000_000
@@ -426,7 +435,74 @@ _MOST_EVIDENCE = 40
 _IN_DOUBT = 5
 """Number of readings after which a verdict may name an axis with an uncertain kind of fault."""
 _LONGEST_REST_NS = 600_000_000_000
-"""Longest time (ns) for which a coil that looks reversed in a tumble is kept at zero current."""
+"""Longest time (ns) for which a coil whose sign changes repeatedly is kept at zero current."""
+_MOST_CHANGES = 2
+"""Largest number of changes of a coil's sign in that time."""
+
+
+class CoilCorrection:
+    """Sign and gain of each coil relative to its description, and the reviews that are due.
+
+    Attributes:
+        factors: dipole (3,) of each coil relative to the described dipole at the same current: 1 for a
+            healthy coil, -1 for a reversed coil.
+    """
+
+    def __init__(self) -> None:
+        self.factors: FloatArray = np.ones(3)
+        self._changes: list[list[int]] = [[], [], []]  # times (ns) of the changes of sign
+        self._unreviewed: set[int] = set()
+
+    def effective(self, wire: FloatArray) -> FloatArray:
+        """Return the currents (3,), A, with which healthy coils would have the same dipole as the coils."""
+        return self.factors * wire
+
+    def wire(self, effective: FloatArray) -> FloatArray:
+        """Return the currents (3,), A, of the coils that cause the dipole of the effective currents (3,)."""
+        return effective / self.factors
+
+    @property
+    def unreviewed(self) -> frozenset[int]:
+        """The axes whose sign was changed in a tumble and has not been reviewed while the body is slow."""
+        return frozenset(self._unreviewed)
+
+    def reverse(self, axis: int, now_ns: int, *, in_tumble: bool) -> bool:
+        """Change the sign of a coil, and return whether it was changed.
+
+        The sign stays as it is if it has changed too often in the last ten minutes.
+        """
+        recent = [time_ns for time_ns in self._changes[axis] if now_ns - time_ns < _LONGEST_REST_NS]
+        self._changes[axis] = recent
+        if len(recent) >= _MOST_CHANGES:
+            return False
+        recent.append(now_ns)
+        self._multiply(axis, -1.0)
+        if in_tumble:
+            self._unreviewed.add(axis)
+        else:
+            self._unreviewed.discard(axis)
+        return True
+
+    def weigh(self, axis: int, gain: float) -> bool:
+        """Change the gain of a coil by a factor, to at most 1, and return whether it changed."""
+        size = abs(float(self.factors[axis]))
+        factor = min(gain, 1.0 / size)
+        if factor == 1.0:
+            return False
+        self._multiply(axis, factor)
+        return True
+
+    def confirm(self, axis: int) -> None:
+        """End the review of a coil, because the motion of the slow body shows its torque."""
+        self._unreviewed.discard(axis)
+
+    def text(self, axis: int) -> str:
+        """Return the factor of a coil as text."""
+        return f"flown with {self.factors[axis]:+.2f} of its described dipole"
+
+    def _multiply(self, axis: int, factor: float) -> None:
+        self.factors = self.factors.copy()
+        self.factors[axis] *= factor
 
 
 class CoilMonitor:
@@ -436,7 +512,8 @@ class CoilMonitor:
     verdict.
 
     Attributes:
-        tumble_rate: body rate (rad/s) above which no coil is isolated because of the motion alone.
+        tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
+        correction: signs and gains of the coils.
     """
 
     def __init__(self, settings: CoilMonitorSettings) -> None:
@@ -462,6 +539,10 @@ class CoilMonitor:
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
         self._weak = ""  # text about the coil whose torque is missing in the motion
         self._verdicts: dict[int, CoilVerdict] = {}
+        self.correction = CoilCorrection()
+        self._news: list[str] = []  # texts of the changes of the correction
+        self._trials = [0, 0, 0]
+        self._speed = math.inf
         # Axes kept at zero current, each with the start time (ns) and the reason.
         self._rests: dict[int, tuple[int, str]] = {}
         self._looked_ns = 0
@@ -482,7 +563,7 @@ class CoilMonitor:
 
     @property
     def resting(self) -> BoolArray:
-        """Flags (3,) of the axes that are kept at zero current because they look reversed in a tumble."""
+        """Flags (3,) of the axes that are kept at zero current because their sign changed too often."""
         return np.array([axis in self._rests for axis in range(3)])
 
     @property
@@ -522,6 +603,29 @@ class CoilMonitor:
 
         If the fault persists, it is detected again.
         """
+        self._trials[axis] = 0
+        self._release(axis)
+
+    def begin_trial(self, now_ns: int) -> tuple[int, str] | None:
+        """Use a broken axis again if its trial is due; return the axis and a text, or None."""
+        if self._speed > self.tumble_rate or self.suspicion or self._leg.is_searching:
+            return None
+        for axis, verdict in self._verdicts.items():
+            if now_ns - verdict.time_ns >= self._settings.trial_after_ns and (
+                self._trials[axis] < self._settings.trials
+            ):
+                self._trials[axis] += 1
+                self._release(axis)
+                count = f"{self._trials[axis]} of {self._settings.trials}"
+                return axis, f"coil {AXES[axis]} is tried again, {count}"
+        return None
+
+    def news(self) -> list[str]:
+        """Return the texts of the changes of the correction since the last call."""
+        news, self._news = self._news, []
+        return news
+
+    def _release(self, axis: int) -> None:
         self._verdicts.pop(axis, None)
         self._rests.pop(axis, None)
         self._proof.discard(axis)
@@ -530,42 +634,68 @@ class CoilMonitor:
     def commanded(
         self, time_ns: int, currents: FloatArray, braked: Axes = NO_AXES, written_ns: int | None = None
     ) -> None:
-        """Record the currents (3,), A, and brakes in force at `time_ns`, written at `written_ns` if given."""
+        """Record the currents (3,), A, and brakes in force at `time_ns`, written at `written_ns` if given.
+
+        The currents are those on the wire.
+        """
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
         # If the monitor gives no readings, the search is ended, because it could not finish.
         if self._leg.is_searching and time_ns - self._looked_ns > self._settings.window_ns:
             self._leg.reset()
+        effective = tuple(self.correction.effective(currents).tolist())
         for response in self._responses:
-            response.commanded(time_ns if written_ns is None else written_ns, values)
+            response.commanded(time_ns if written_ns is None else written_ns, effective)
 
     def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> None:
         """Add a sample of body rate (3,), rad/s, and magnetic field (3,), T, in body axes."""
+        self._speed = float(np.sqrt(rate @ rate))
         if self._rests:
-            self._end_rests(time_ns, float(np.sqrt(rate @ rate)))
+            self._end_rests(time_ns, self._speed)
         for response in self._responses:
             if response.observe_motion(time_ns, rate, field):
                 self._judge_motion(response, time_ns)
 
     def _judge_motion(self, response: CoilResponse, now_ns: int) -> None:
-        """Give a verdict on a reversed axis, and raise a suspicion about an axis without torque.
-
-        In a tumble, an axis that looks reversed is kept at zero current without a verdict.
-        """
-        for axis in response.reversed_axes():
-            # An uncommanded current also makes a torque, which could be mistaken for a reversed coil.
-            if axis in self._verdicts or axis in self._rests or self._leg.suspicion or self._strangeness:
-                continue
-            if response.fastest <= self.tumble_rate:
-                self._give(axis, CoilFault.REVERSED, now_ns, response.text(axis))
-            else:
-                why = f"coil {AXES[axis]}: {response.text(axis)}; kept at zero current in the tumble"
-                self._rests[axis] = now_ns, why
+        """Correct sign or gain of a coil, and raise a suspicion about an axis without torque."""
+        slow = response.fastest <= self.tumble_rate
+        for axis in self.correction.unreviewed:
+            if slow and response.is_healthy(axis):
+                self.correction.confirm(axis)
+                self._tell(axis, f"{response.text(axis)} while the body is slow, which confirms its sign")
+        known = self._verdicts.keys() | self._rests.keys()
+        # An uncommanded current also makes a torque, which could be mistaken for that of a reversed coil.
+        if not (self._leg.suspicion or self._strangeness):
+            for axis in response.axes(Finding.REVERSED):
+                if axis not in known:
+                    self._reverse(axis, response, now_ns, in_tumble=not slow)
+                    return
+            for axis in (*response.axes(Finding.WEAK), *response.axes(Finding.STRONG)):
+                seen = response.text(axis)
+                if axis not in known and self.correction.weigh(axis, float(response.gain[axis])):
+                    self._apply(axis, seen, now_ns)
+                    return
         if response is self._slow:
-            known = self._verdicts.keys() | self._rests.keys()
-            axes = [axis for axis in response.feeble_axes() if axis not in known]
-            # If several coils look weak at once, the gyro or the field is wrong rather than the coils.
-            self._weak = f"coil {AXES[axes[0]]}: {response.text(axes[0])}" if len(axes) == 1 else ""
+            feeble = [axis for axis in response.axes(Finding.FEEBLE) if axis not in known]
+            self._weak = f"coil {AXES[feeble[0]]}: {response.text(feeble[0])}" if feeble else ""
+
+    def _reverse(self, axis: int, response: CoilResponse, now_ns: int, *, in_tumble: bool) -> None:
+        """Change the sign of a coil, or keep it at zero current if its sign has changed too often."""
+        seen = response.text(axis)
+        if self.correction.reverse(axis, now_ns, in_tumble=in_tumble):
+            self._apply(axis, seen, now_ns)
+        else:
+            self._rests[axis] = now_ns, f"coil {AXES[axis]}: {seen}; its sign changed too often, kept at zero"
+
+    def _apply(self, axis: int, seen: str, now_ns: int) -> None:
+        """Report a change of the correction, and judge the motion again without the earlier evidence."""
+        self._tell(axis, seen)
+        self._weak = ""
+        for response in self._responses:
+            response.interrupted(now_ns)
+
+    def _tell(self, axis: int, seen: str) -> None:
+        self._news.append(f"coil {AXES[axis]}: {seen}; {self.correction.text(axis)}")
 
     def _end_rests(self, now_ns: int, speed: float) -> None:
         """Use the axes at zero current again, if the body is slow or after a long time."""

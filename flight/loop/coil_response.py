@@ -7,12 +7,19 @@ input is pulsed.
 
 The class `CoilResponse` estimates the torque gain of each coil from the body's angular acceleration over some
 seconds. The measured rate and the commanded rate change, which is the integral of J^-1 (m x B), are averaged
-over short bins. Differences of neighbouring bins are accelerations. A least squares fit over the last bins
+over short bins. Differences of neighbouring bins are accelerations. A generalised least squares fit, which
+uses that the noise of neighbouring differences is correlated, over the last bins
 estimates the gain of each coil, together with a constant disturbance, a torsion and a damping about each free
 axis. The gain is 1 for a healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the
 commands vary too little, the standard deviation of the gain is large, and the axis is not judged. A gain
 larger than `LARGEST_GAIN` is physically impossible. A gain larger than `LARGEST_GAIN` shows that the model is
 wrong, and no axis is judged.
+
+In a field, the torques of three coils are normal to the field, so that the three gains can hardly be separated
+from each other within a short time. The gain of each coil is therefore estimated with the other two coils
+assumed healthy within the accuracy of their description. An axis is judged only if a fault of this axis
+explains the motion clearly better than a fault of another axis. A coil is reversed if this is far more likely
+than that all coils are healthy.
 
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
 that an inertia error of 2 % can make healthy coils look reversed. The fit therefore subtracts the gyroscopic
@@ -32,8 +39,9 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, auto
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -316,10 +324,12 @@ class ResponseSettings:
         rate_noise: standard deviation (rad/s) of a gyro sample about each axis.
         free: flags (3,) of the axes about which the body can rotate; on a thread only y.
         bin_samples: number of gyro samples in a bin.
-        bins: number of differences of neighbouring bins in the fit.
+        bins: largest number of differences of neighbouring bins in the fit.
+        least_bins: number of differences of neighbouring bins before the first fit.
         model_error: acceleration error (rad/s^2) of a bin due to the uncertain delay from command to current.
         torsion, damping: prior standard deviations of torsion (1/s^2) and damping (1/s) about each free axis.
-        errors: largest errors of inertia and gyro of a body that is free about three axes.
+        errors: largest errors of the coils' gains, and of inertia and gyro of a body that is free about three
+            axes.
         sure: standard deviation of a gain below which the gain is used for judgements.
         persistence: number of consecutive fits that must agree.
         lowest_sound, highest_feeble, highest_reversed: gain limits for a healthy coil (minimum), a coil
@@ -335,6 +345,7 @@ class ResponseSettings:
     free: tuple[bool, bool, bool] = (True, True, True)
     bin_samples: int = 8
     bins: int = 15
+    least_bins: int = 7
     model_error: float = 8.0e-4
     torsion: float = 0.03
     damping: float = 5.0e-3
@@ -359,8 +370,18 @@ _LEAST_CHANGE = 4.0e-3
 LARGEST_GAIN = 1.5
 """Largest absolute gain of a coil that is physically possible."""
 _GAIN_PRIOR = 10.0
+_LEAST_GAIN_ERROR = 0.05
+"""Smallest error assumed for the gain of a healthy coil."""
 _WEAK_GAIN, _SIGMAS = 0.7, 2.5
 """Upper limit of a weak coil's gain, and number of standard deviations that must lie below the limit."""
+_STRONG_GAIN = 1.25
+"""Lower limit of the gain of a coil that is stronger than assumed."""
+_LEAST_GAIN, _EXACT = 0.1, 0.1
+"""Smallest gain of a weak coil that is worth using, and largest standard deviation of a gain to be used."""
+_CLEARLY, _CERTAINLY, _WORSE = 9.0, 20.0, 25.0
+"""Differences of weighted sums of squares. A fault of one coil must explain the motion better than a fault of
+another coil by the first, and a reversed coil better than three healthy coils by the second. A fit of all
+gains may explain the motion better than a fault of one coil by less than the third."""
 
 
 class CoilResponse:
@@ -387,8 +408,9 @@ class CoilResponse:
         # Fit parameters: three gains, torsion and damping of each free axis, and a weight of each error mode.
         spreads = [_GAIN_PRIOR] * 3 + [settings.torsion] * count + [settings.damping] * count
         spreads += [1.0] * len(self._modes)
-        self._prior: FloatArray = np.diag(1.0 / np.array(spreads) ** 2)
-        self._expected: FloatArray = self._prior[:, :3].sum(axis=1)
+        self._prior: FloatArray = 1.0 / np.array(spreads) ** 2
+        # Prior weight of a healthy coil's gain, whose error is uniform within its bound.
+        self._healthy = 3.0 / max(settings.errors.coil_gain, _LEAST_GAIN_ERROR) ** 2
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
         self._known_ns = 0
         self._last_ns = 0
@@ -415,9 +437,7 @@ class CoilResponse:
         # Each bin has a residual, with its time (ns) and the commanded acceleration of each coil (3, 3).
         # The acceleration per ampere (3, 3), the residual (3,) and the error modes' (3, k) follow.
         self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]] = deque()
-        self._wrong_for = [0, 0, 0]
-        self._sound_for = [0, 0, 0]
-        self._feeble_for = [0, 0, 0]
+        self._in_a_row = {finding: [0, 0, 0] for finding in Finding}
         self.sigma = np.full(3, np.inf)
 
     def commanded(self, time_ns: int, currents: tuple[float, ...]) -> None:
@@ -473,17 +493,14 @@ class CoilResponse:
                 return currents
         return self._commands[0][1]
 
-    def reversed_axes(self) -> list[int]:
-        """Return the axes whose gain was that of a reversed coil in the last `persistence` fits."""
-        return [axis for axis in range(3) if self._wrong_for[axis] >= self._settings.persistence]
-
-    def feeble_axes(self) -> list[int]:
-        """Return the axes whose torque was missing or reversed in the last `persistence` fits."""
-        return [axis for axis in range(3) if self._feeble_for[axis] >= self._settings.persistence]
+    def axes(self, finding: Finding) -> list[int]:
+        """Return the axes for which a finding held in the last `persistence` fits."""
+        counts = self._in_a_row[finding]
+        return [axis for axis in range(3) if counts[axis] >= self._settings.persistence]
 
     def is_healthy(self, axis: int) -> bool:
         """Return whether an axis had the gain of a healthy coil in the last `persistence` fits."""
-        return self._sound_for[axis] >= self._settings.persistence
+        return axis in self.axes(Finding.SOUND)
 
     def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
         """Return the observed fraction of a hypothetical change of torque.
@@ -544,46 +561,138 @@ class CoilResponse:
         self._remainders.append((self._last_ns, row[:, :3], per_ampere, remainder, row[:, 6:]))
         while self._remainders[0][0] < self._last_ns - self._settings.memory_ns:
             self._remainders.popleft()
-        if len(self._rows) < self._settings.bins // 2:
+        if len(self._rows) < self._settings.least_bins:
             return False
         self._fit(span)
         return True
 
     def _fit(self, span: float) -> None:
-        rows = np.array(self._rows)
-        # Subtracting the mean removes a constant disturbance about each free axis.
-        rows -= rows.sum(axis=0) / len(rows)
+        """Fit all gains freely, and fit each gain with the other two coils assumed healthy."""
         count = len(self._free)
+        rows = self._whitened(span)
         inputs = np.zeros((len(rows), count, len(self._prior)))
         inputs[:, :, :3], inputs[:, :, 3 + 2 * count :] = rows[:, :, :3], rows[:, :, 6:]
         for place in range(count):
             inputs[:, place, 3 + place] = -rows[:, place, 5]
             inputs[:, place, 3 + count + place] = -rows[:, place, 4]
         matrix, outputs = inputs.reshape(-1, len(self._prior)), rows[:, :, 3].reshape(-1)
-        settings = self._settings
-        floor = settings.rate_noise * np.sqrt(2.0 / settings.bin_samples) / span + settings.model_error
-        weight = 1.0 / floor**2
-        covariance = np.linalg.inv(matrix.T @ matrix * weight + self._prior)
-        found = covariance @ (matrix.T @ outputs * weight + self._expected)
-        residual = outputs - matrix @ found
-        freedom = max(len(outputs) - count - 3, 1)
-        spread = max(1.0, float(residual @ residual) * weight / freedom)
-        self.gain = found[:3]
-        self.sigma = np.sqrt(spread * covariance.diagonal()[:3])
+        normal, right = matrix.T @ matrix + np.diag(self._prior), matrix.T @ outputs
+        # Eliminate the nuisance parameters, which leaves three equations for the gains.
+        others = np.linalg.inv(normal[3:, 3:])
+        coupling = others @ normal[3:, :3]
+        gains = GainEquations(
+            normal[:3, :3] - np.diag(self._prior[:3]) - normal[:3, 3:] @ coupling,
+            right[:3] - right[3:] @ coupling,
+            float(outputs @ outputs - right[3:] @ others @ right[3:]),
+        )
+        freely = gains.solve(self._prior[:3])
+        spread = max(1.0, freely.cost / max(len(outputs) - count - 3, 1))
         self.fastest = max(self._speeds)
-        self._weights = found[3 + 2 * count :]
+        self._weights = (others @ right[3:] - coupling @ freely.gains)[2 * count :]
         # If a gain is impossible even within its uncertainty, the model is wrong.
-        possible = bool((np.abs(self.gain) - 3.0 * self.sigma < LARGEST_GAIN).all())
-        pairs = zip(self.gain.tolist(), self.sigma.tolist(), strict=True)
-        for number, (gain, sigma) in enumerate(pairs):
-            judged = possible and abs(gain) <= LARGEST_GAIN
-            wrong = judged and gain + 3.0 * sigma < 0.0 and gain < settings.highest_reversed
-            weak = gain + _SIGMAS * sigma < _WEAK_GAIN and gain < settings.highest_feeble
-            feeble = wrong or (judged and sigma < settings.sure and weak)
-            sound = judged and sigma < settings.sure and gain > settings.lowest_sound
-            self._wrong_for[number] = self._wrong_for[number] + 1 if wrong else 0
-            self._feeble_for[number] = self._feeble_for[number] + 1 if feeble else 0
-            self._sound_for[number] = self._sound_for[number] + 1 if sound else 0
+        sigmas = np.sqrt(spread * freely.variances)
+        possible = bool((np.abs(freely.gains) - 3.0 * sigmas < LARGEST_GAIN).all())
+        healthy = np.full(3, self._healthy)
+        one_free = [gains.solve(np.where(_EACH == axis, self._prior[:3], healthy)) for axis in range(3)]
+        self.gain = np.array([fit.gains[axis] for axis, fit in enumerate(one_free)])
+        self.sigma = np.sqrt(spread * np.array([fit.variances[axis] for axis, fit in enumerate(one_free)]))
+        costs = [fit.cost / spread for fit in one_free]
+        sound_cost = gains.solve(healthy).cost / spread
+        for axis in range(3):
+            # Limit of the sum of squares of a hypothesis that only this axis is broken.
+            limit = min(costs[other] for other in range(3) if other != axis) - _CLEARLY
+            limit = min(limit, freely.cost / spread + _WORSE)
+            reversed_cost = gains.solve(healthy, np.where(_EACH == axis, -1.0, 1.0)).cost / spread
+            is_reversed = reversed_cost < min(limit, sound_cost - _CERTAINLY)
+            self._count(axis, possible, alone=costs[axis] < limit, is_reversed=is_reversed)
+
+    def _count(self, axis: int, possible: bool, *, alone: bool, is_reversed: bool) -> None:
+        """Count the fits in a row that agree on an axis.
+
+        Args:
+            axis: index of the axis.
+            possible: whether the gains of all axes are physically possible.
+            alone: whether a fault of this axis explains the motion, clearly better than that of another axis.
+            is_reversed: the same for a reversed coil on this axis, which is also far more likely than that
+                all coils are healthy.
+        """
+        settings, gain, sigma = self._settings, float(self.gain[axis]), float(self.sigma[axis])
+        judged = possible and abs(gain) <= LARGEST_GAIN
+        sure = judged and sigma < settings.sure
+        wrong = possible and is_reversed and gain < settings.highest_reversed
+        weak = alone and gain + _SIGMAS * sigma < _WEAK_GAIN and gain < settings.highest_feeble
+        exact = judged and alone and sigma < _EXACT
+        findings = {
+            Finding.REVERSED: wrong,
+            Finding.FEEBLE: wrong or (sure and weak),
+            Finding.SOUND: sure and gain > settings.lowest_sound,
+            Finding.WEAK: exact and gain + 3.0 * sigma < _WEAK_GAIN and gain - 3.0 * sigma > _LEAST_GAIN,
+            Finding.STRONG: exact and gain - 3.0 * sigma > _STRONG_GAIN,
+        }
+        for finding, holds in findings.items():
+            counts = self._in_a_row[finding]
+            counts[axis] = counts[axis] + 1 if holds else 0
+
+    def _whitened(self, span: float) -> FloatArray:
+        """Return the rows (n, f, 6 + k) of all bins with noise of variance 1, without a constant acceleration.
+
+        The noise of the mean rate of a bin enters two differences of neighbouring bins with opposite signs.
+        """
+        settings, rows = self._settings, np.array(self._rows)
+        variance = (settings.rate_noise / span) ** 2 / settings.bin_samples
+        count = len(rows)
+        covariance = (settings.model_error**2 + 2.0 * variance) * np.eye(count)
+        covariance -= variance * (np.eye(count, k=1) + np.eye(count, k=-1))
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        rows = np.tensordot(whitening, rows, 1)
+        constant = whitening.sum(axis=1)
+        constant /= math.sqrt(float(constant @ constant))
+        return np.asarray(rows - constant[:, None, None] * np.tensordot(constant, rows, 1))
+
+
+class Finding(Enum):
+    """What a fit shows of a coil."""
+
+    REVERSED = auto()
+    FEEBLE = auto()
+    SOUND = auto()
+    WEAK = auto()
+    STRONG = auto()
+
+
+class GainFit(NamedTuple):
+    """Gains (3,), their variances (3,), and the weighted sum of squares of all residuals.
+
+    The sum includes the deviations of the parameters from their expected values.
+    """
+
+    gains: FloatArray
+    variances: FloatArray
+    cost: float
+
+
+class GainEquations(NamedTuple):
+    """Normal equations of the three gains; the sum of squares at gains g is g S g - 2 t g + c.
+
+    The matrix S is `matrix` (3, 3), the vector t is `right` (3,), and c is `constant`.
+    """
+
+    matrix: FloatArray
+    right: FloatArray
+    constant: float
+
+    def solve(self, weights: FloatArray, expected: FloatArray | None = None) -> GainFit:
+        """Fit gains with the prior weights (3,) of the expected gains (3,), which are 1 by default."""
+        prior = weights if expected is None else weights * expected
+        covariance = np.linalg.inv(self.matrix + np.diag(weights))
+        right = self.right + prior
+        gains = covariance @ right
+        # The expected gains are 1 or -1, so that the weights are also the sum of their squares.
+        cost = self.constant + float(weights.sum() - right @ gains)
+        return GainFit(gains, covariance.diagonal(), cost)
+
+
+_EACH = np.arange(3)
 
 
 _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}

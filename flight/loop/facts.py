@@ -220,6 +220,10 @@ class Facts:
             self._states[fact.name] = _State()
         return bool(found)
 
+    def release(self, fact: Fact) -> None:
+        """Make a latched fact inactive, because its cause is examined again."""
+        self._states[fact.name] = _State()
+
     def enter(self, mode: Mode) -> None:
         """Watch the facts of `mode`, and reset all facts that are not watched in this mode."""
         self._mode = mode

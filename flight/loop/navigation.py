@@ -89,11 +89,11 @@ class Navigation:
         """Return the counters of the inertial unit's serial line."""
         return self._link
 
-    def commanded(self, in_force: CoilState, known: CurrentValidity) -> None:
-        """Pass the coil currents, and whether they are known, to the filter."""
+    def commanded(self, in_force: CoilState, currents: FloatArray, known: CurrentValidity) -> None:
+        """Pass the effective coil currents (3,), A, and whether they are known, to the filter."""
         if known.uncertain_since_ns is not None:
             self._filter.mark_unknown(known.uncertain_since_ns)
-        self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
+        self._filter.command(max(in_force.written_ns, known.since_ns), currents, known=known.now)
 
     def update(self, now_ns: int) -> tuple[ImuReading, ...]:
         """Apply new and late measurements, and return the readings of this cycle, oldest first."""

@@ -4,6 +4,9 @@ The coil drive excludes failed axes, and reallocates the current among the remai
 direction of the torque is preserved. The sent commands are compared with the supply current and the body's
 motion (`flight.loop.coil_monitor`). A verdict that a coil is broken activates a fact. The fact reports an
 event, whose reaction excludes the axis.
+
+All currents in the loop are effective currents: those of healthy coils with the same dipole. Only the coil
+drive converts them to the currents on the wire, by the signs and gains that the coil monitor has found.
 """
 
 from __future__ import annotations
@@ -47,7 +50,7 @@ class CoilDrive:
     """Commands the coils, and monitors their response.
 
     Attributes:
-        command: currents (3,), A, that were sent to the driver in this cycle.
+        command: effective currents (3,), A, of the command in this cycle.
         available: flags (3,) of the axes that are not excluded.
     """
 
@@ -65,7 +68,7 @@ class CoilDrive:
         self._settings = settings
         self._facts = services.facts
         self._events = services.events
-        self._verdicts = 0
+        self._reported: set[int] = set()  # axes whose verdict was reported
         self._braked = NO_AXES
         self.available = np.ones(3, dtype=bool)
         self.command: FloatArray = np.zeros(3)
@@ -73,6 +76,10 @@ class CoilDrive:
     def state(self) -> CoilState:
         """Return the command that the PWM chip holds at present."""
         return self._coils.state()
+
+    def effective(self, in_force: CoilState) -> FloatArray:
+        """Return the effective currents (3,), A, of the command that the PWM chip holds."""
+        return self._watch.correction.effective(in_force.current)
 
     def off(self) -> None:
         """Switch all coils off at the end of the flight."""
@@ -105,10 +112,12 @@ class CoilDrive:
         answer = self._power.latest() if self._power is not None and not self._power.error() else None
         if answer is not None:
             watch.measured(answer)
-        found = watch.verdicts
-        for verdict in found[self._verdicts :]:
-            self._facts.update(_BROKEN[verdict.axis], True, now_ns, verdict.text)
-        self._verdicts = len(found)
+        for text in watch.news():
+            self._events.report(events.COIL_CORRECTED, now_ns, text)
+        self._report_verdicts(now_ns)
+        trial = watch.begin_trial(now_ns)
+        if trial is not None:
+            self._begin_trial(*trial, now_ns)
         self._brake(watch.braked)
         self._facts.update(facts.COIL_SUSPECT, bool(watch.suspicion), now_ns, watch.suspicion)
         self._facts.update(facts.POWER_DOUBTED, bool(watch.monitor_doubted), now_ns, watch.monitor_doubted)
@@ -128,35 +137,54 @@ class CoilDrive:
         """Use all axes again, as commanded by the ground. If a fault persists, it will be detected again."""
         for axis in range(3):
             self._watch.forget(axis)
-        self._verdicts = 0
+        self._reported.clear()
         self.isolate()
         self._events.report(events.COIL_TRUSTED, now_ns, "all three axes are in use again")
 
+    def _report_verdicts(self, now_ns: int) -> None:
+        for verdict in self._watch.verdicts:
+            if verdict.axis not in self._reported:
+                self._reported.add(verdict.axis)
+                self._facts.update(_BROKEN[verdict.axis], True, now_ns, verdict.text)
+
+    def _begin_trial(self, axis: int, text: str, now_ns: int) -> None:
+        """Use a coil again that the monitor tries without a command."""
+        self._reported.discard(axis)
+        self._facts.release(_BROKEN[axis])
+        self.isolate()
+        self._events.report(events.COIL_TRUSTED, now_ns, text)
+
     def send(self, currents: FloatArray, field: Callable[[], FloatArray | None]) -> None:
-        """Command currents (3,) A.
+        """Command effective currents (3,) A.
 
         The function `field` returns the magnetic field (3,), T, in body axes, for the reallocation of
         currents.
         """
-        usable = self.available & ~self._watch.resting
-        if not all(usable.tolist()) and currents.any():
+        watch, settings = self._watch, self._settings
+        usable = self.available & ~watch.resting
+        factors = np.abs(watch.correction.factors)
+        limits = settings.limits * factors
+        # A weak coil reaches its limit at a smaller effective current.
+        beyond = bool((factors < 1.0).any() and (np.abs(currents) > limits).any())
+        if (beyond or not all(usable.tolist())) and currents.any():
             # The usable axes share the torque that was commanded for all axes.
             # While the field is unknown, each usable axis keeps its own current.
-            known, settings = field(), self._settings
+            known = field()
             if known is None:
-                currents = np.where(usable, currents, 0.0)
+                currents = np.clip(np.where(usable, currents, 0.0), -limits, limits)
             else:
                 torque = np.cross(settings.dipole_per_ampere * currents, known)
                 currents = allocate(
                     torque,
                     known,
                     settings.dipole_per_ampere,
-                    settings.limits,
+                    limits,
                     usable.astype(float),
                     settings.free_axis,
                 ).currents
-        self.command = np.zeros(3) if self._watch.at_rest else currents + self._watch.probe
-        self._coils.command(self.command)
+        wire = np.zeros(3) if watch.at_rest else watch.correction.wire(currents) + watch.probe
+        self.command = watch.correction.effective(wire)
+        self._coils.command(wire)
 
     def zero(self) -> None:
         """Command zero current."""

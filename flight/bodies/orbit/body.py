@@ -467,12 +467,13 @@ def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
         config.inertial_unit.rate_noise,
         bin_samples=16,
         bins=40,
+        least_bins=20,
         model_error=2.0e-4,
         torsion=1e-6,
         damping=1e-4,
         errors=description_errors(config),
         settle_ns=settle_ns,
     )
-    slow = replace(response, bin_samples=80, bins=20, model_error=3.0e-5)
+    slow = replace(response, bin_samples=40, least_bins=8, model_error=3.0e-5)
     tumble = config.modes.tumble_rate
     return CoilMonitor(CoilMonitorSettings((x, y, z), response=response, slow=slow, tumble_rate=tumble))
