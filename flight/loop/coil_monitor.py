@@ -54,6 +54,7 @@ import numpy as np
 
 from flight.loop.coil_response import (
     ELECTRICAL,
+    LARGEST_GAIN,
     MEAN,
     NEWEST,
     Bounds,
@@ -692,6 +693,7 @@ class CoilMonitor:
         self._tell(axis, seen)
         self._weak = ""
         for response in self._responses:
+            response.largest = LARGEST_GAIN / np.abs(self.correction.factors)
             response.interrupted(now_ns)
 
     def _tell(self, axis: int, seen: str) -> None:

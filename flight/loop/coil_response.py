@@ -85,7 +85,6 @@ class CoilFault(Enum):
     A_HIGH = "input A's leg stuck high: current at zero command"
     B_HIGH = "input B's leg stuck high: current at zero command"
     HIGH = "a leg stuck high: current at zero command, gone while its bridge is braked"
-    REVERSED = "reversed: it turns the body the wrong way"
     UNCERTAIN = "broken in one of several ways"
 
 
@@ -391,6 +390,7 @@ class CoilResponse:
         gain, sigma: gains (3,) of the newest fit, and their standard deviations (3,), infinite before the
             first fit.
         fastest: largest body rate (rad/s) within the window of the newest fit.
+        largest: largest physically possible gains (3,), relative to the dipole of the recorded currents.
     """
 
     def __init__(self, settings: ResponseSettings) -> None:
@@ -415,6 +415,7 @@ class CoilResponse:
         self._known_ns = 0
         self._last_ns = 0
         self.gain: FloatArray = np.ones(3)
+        self.largest: FloatArray = np.full(3, LARGEST_GAIN)
         self.sigma: FloatArray = np.full(3, np.inf)
         self.reset()
 
@@ -591,9 +592,9 @@ class CoilResponse:
         self._weights = (others @ right[3:] - coupling @ freely.gains)[2 * count :]
         # If a gain is impossible even within its uncertainty, the model is wrong.
         sigmas = np.sqrt(spread * freely.variances)
-        possible = bool((np.abs(freely.gains) - 3.0 * sigmas < LARGEST_GAIN).all())
+        possible = bool((np.abs(freely.gains) - 3.0 * sigmas < self.largest).all())
         healthy = np.full(3, self._healthy)
-        one_free = [gains.solve(np.where(_EACH == axis, self._prior[:3], healthy)) for axis in range(3)]
+        one_free = [gains.solve(np.where(axis == _EACH, self._prior[:3], healthy)) for axis in range(3)]
         self.gain = np.array([fit.gains[axis] for axis, fit in enumerate(one_free)])
         self.sigma = np.sqrt(spread * np.array([fit.variances[axis] for axis, fit in enumerate(one_free)]))
         costs = [fit.cost / spread for fit in one_free]
@@ -602,7 +603,7 @@ class CoilResponse:
             # Limit of the sum of squares of a hypothesis that only this axis is broken.
             limit = min(costs[other] for other in range(3) if other != axis) - _CLEARLY
             limit = min(limit, freely.cost / spread + _WORSE)
-            reversed_cost = gains.solve(healthy, np.where(_EACH == axis, -1.0, 1.0)).cost / spread
+            reversed_cost = gains.solve(healthy, np.where(axis == _EACH, -1.0, 1.0)).cost / spread
             is_reversed = reversed_cost < min(limit, sound_cost - _CERTAINLY)
             self._count(axis, possible, alone=costs[axis] < limit, is_reversed=is_reversed)
 
@@ -617,7 +618,7 @@ class CoilResponse:
                 all coils are healthy.
         """
         settings, gain, sigma = self._settings, float(self.gain[axis]), float(self.sigma[axis])
-        judged = possible and abs(gain) <= LARGEST_GAIN
+        judged = possible and abs(gain) <= float(self.largest[axis])
         sure = judged and sigma < settings.sure
         wrong = possible and is_reversed and gain < settings.highest_reversed
         weak = alone and gain + _SIGMAS * sigma < _WEAK_GAIN and gain < settings.highest_feeble
@@ -634,7 +635,7 @@ class CoilResponse:
             counts[axis] = counts[axis] + 1 if holds else 0
 
     def _whitened(self, span: float) -> FloatArray:
-        """Return the rows (n, f, 6 + k) of all bins with noise of variance 1, without a constant acceleration.
+        """Return the rows (n, f, 6 + k) of all bins, with noise of variance 1 and without a constant part.
 
         The noise of the mean rate of a bin enters two differences of neighbouring bins with opposite signs.
         """

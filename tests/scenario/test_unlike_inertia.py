@@ -24,15 +24,17 @@ def test_moments_two_percent_off_isolate_no_healthy_coil(tmp_path: Path) -> None
     """Of this flight the believed inertia alone made coils y and z look reversed, at 48 and 88 s."""
     found = coil_judgement(_flown(tmp_path, 110.0, ""), "")
     assert found["healthy_isolated"] == []
-    assert found["healthy_suspected"] == []
+    assert found["healthy_suspected"] == found["healthy_corrected"] == []
 
 
 @pytest.mark.parametrize("axis", "yz")
-def test_a_coil_reversed_in_the_tumble_is_named_and_not_isolated(tmp_path: Path, axis: str) -> None:
+def test_a_coil_reversed_in_the_tumble_is_soon_flown_with_its_sign_changed(tmp_path: Path, axis: str) -> None:
     found = coil_judgement(_flown(tmp_path, 60.0, f"coil-{axis}: reversed"), axis)
-    assert found["named_s"] is not None
+    assert found["corrected_s"] is not None
+    assert found["corrected_s"] < 30.0
+    assert found["flown_with"] == -1.0
     assert found["isolated_s"] is None
-    assert found["healthy_isolated"] == []
+    assert found["healthy_isolated"] == found["healthy_corrected"] == []
 
 
 def test_an_open_coil_is_isolated_in_the_tumble_by_the_supply_current(tmp_path: Path) -> None:

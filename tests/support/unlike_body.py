@@ -32,6 +32,12 @@ def without_cameras(config: OrbitConfig, duration: float) -> OrbitConfig:
     return configuration.replace(config, duration=duration, camera=None, wide_cameras=())
 
 
+def with_fault(world: Simulation, seed: int, fault: str = "") -> Simulation:
+    """Return a world with other errors of the configuration's description, and perhaps a fault."""
+    entries = (FaultEntry(fault=fault, at=0.0),) if fault else ()
+    return configuration.replace(world, seed=seed, faults=entries)
+
+
 def with_other_body(
     world: Simulation, moments: Sequence[float], axes_deg: float, seed: int, fault: str = ""
 ) -> Simulation:
@@ -46,24 +52,38 @@ def with_other_body(
         craft=configuration.replace(craft, inertia=(x, y, z)),
         disturbances=configuration.replace(body.disturbances, principal_turn_deg=axes_deg),
     )
-    entries = (FaultEntry(fault=fault, at=0.0),) if fault else ()
-    return configuration.replace(world, seed=seed, free_body=body, faults=entries)
+    return configuration.replace(with_fault(world, seed, fault), free_body=body)
 
 
 def coil_judgement(flown: Run, broken: str) -> dict[str, Any]:
-    """Return which axes were isolated, and when the `broken` one ("" for none) was named and isolated, s."""
+    """Return which axes were judged, and when the `broken` one ("" for none) was named and corrected, s.
+
+    `flown_with` is the last factor of the broken coil's dipole, 1 if it was never corrected.
+    """
     isolated: dict[str, float] = {}
     named: dict[str, float] = {}
-    kinds = {events.COIL_BROKEN.name: isolated, events.COIL_SUSPECT.name: named}
+    corrected: dict[str, float] = {}
+    factors: dict[str, float] = {}
+    kinds = {
+        events.COIL_BROKEN.name: isolated,
+        events.COIL_SUSPECT.name: named,
+        events.COIL_CORRECTED.name: corrected,
+    }
     for event in flown["event"]:
         text = to_text(event["text"])
         found = kinds.get(to_text(event["name"]))
-        if found is not None and text.startswith("coil "):
-            found.setdefault(text[5], float(event["time_ns"]) / SECOND_NS)
+        if found is None or not text.startswith("coil "):
+            continue
+        found.setdefault(text[5], float(event["time_ns"]) / SECOND_NS)
+        if found is corrected:
+            factors[text[5]] = float(text.partition("flown with ")[2].split()[0])
     return {
         "healthy_isolated": sorted(axis for axis in isolated if axis != broken),
         "healthy_suspected": sorted(axis for axis in named if axis != broken),
+        "healthy_corrected": sorted(axis for axis in corrected if axis != broken),
         "isolated_s": isolated.get(broken),
-        "named_s": min((one[broken] for one in (isolated, named) if broken in one), default=None),
+        "corrected_s": corrected.get(broken),
+        "flown_with": factors.get(broken, 1.0),
+        "named_s": min((one[broken] for one in kinds.values() if broken in one), default=None),
         "speed_deg_s": math.degrees(float(np.linalg.norm(flown["attitude"]["rate"][-1]))),
     }

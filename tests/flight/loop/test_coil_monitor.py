@@ -36,7 +36,6 @@ BOUNDS = Bounds((FULL, FULL, FULL), 3.5e-3, 0.2, 1.5e-3)
         ("coil-x: open", {"OPEN", "UNCERTAIN"}, 3.5),
         ("coil-x: shorted", {"SHORTED"}, 4.0),
         ("coil-x: shorted (ohm=1)", {"SHORTED"}, 4.0),  # beyond the range of the monitor
-        ("coil-x: reversed", {"REVERSED"}, 6.0),
         ("bridge-x: a-low", {"A_LOW", "UNCERTAIN"}, 3.5),
         ("bridge-x: a-high", {"HIGH"}, 4.0),
         ("bridge-y: a-high", {"HIGH"}, 3.0),
@@ -51,6 +50,38 @@ def test_a_broken_axis_is_found_and_named(fault: str, names: set[str], within: f
     assert name in names
     assert FAULT_AT < when < FAULT_AT + within
     assert not seen.watch.available["xyz".index(axis)]
+
+
+def test_a_reversed_coil_on_the_thread_is_used_with_its_sign_changed() -> None:
+    seen = observe(hold(TARGET), FAULT_AT + 14.0, [f"coil-x: reversed @ {FAULT_AT}"])
+    assert seen.found == []
+    ((when, told),) = seen.news
+    assert FAULT_AT < when < FAULT_AT + 6.0
+    assert told.startswith("coil x: ")
+    assert seen.watch.correction.factors.tolist() == [-1.0, 1.0, 1.0]
+    assert abs(seen.angle - TARGET) < 0.1
+
+
+@pytest.mark.parametrize("trials", [0, 2])
+def test_an_open_coil_is_tried_again_while_the_body_is_slow(trials: int) -> None:
+    settings = CoilMonitorSettings((FULL, FULL, FULL), tumble_rate=0.02, trial_after_ns=5, trials=trials)
+    watch, quiet = CoilMonitor(settings), np.zeros(3)
+    watch.commanded(0, quiet)
+    for trial in range(trials):
+        watch._give(1, CoilFault.OPEN, 100 * trial, "no current")
+        watch.observe_motion(100 * trial + 9, np.array([0.03, 0.0, 0.0]), quiet)
+        assert watch.begin_trial(100 * trial + 9) is None, "the body is too fast"
+        watch.observe_motion(100 * trial + 10, np.array([0.01, 0.0, 0.0]), quiet)
+        assert watch.begin_trial(100 * trial + 4) is None, "too early"
+        found = watch.begin_trial(100 * trial + 5)
+        assert found == (1, f"coil y is tried again, {trial + 1} of {trials}")
+        assert watch.available.all()
+    watch._give(1, CoilFault.OPEN, 1000, "no current")
+    watch.observe_motion(1010, quiet, quiet)
+    assert watch.begin_trial(2000) is None, "no trial is left"
+    assert watch.available.tolist() == [True, False, True]
+    watch.forget(1)
+    assert watch.available.all()
 
 
 def test_sound_coils_of_another_resistance_raise_no_suspicion() -> None:

@@ -1,18 +1,19 @@
-"""The coil drive leaves resting coils undriven and adopts the rate above which coils may only rest."""
+"""The coil drive leaves resting coils undriven, corrects signs and gains, and reports trials of coils."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from flight.loop.coil_monitor import CoilMonitor
-from flight.loop.facts import Services
+from flight.loop.coil_monitor import CoilCorrection, CoilMonitor, CoilMonitorSettings
+from flight.loop.coil_response import CoilFault
+from flight.loop.facts import EventLog, Facts, Services
 from flight.loop.steering import CoilDrive, CoilDriveSettings
 from flight.schema.sections import Modes
-from hal.interfaces.devices import TorqueCoils
+from hal.interfaces.devices import CoilState, ImuReading, TorqueCoils
 from knightcube.astro.arrays import FloatArray
 
 FIELD = np.array([2e-5, -1e-5, 3e-5])
@@ -32,7 +33,12 @@ class Coils:
 def _drive(resting: list[bool]) -> tuple[CoilDrive, Coils, SimpleNamespace]:
     coils = Coils()
     watch = SimpleNamespace(
-        resting=np.array(resting), at_rest=False, probe=np.zeros(3), suspicion="", tumble_rate=0.0175
+        resting=np.array(resting),
+        at_rest=False,
+        probe=np.zeros(3),
+        suspicion="",
+        tumble_rate=0.0175,
+        correction=CoilCorrection(),
     )
     settings = CoilDriveSettings(DIPOLE, np.full(3, 0.148), None)
     services = SimpleNamespace(facts=None, events=None)
@@ -63,7 +69,59 @@ def test_coils_that_do_not_rest_get_what_is_asked() -> None:
     assert coils.currents.tolist() == [0.02, 0.03, -0.01]
 
 
-def test_a_loaded_parameter_changes_the_rate_above_which_coils_may_only_rest() -> None:
+def test_a_loaded_parameter_changes_the_rate_below_which_coils_are_reviewed() -> None:
     drive, _, watch = _drive([False, False, False])
     drive.adopt(Modes(tumble_rate=0.3))
     assert watch.tumble_rate == 0.3
+
+
+def test_a_reversed_coil_gets_the_opposite_current_and_the_filter_the_effective_one() -> None:
+    drive, coils, watch = _drive([False, False, False])
+    watch.correction.reverse(1, 0, in_tumble=True)
+    asked = np.array([0.02, 0.03, -0.01])
+    drive.send(asked, lambda: FIELD)
+    assert coils.currents.tolist() == [0.02, -0.03, -0.01]
+    assert drive.command.tolist() == asked.tolist()
+    in_force = cast(CoilState, SimpleNamespace(current=coils.currents))
+    assert drive.effective(in_force).tolist() == asked.tolist()
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_weak_coil_gets_more_current_within_its_limit(known: bool) -> None:
+    drive, coils, watch = _drive([False, False, False])
+    watch.correction.weigh(2, 0.5)
+    drive.send(np.array([0.02, 0.03, -0.05]), lambda: FIELD)
+    assert coils.currents.tolist() == [0.02, 0.03, -0.1]
+    asked = np.array([0.02, 0.03, -0.12])
+    drive.send(asked, lambda: FIELD if known else None)
+    assert np.abs(coils.currents).max() <= 0.148 + 1e-12
+    made, wanted = (np.cross(currents, FIELD) for currents in (drive.command, asked))
+    if known:
+        assert np.cross(made, wanted) == pytest.approx(np.zeros(3), abs=1e-18)
+        assert made @ wanted > 0.0
+    else:
+        assert drive.command.tolist() == [0.02, 0.03, -0.074]
+
+
+def test_corrections_and_trials_are_reported_and_a_coil_on_trial_is_used_again() -> None:
+    drive, _, _ = _drive([False, False, False])
+    told: list[tuple[str, str]] = []
+    events = SimpleNamespace(report=lambda kind, time_ns, text: told.append((kind.name, text)))
+    table = Facts(cast(EventLog, events))
+    watch = CoilMonitor(CoilMonitorSettings((0.148, 0.148, 0.148), trial_after_ns=10**9))
+    drive._watch, drive._events, drive._facts = watch, cast(EventLog, events), table
+    cast(Any, drive._coils).brake = lambda axes: None
+    state = CoilState(np.zeros(3), np.zeros(3), 0, False, 0, False, 0, "")
+    watch._give(0, CoilFault.OPEN, 0, "no current")
+    watch._tell(1, "seen")
+    drive.look(state, [], 1)
+    drive.isolate()
+    assert drive.available.tolist() == [False, True, True]
+    slow = ImuReading(2, 2, 2, np.zeros(4), np.zeros(3), np.zeros(3), np.zeros(3))
+    drive.look(state, [slow], 10**9)
+    assert drive.available.all()
+    watch._give(0, CoilFault.OPEN, 10**9, "no current")
+    drive.look(state, [], 10**9 + 1)
+    names = [name for name, _ in told]
+    assert names == ["coil-corrected", "coil-broken", "coil-trusted", "coil-broken"]
+    assert told[2][1] == "coil x is tried again, 1 of 3"

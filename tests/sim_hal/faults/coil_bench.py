@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -62,7 +62,7 @@ def watch_settings(config: TestbedConfig, monitor_only: bool = False) -> CoilMon
 
 @dataclass
 class Watched:
-    """What a watch saw: verdicts with the time at which they came, s; what the coils carried (k, 3) A."""
+    """What a watch saw: verdicts and corrections with their times, s; what the coils carried (k, 3) A."""
 
     watch: CoilMonitor
     found: list[tuple[float, str, str]]
@@ -71,6 +71,7 @@ class Watched:
     angle: float
     times: FloatArray
     carried: FloatArray
+    news: list[tuple[float, str]] = field(default_factory=list)
 
 
 def observe(
@@ -121,10 +122,11 @@ def observe(
         for verdict in watch.verdicts[len(seen.found) :]:
             assert verdict.fault is not None
             seen.found.append((time, "xyz"[verdict.axis], verdict.fault.name))
+        seen.news += [(time, text) for text in watch.news()]
         if newest is not None:
             wanted = command(time, newest)
             usable = watch.available & (not watch.at_rest)
-            coils.command(np.where(usable, wanted, 0.0) + watch.probe)
+            coils.command(np.where(usable, watch.correction.wire(wanted), 0.0) + watch.probe)
         coils.brake(watch.braked)
     seen.times, seen.carried = (np.array(column) for column in zip(*carried, strict=True))
     assert isinstance(lock.hardware.world, Testbed)
