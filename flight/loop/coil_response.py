@@ -15,11 +15,11 @@ commands vary too little, the standard deviation of the gain is large, and the a
 larger than `LARGEST_GAIN` is physically impossible. A gain larger than `LARGEST_GAIN` shows that the model is
 wrong, and no axis is judged.
 
-In a field, the torques of three coils are normal to the field, so that the three gains can hardly be separated
-from each other within a short time. The gain of each coil is therefore estimated with the other two coils
-assumed healthy within the accuracy of their description. An axis is judged only if a fault of this axis
-explains the motion clearly better than a fault of another axis. A coil is reversed if this is far more likely
-than that all coils are healthy.
+The torques of three coils are normal to the field, so that the three gains can hardly be separated from each
+other within a short time. The gain of each coil is therefore estimated with the other two coils assumed
+healthy within the accuracy of their description. An axis is judged only if a fault of this axis explains the
+motion clearly better than a fault of another axis. A coil is reversed if this is far more likely than that
+all coils are healthy.
 
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
 that an inertia error of 2 % can make healthy coils look reversed. The fit therefore subtracts the gyroscopic

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from flight.link import events
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import PacketArray, to_text
 from flight.loop.facts import FACTS, StreamState
@@ -73,6 +74,7 @@ def summarise(run: Run) -> Object:
         "modes": _modes(run["mode"]),
         "health": _health(run["health"]),
         "events": _events(run["event"]),
+        "coils": _coils(run["event"]),
         "logs": _logs(run),
         "notes": notes,
     }
@@ -269,6 +271,16 @@ def _events(packets: PacketArray) -> list[Object]:
         first = {"name": name, "count": 0, "severity": int(row["severity"]), "first_s": float(time)}
         found.setdefault(name, {**first, "text": text})["count"] += 1 + int(row["suppressed"])
     return list(found.values())
+
+
+_OF_COILS = {events.COIL_BROKEN.name, events.COIL_CORRECTED.name, events.COIL_TRUSTED.name}
+
+
+def _coils(packets: PacketArray) -> list[Object]:
+    """Return time, name and text of the events by which a coil is isolated, corrected or used again."""
+    rows = ((float(time), row) for row, time in zip(packets, seconds(packets), strict=True))
+    named = ((time, to_text(row["name"]), to_text(row["text"])) for time, row in rows)
+    return [{"time_s": time, "name": name, "text": text} for time, name, text in named if name in _OF_COILS]
 
 
 def _logs(run: Run) -> list[Object]:

@@ -39,6 +39,7 @@ def format_report(summary: Object) -> str:
         _modes(summary["modes"]),
         _health(summary["health"]),
         _events(summary["events"]),
+        _coils(summary["coils"]),
         _logs(summary["logs"]),
         [f"note: {note}" for note in summary["notes"]],
     ]
@@ -400,6 +401,13 @@ def _events(events: list[Object]) -> list[str]:
         for event in events
     ]
     return ["Events", *table(["", "severity", "count", "first at s"], rows)]
+
+
+def _coils(judged: list[Object]) -> list[str]:
+    """Return the events by which a coil is isolated, corrected or used again, with their texts."""
+    if not judged:
+        return []
+    return ["Coils", *(f"  {number(one['time_s'], 1)} s  {one['name']}: {one['text']}" for one in judged)]
 
 
 def _logs(logs: list[Object]) -> list[str]:

@@ -32,6 +32,7 @@ EMPTY: dict[str, Any] = {
     "modes": [],
     "health": None,
     "events": [],
+    "coils": [],
     "logs": [],
     "notes": ["one", "two"],
 }
@@ -288,6 +289,18 @@ def test_up_to_twenty_failed_frames_are_listed(count: int, more: str) -> None:
     assert lines[3].split() == ["1", "0.500", "too-few", "-"]
     assert len(lines) == 2 + 20 + bool(more)
     assert not more or lines[-1] == more
+
+
+def test_judgements_of_coils_are_listed_with_their_texts() -> None:
+    row = {
+        "time_s": 9.2,
+        "name": "coil-corrected",
+        "text": "coil y: flown with -1.00 of its described dipole",
+    }
+    assert blocks(coils=[row])[-1].splitlines() == [
+        "Coils",
+        "  9.2 s  coil-corrected: coil y: flown with -1.00 of its described dipole",
+    ]
 
 
 def test_modes_health_and_events_are_listed() -> None:

@@ -94,7 +94,14 @@ def judge(flown: Run, entry: FaultEntry) -> Result:
         "refusals": len(refused_s),
         "last_refusal_s": max(refused_s.tolist(), default=None),
         "control_lost": names.count(events.CONTROL_LOST.name),
-        "found_s": _first(event, names, events.COIL_BROKEN.name, begin),
+        "found_s": min(
+            (
+                time
+                for kind in (events.COIL_BROKEN, events.COIL_CORRECTED)
+                if (time := _first(event, names, kind.name, begin)) is not None
+            ),
+            default=None,
+        ),
     }
 
 

@@ -16,7 +16,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray
 from sim_hal.faults.bench import FaultKind
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns.campaign import Result
-from tests.studies.campaigns.fault_table import REACTION, own_events, part_of
+from tests.studies.campaigns.fault_table import COIL_JUDGED, REACTION, own_events, part_of
 from tests.support.flights import DURATION, FRAME_EXPOSURE, FRAME_LATE, FRAME_PERIOD, demo_world
 
 CYCLE = 0.025
@@ -193,7 +193,7 @@ def _recovered(
             grown = np.flatnonzero(np.diff(house["frames"].astype(int)) > 0) + 1
             found = _first(house["time_ns"][grown] * 1e-9, end)
         case "coil" | "bridge":
-            found = _first(np.array([time for time, name in reported if name == "coil-broken"]), at)
+            found = _first(np.array([time for time, name in reported if name in COIL_JUDGED]), at)
         case "disk":
             found = _first(np.array([time for time, name in reported if name == "log-recovered"]), end)
         case _:
@@ -264,7 +264,9 @@ def _reaction_right(
 ) -> bool | None:
     """Return whether the table's reaction followed; None where the table has none."""
     part = part_of(kind)
-    times = [time for time, name in warned if name == REACTION.get(part)]
+    # A reversed coil is not isolated, but used with its sign changed.
+    expected = COIL_JUDGED if part == "coil" else {REACTION.get(part)}
+    times = [time for time, name in warned if name in expected]
     control = flown["control"]
     time = control["time_ns"] * 1e-9
     driven = np.abs(control["current_written"]).max(axis=1) > DRIVEN

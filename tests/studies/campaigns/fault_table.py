@@ -19,7 +19,7 @@ OWN: Mapping[str, frozenset[str]] = {
     "pwm": frozenset({"coil-fault"}),
     "bus": frozenset({"coil-fault", "power-fault"}),
     "monitor": frozenset({"power-fault", "power-doubted", "coil-suspect"}),
-    "coil": frozenset({"coil-broken", "coil-suspect"}),
+    "coil": frozenset({"coil-broken", "coil-corrected", "coil-suspect"}),
     "bridge": frozenset({"coil-broken", "coil-suspect"}),
     "camera": frozenset(
         {"camera-lost", "camera-frozen", "camera-black", "camera-torn", "camera-strange", "camera-late"}
@@ -31,6 +31,9 @@ OWN: Mapping[str, frozenset[str]] = {
     "disk": frozenset({"log-fault"}),
 }
 """Events that report a fault of a device."""
+
+COIL_JUDGED = frozenset({"coil-broken", "coil-corrected"})
+"""Events by which a broken coil is isolated, or a reversed one used with its sign changed."""
 
 OWN_OF_KIND: dict[str, frozenset[str]] = {
     # The packets are good, but too few or too old to steer by: only the stream's own event applies.
