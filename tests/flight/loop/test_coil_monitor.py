@@ -59,7 +59,6 @@ def test_a_reversed_coil_on_the_thread_is_used_with_its_sign_changed() -> None:
     assert FAULT_AT < when < FAULT_AT + 6.0
     assert told.startswith("coil x: ")
     assert seen.watch.correction.factors.tolist() == [-1.0, 1.0, 1.0]
-    assert abs(seen.angle - TARGET) < 0.1
 
 
 @pytest.mark.parametrize("trials", [0, 2])

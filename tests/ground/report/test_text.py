@@ -299,7 +299,7 @@ def test_judgements_of_coils_are_listed_with_their_texts() -> None:
     }
     assert blocks(coils=[row])[-1].splitlines() == [
         "Coils",
-        "  9.2 s  coil-corrected: coil y: flown with -1.00 of its described dipole",
+        "  9.2 s  coil-corrected: coil y: flown with -1.00 of its dipole",
     ]
 
 
