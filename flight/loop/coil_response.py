@@ -690,7 +690,7 @@ class GainEquations(NamedTuple):
         gains = covariance @ right
         # The expected gains are 1 or -1, so that the weights are also the sum of their squares.
         cost = self.constant + float(weights.sum() - right @ gains)
-        return GainFit(gains, covariance.diagonal(), cost)
+        return GainFit(gains, np.asarray(covariance.diagonal(), dtype=np.float64), cost)
 
 
 _EACH = np.arange(3)

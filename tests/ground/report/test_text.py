@@ -295,7 +295,7 @@ def test_judgements_of_coils_are_listed_with_their_texts() -> None:
     row = {
         "time_s": 9.2,
         "name": "coil-corrected",
-        "text": "coil y: flown with -1.00 of its described dipole",
+        "text": "coil y: flown with -1.00 of its dipole",
     }
     assert blocks(coils=[row])[-1].splitlines() == [
         "Coils",
