@@ -17,6 +17,7 @@ from ipaddress import IPv4Network
 from pathlib import Path
 
 from flight.schema.devices import V4l2Device
+from flight.schema.document import ConfigError, read_document, read_text
 from flight.schema.reader import LOOPBACK, load, peer_networks
 from flight.schema.sections import Config
 from hal.buses.i2c_bus import device_file
@@ -148,11 +149,20 @@ def _bus(config: Config) -> list[str]:
     ]
 
 
+def _check_single(path: Path) -> None:
+    """Raise ConfigError for a configuration that extends another file, which its checksum does not cover."""
+    if len(read_document(read_text(path), str(path)).chain) > 1:
+        problem = "its checksum covers one file: write it as one file by `flight check FILE --merged NEW`"
+        raise ConfigError(str(path), f"`extends` cannot be used on a board: {problem}")
+
+
 def main(words: list[str]) -> int:
     """Print the drop-in for the configuration file in the arguments, and return the exit status."""
     make = {"--safe": safe_dropin, "--link": link_dropin}.get(words[0], dropin)
     try:
-        sys.stdout.write(make(load(Path(words[-1]))))
+        path = Path(words[-1])
+        _check_single(path)
+        sys.stdout.write(make(load(path)))
     except UsageError as error:
         sys.stderr.write(f"install: {error}\n")
         return 2

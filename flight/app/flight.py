@@ -69,7 +69,7 @@ from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
 from flight.loop.worker_processes import ProcessRunner
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_settings
-from flight.schema.document import ConfigError, read_text
+from flight.schema.document import ConfigError, merged_text, read_text
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.buses.linux_process import worker_cores
 from hal.interfaces.wires import SECOND_NS, Clock, Rig
@@ -167,11 +167,15 @@ def mission_zero(clock: Clock) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """A request whose configuration was read from the file in `chosen`, and validated."""
+    """A request whose configuration was read from the file in `chosen`, and validated.
+
+    The text `merged` includes the files that the configuration extends.
+    """
 
     request: RunRequest
     chosen: Chosen
     text: str
+    merged: str
     config: Config
 
 
@@ -181,6 +185,7 @@ class _Opened:
 
     request: RunRequest
     text: str
+    merged: str
     config: Config
     rig: Rig
     loop: FlightLoop
@@ -205,7 +210,7 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
             loop.note(events.RELEASE_LEFT, release.note)
         if rig.realtime:
             release.serve(rig.clock, stack)
-        label = RunLabel(text, rig.seed, config.simulation is not None, rig.realtime)
+        label = RunLabel(opened.merged, rig.seed, config.simulation is not None, rig.realtime)
         epoch_ns = mission_zero(rig.clock) if rig.realtime else next_whole_second(rig.clock)
         rig.release(epoch_ns)
         signals.end(loop)
@@ -245,14 +250,14 @@ def _judge(request: RunRequest) -> _Judged:
     text, config = requested_config(request, chosen.text)
     with placing(text, str(chosen.path)):
         check_settings(config)
-    return _Judged(request, chosen, text, config)
+    return _Judged(request, chosen, text, merged_text(text, str(chosen.path)), config)
 
 
 def _open(judged: _Judged, stack: ExitStack) -> _Opened:
     """Open a flight. The run folder is removed from the archive if the opening fails."""
     chosen, text, config = judged.chosen, judged.text, judged.config
     stack.enter_context(placing(text, str(chosen.path)))
-    request, earlier = begin_folder(judged.request, text, config)
+    request, earlier = begin_folder(judged.request, judged.merged, config)
     unflown = stack.enter_context(ExitStack())
     if request.archive is not None:
         unflown.callback(rmtree, request.out, ignore_errors=True)
@@ -263,9 +268,9 @@ def _open(judged: _Judged, stack: ExitStack) -> _Opened:
         sys.stderr.write(f"flight: {chosen.problem}\n")
         loop.note(events.CONFIG_DAMAGED, chosen.problem)
     elif chosen.accepted and rig.realtime and (folder := service_folder(os.environ)) is not None:
-        stack.callback(FlownConfig(text, folder).serve(rig.clock).stop)
+        stack.callback(FlownConfig(judged.merged, folder).serve(rig.clock).stop)
     unflown.pop_all()
-    return _Opened(request, text, config, rig, loop, log)
+    return _Opened(request, text, judged.merged, config, rig, loop, log)
 
 
 @contextmanager

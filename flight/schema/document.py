@@ -1,16 +1,18 @@
 """Converts configuration text into plain values and typed sections; errors name file, line, value and cure.
 
 Plain scalars follow the core schema of YAML 1.2: `1e-5` and `0o17` are numbers, `yes` and `12:30` are texts.
-Aliases, duplicate keys, application tags, infinite numbers and NaN are rejected.
+Aliases, duplicate keys, application tags, infinite numbers and NaN are rejected. A file with the key
+`extends` takes over the values of another file and replaces some of them.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
+import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -22,6 +24,8 @@ from knightcube.errors import InputError
 
 FOLDER = Path(__file__).parent / "configurations"
 """Folder of the configurations in the package, a link to the folder config of the repository."""
+EXTENDS = "extends"
+"""Key whose value names the file that a configuration extends."""
 _LONGEST = 1 << 20
 """Maximum length of a configuration file, in characters."""
 
@@ -39,18 +43,28 @@ class UnreadConfigError(ConfigError):
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """The values of a configuration file, its name, and the line of each dotted name (`steps[1].at`)."""
+    """The values of a configuration file, including those of the files that it extends.
+
+    Attributes:
+        values: values without the key `extends`.
+        name: name of the file in messages.
+        lines: line of each dotted name (`steps[1].at`), in the file that gives its value.
+        files: file of each dotted name whose value stands in another file than `name`.
+        chain: name of this file, of the file that it extends, and so on.
+    """
 
     values: dict[str, Any]
     name: str
     lines: dict[str, int]
+    files: dict[str, str] = field(default_factory=dict)
+    chain: tuple[str, ...] = ()
 
     def error(self, dotted: str, problem: str) -> ConfigError:
         """Return an error about a value, with the line of the value or of the nearest enclosing section."""
         known = dotted
         while known and known not in self.lines:
             known = re.sub(r"(\.[^.\[]+|\[[^\]]*\]|^[^.\[]+)$", "", known)
-        where = f"{self.name}:{self.lines[known]}" if known else self.name
+        where = f"{self.files.get(known, self.name)}:{self.lines[known]}" if known else self.name
         return ConfigError(where, f"`{dotted or 'configuration'}` {problem}")
 
 
@@ -146,7 +160,77 @@ def checked_length(text: str, path: Path) -> str:
 
 
 def read_document(text: str, name: str) -> Document:
-    """Return the values of a YAML text. Error messages name the file `name`. Raises ConfigError."""
+    """Return the values of a YAML text, including those of the files that it extends.
+
+    The value of the key `extends` is a path relative to the file `name`, or the name of a packaged
+    configuration. Mappings are merged key by key; lists and scalars replace those of the extended file. Error
+    messages name the file in which a value stands.
+
+    Raises ConfigError, also if files extend each other in a circle, and UnreadConfigError if an extended file
+    cannot be read.
+    """
+    return _extended(_read_single(text, name), ())
+
+
+def merged_text(text: str, name: str) -> str:
+    """Return a configuration as one file: `text` itself, or its merged values if it extends another file.
+
+    Raises ConfigError.
+    """
+    document = read_document(text, name)
+    if len(document.chain) == 1:
+        return text
+    # The names are quoted, because they may contain line breaks.
+    names_of = ", ".join(ascii(Path(one).name) for one in document.chain)
+    return f"# merged from {names_of}\n{to_yaml(document.values)}"
+
+
+def _extended(document: Document, above: tuple[str, ...]) -> Document:
+    """Return a document merged with the file that it extends; `above` are the files that extend it."""
+    if EXTENDS not in document.values:
+        return document
+    named = document.values.pop(EXTENDS)
+    place = document.error(EXTENDS, "").where
+    if not isinstance(named, str) or "\0" in named:
+        problem = f"is {named!r}: give the path of a file, or the name of a configuration"
+        raise document.error(EXTENDS, problem)
+    path = Path(document.name).parent / named
+    if named in names() or (named.removesuffix(".yaml") in names() and not os.path.lexists(path)):
+        path = FOLDER / f"{named.removesuffix('.yaml')}.yaml"
+    above, real = (*above, os.path.realpath(document.name)), os.path.realpath(path)
+    if real in above:
+        circle = ", ".join(Path(file).name for file in (*above[above.index(real) :], real))
+        raise document.error(EXTENDS, f"is {named!r}: these files extend each other in a circle: {circle}")
+    try:
+        text = read_text(path)
+    except ConfigError as error:
+        raise type(error)(place, f"`{EXTENDS}` is {named!r}: {error}") from error
+    base = _extended(_read_single(text, str(path)), above)
+    del document.lines[EXTENDS]
+    lines, sources = dict(base.lines), {dotted: base.files.get(dotted, base.name) for dotted in base.lines}
+    values = _merged(base.values, document.values, "", lines)
+    for dotted, line in document.lines.items():
+        lines[dotted] = line
+        sources.pop(dotted, None)
+    files_of = {dotted: source for dotted, source in sources.items() if dotted in lines}
+    return Document(values, document.name, lines, files_of, (document.name, *base.chain))
+
+
+def _merged(base: Any, own: Any, dotted: str, lines: dict[str, int]) -> Any:
+    """Return `own` merged into `base`, and delete the lines of the values below `dotted` that it replaces."""
+    if isinstance(base, dict) and isinstance(own, dict):
+        merged = dict(base)
+        for key, value in own.items():
+            below = join(dotted, str(key))
+            merged[key] = _merged(base[key], value, below, lines) if key in base else value
+        return merged
+    for name in [name for name in lines if name.startswith((f"{dotted}.", f"{dotted}["))]:
+        del lines[name]
+    return own
+
+
+def _read_single(text: str, name: str) -> Document:
+    """Return the values of a YAML text without those of a file that it extends. Raises ConfigError."""
     lines: dict[str, int] = {}
     try:
         loader = _Loader(text)
@@ -166,7 +250,7 @@ def read_document(text: str, name: str) -> Document:
         raise ConfigError(where, f"is not YAML: {problem.splitlines()[0]}") from error
     if not isinstance(values, dict):
         raise ConfigError(name, "must be a mapping of sections, see config/step_demo.yaml")
-    document = Document(values, name, lines)
+    document = Document(values, name, lines, chain=(name,))
     _refuse_not_finite(values, "", document)
     return document
 

@@ -28,7 +28,7 @@ from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
 from flight.link.telemetry.definitions import VERIFICATION, Field, crc_of
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import Layout, Packer, PacketArray, TelemetryError
-from flight.schema.document import read_text
+from flight.schema.document import merged_text, read_text
 from flight.schema.reader import parse
 from flight.schema.sections import Commands
 from ground.console.history import values
@@ -205,7 +205,7 @@ def flying(config: Path, out: Path) -> Iterator[str]:
 
     The flight ends when the context is left. Raises FlightError if it does not start.
     """
-    text = read_text(config)
+    text = merged_text(read_text(config), str(config))
     parsed = parse(text, str(config))
     if parsed.simulation is None:
         raise UsageError(f"{config}: flies real devices; start the flight separately and give its run folder")

@@ -144,6 +144,18 @@ def test_the_dropin_names_the_devices_and_nothing_of_a_network() -> None:
     assert "video" not in text
 
 
+def test_a_configuration_that_extends_another_is_refused_for_a_board(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "flight.yaml"
+    path.write_text("extends: testbed\n", encoding="utf-8")
+    assert board_dropin.main([str(path)]) == 2
+    words = capsys.readouterr().err
+    assert f"install: {path}: `extends` cannot be used on a board" in words
+    assert "flight check FILE --merged NEW" in words
+    assert board_dropin.main([str(TESTBED)]) == 0
+
+
 @needs_systemd
 def test_the_flight_waits_for_the_device_that_udev_names() -> None:
     words = ["systemd-escape", "--path", "--suffix=device", "/dev/knightcube-imu"]

@@ -25,7 +25,7 @@ from flight.app.devices import linux_camera, unit_settings
 from flight.app.run import RunRequest, RunResult
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera
-from flight.schema.document import config_path, names
+from flight.schema.document import config_path, merged_text, names, read_document
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus, device_file
@@ -34,6 +34,7 @@ from hal.drivers import ads1115, ina219
 from hal.drivers.pca9685 import MODE1
 from hal.drivers.vn100.driver import Vn100
 from hal.interfaces.errors import DeviceError, NotResponding
+from knightcube.errors import UsageError
 
 _CHIP_CURE = "check power, wiring and address; `i2cdetect -y` lists the chips that answer"
 _LISTENED_NS = 2_500_000_000
@@ -145,6 +146,7 @@ class CheckResult:
 
     config: Config
     path: Path
+    chain: tuple[str, ...] = ()
     problems: list[str] = field(default_factory=list)
     devices: list[Any] = field(default_factory=list)
     result: RunResult | None = None
@@ -161,6 +163,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     carried = ", ".join(names())
     parser.add_argument("config", type=config_path, metavar="CONFIG", help=f"YAML file, or one of {carried}")
+    parser.add_argument(
+        "--merged", type=Path, metavar="FILE", help="write CONFIG and the files that it extends as one file"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=check)
 
@@ -175,7 +180,10 @@ def check(options: argparse.Namespace) -> int:
     chosen = accepted_config(options.config, os.environ)
     path = chosen.path
     config = configuration.parse(chosen.text, str(path))
-    verdict = CheckResult(config, path, [chosen.problem] if chosen.problem else [])
+    chain = read_document(chosen.text, str(path)).chain
+    verdict = CheckResult(config, path, chain, [chosen.problem] if chosen.problem else [])
+    if options.merged is not None:
+        _write(options.merged, merged_text(chosen.text, str(path)))
     with placing(chosen.text, str(path)):
         body_kind(config)
         check_settings(config)
@@ -186,6 +194,15 @@ def check(options: argparse.Namespace) -> int:
             _fly(verdict)
     sys.stdout.write(json.dumps(_facts(verdict)) + "\n" if options.json else _text(verdict))
     return 1 if verdict.problems else 0
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a new file. Raises UsageError if the file exists or cannot be written."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise UsageError(f"--merged {path}: cannot be written: {error.strerror or error}") from error
 
 
 def _fly(verdict: CheckResult) -> None:
@@ -218,6 +235,7 @@ def _facts(verdict: CheckResult) -> dict[str, Any]:
     flown = None if result is None else summary_facts(result, verdict.elapsed)
     return {
         "config": str(verdict.path),
+        "extends": list(verdict.chain[1:]),
         "name": config.name,
         "body": config.body,
         "simulated": config.simulation is not None,
@@ -232,6 +250,7 @@ def _text(verdict: CheckResult) -> str:
     config, result = verdict.config, verdict.result
     lines = [
         ("configuration", f"{verdict.path}: {config.name}, valid"),
+        *(("extends", name) for name in verdict.chain[1:]),
         ("to fly", f"body {config.body}, {config.duration:g} s"),
         ("devices", "simulated" if config.simulation is not None else f"{len(verdict.devices)} looked for"),
     ]

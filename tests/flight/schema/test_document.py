@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from flight.schema.document import ConfigError, config_path, join, read_document, read_text, to_yaml
+from flight.schema.document import (
+    ConfigError,
+    Document,
+    config_path,
+    join,
+    merged_text,
+    read_document,
+    read_text,
+    to_yaml,
+)
+from flight.schema.reader import load, simulation_section
+from sim_hal.settings import Simulation
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"
 FILES = sorted(FOLDER.rglob("*.yaml"))
@@ -149,3 +161,124 @@ def test_a_bare_name_is_a_configuration_of_the_package_and_everything_else_a_pat
     assert config_path("step_demo").resolve() == FOLDER / "step_demo.yaml"
     for text in ("step_demo.yaml", "./step_demo", "nothing"):
         assert config_path(text) == Path(text)
+
+
+def write(folder: Path, name: str, text: str) -> Path:
+    """Write a file of indented text into a folder."""
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(textwrap.dedent(text), encoding="utf-8")
+    return path
+
+
+def read(path: Path) -> Document:
+    return read_document(read_text(path), str(path))
+
+
+def test_a_file_takes_over_mappings_key_by_key_and_replaces_lists_and_scalars(tmp_path: Path) -> None:
+    write(
+        tmp_path,
+        "base.yaml",
+        """\
+        name: base
+        coils: {limit: 1, pair: [1, 2, 3], deep: {a: 1, b: 2}}
+        targets: [{at: 0}, {at: 1}]
+        camera: {rows: 5}
+        """,
+    )
+    write(tmp_path, "sub/middle.yaml", "extends: ../base.yaml\nname: middle\ncoils: {limit: 7}\n")
+    top = write(
+        tmp_path,
+        "top.yaml",
+        """\
+        # a comment
+        extends: sub/middle.yaml
+        coils:
+          pair: [4]
+          deep: {b: 3}
+        targets: [{at: 9}]
+        camera: none
+        """,
+    )
+    document = read(top)
+    assert document.values == {
+        "name": "middle",
+        "coils": {"limit": 7, "pair": [4], "deep": {"a": 1, "b": 3}},
+        "targets": [{"at": 9}],
+        "camera": "none",
+    }
+    assert document.chain == (
+        str(top),
+        str(tmp_path / "sub/middle.yaml"),
+        str(tmp_path / "sub/../base.yaml"),
+    )
+    middle, base = document.chain[1:]
+    for dotted, place in (
+        ("name", f"{middle}:2"),
+        ("coils", f"{top}:3"),
+        ("coils.limit", f"{middle}:3"),
+        ("coils.pair", f"{top}:4"),
+        ("coils.deep.a", f"{base}:2"),
+        ("coils.deep.b", f"{top}:5"),
+        ("coils.absent", f"{top}:3"),
+        ("targets[0].at", f"{top}:6"),
+        ("targets[1].at", f"{top}:6"),
+        ("camera.rows", f"{top}:7"),
+    ):
+        assert document.error(dotted, "").where == place, dotted
+    merged = merged_text(read_text(top), str(top))
+    assert merged.startswith("# merged from 'top.yaml', 'middle.yaml', 'base.yaml'\n")
+    assert read_document(merged, "elsewhere").values == document.values
+    assert merged_text("a: 1 # as it is\n", "one") == "a: 1 # as it is\n"
+
+
+@pytest.mark.parametrize("named", ["orbit_3u", "orbit_3u.yaml"])
+def test_a_packaged_configuration_is_extended_by_its_name(tmp_path: Path, named: str) -> None:
+    top = write(tmp_path, "top.yaml", f"extends: {named}\nname: mine\n")
+    assert read(top).values == read(FOLDER / "orbit_3u.yaml").values | {"name": "mine"}
+    # A file beside the extending file has precedence over a packaged file, but not over the bare name.
+    write(tmp_path, "orbit_3u.yaml", "own: 1\n")
+    assert ("own" in read(top).values) == named.endswith(".yaml")
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({"a.yaml": "extends: a.yaml\n"}, ["a.yaml:1", "in a circle: a.yaml, a.yaml"]),
+        (
+            {"a.yaml": "extends: b.yaml\n", "b.yaml": "x: 1\nextends: c.yaml\n", "c.yaml": "extends: b.yaml"},
+            ["c.yaml:1", "in a circle: b.yaml, c.yaml, b.yaml"],
+        ),
+        ({"a.yaml": "x: 1\nextends: none.yaml\n"}, ["a.yaml:2", "'none.yaml'", "no such file", "orbit_3u"]),
+        ({"a.yaml": "extends: [b]\n"}, ["a.yaml:1", "is ['b']: give the path of a file"]),
+        ({"a.yaml": 'extends: "b\\0"\n'}, ["a.yaml:1", "give the path of a file"]),
+        ({"a.yaml": f"extends: {'b' * 5000}\n"}, ["a.yaml:1", "cannot be read"]),
+        ({"a.yaml": "extends: .\n"}, ["a.yaml:1", "cannot be read"]),
+        ({"a.yaml": "extends: b.yaml\n", "b.yaml": "x: [\n"}, ["b.yaml:2", "is not YAML"]),
+        ({"a.yaml": "extends: b.yaml\n", "b.yaml": "x:\n  y: .inf\n"}, ["b.yaml:2", "`x.y` is inf"]),
+    ],
+)
+def test_a_wrong_extension_is_refused_with_its_place(
+    tmp_path: Path, files: dict[str, str], words: list[str]
+) -> None:
+    for name, text in files.items():
+        write(tmp_path, name, text)
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path / "a.yaml")
+    assert "\n" not in str(caught.value)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_errors_of_sections_name_the_file_of_the_value(tmp_path: Path) -> None:
+    text = read_text(FOLDER / "orbit_3u.yaml")
+    wrong = text.replace("release: {speed: 0.1745}", "release: {speed: -1.0}")
+    line = 1 + next(i for i, one in enumerate(wrong.splitlines()) if "speed: -1.0" in one)
+    write(tmp_path, "base.yaml", wrong)
+    top = write(tmp_path, "top.yaml", "extends: base.yaml\nsimulation: {seed: 2}\ncoils: {resistance: -1}\n")
+    with pytest.raises(ConfigError, match=r"top\.yaml:3: `coils\.resistance` is -1"):
+        load(top)
+    with pytest.raises(
+        ConfigError, match=rf"base\.yaml:{line}: `simulation\.free_body\.release\.speed` is -1"
+    ):
+        simulation_section(read_text(top), str(top), Simulation)

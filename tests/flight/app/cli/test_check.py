@@ -40,6 +40,25 @@ def test_a_sound_simulation_flies_ten_seconds_and_is_ready(tmp_path: Path) -> No
     assert not Path(facts["flight"]["folder"]).exists(), "nothing is left behind"
 
 
+def test_a_configuration_that_extends_another_is_checked_and_written_as_one_file(tmp_path: Path) -> None:
+    base = write(tmp_path, DEMO, camera="none", duration=0.5, steps=[{"at": 0.0, "q2": 0.0}])
+    top, merged, out = tmp_path / "top.yaml", tmp_path / "merged.yaml", tmp_path / "run"
+    top.write_text("extends: mine.yaml\nname: top\n", encoding="utf-8")
+    done = command("check", top, "--merged", merged)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"configuration: {top}: top, valid\nextends:       {base}\n")
+    assert yaml.safe_load(merged.read_text()) == yaml.safe_load(base.read_text()) | {"name": "top"}
+    facts = json.loads(command("check", top, "--json").stdout)
+    assert facts["extends"] == [str(base)]
+    again = command("check", top, "--merged", merged)
+    assert again.returncode == 2
+    assert "merged.yaml: cannot be written: File exists" in again.stderr
+    flown = command("run", top, "--out", out)
+    assert flown.returncode == 0, flown.stderr
+    assert (out / "config.yaml").read_text() == merged.read_text(), "the run folder does not need the files"
+    assert command("report", out).returncode == 0
+
+
 def test_a_shorter_flight_is_flown_whole_and_the_text_says_ready(tmp_path: Path) -> None:
     path = write(tmp_path, DEMO, camera="none", duration=0.5, steps=[{"at": 0.0, "q2": 0.0}])
     done = command("check", path)

@@ -1,0 +1,29 @@
+"""The page about a satellite of one's own: its blocks are read, and its commands are run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flight.schema.orbit import as_orbit
+from flight.schema.reader import load, parse
+from tests.support.places import ROOT
+
+PAGE = ROOT / "docs" / "fly" / "my-satellite.md"
+
+
+def block(start: str) -> str:
+    """Return the code block of the page that begins with a text."""
+    text = PAGE.read_text(encoding="utf-8")
+    return start + text.split(f"\n{start}", 1)[1].split("\n```", 1)[0]
+
+
+def test_the_extended_configuration_has_the_described_values(tmp_path: Path) -> None:
+    base = as_orbit(load(ROOT / "config" / "orbit_3u.yaml"))
+    own = as_orbit(parse(block("extends:"), str(tmp_path / "mine.yaml")))
+    assert (own.name, own.coils.current_limit, own.coils.resistance) == (
+        "my_satellite",
+        0.12,
+        base.coils.resistance,
+    )
+    assert [step.point for step in own.targets] == ["sun"]
+    assert own.wide_cameras == base.wide_cameras
