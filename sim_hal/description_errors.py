@@ -15,6 +15,7 @@ import numpy as np
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.inertia import principal_axes
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.settings import Simulation
 from sim_hal.worlds.world import World
@@ -68,7 +69,7 @@ def description_errors(config: Config, section: Simulation) -> DescriptionErrors
         np.fill_diagonal(errors, drawn(scale, 3))
         return np.eye(3) + errors
 
-    inertia = np.array(config.craft.inertia)
+    inertia, _ = principal_axes(config.craft.inertia_matrix())
     while True:
         moments = 1.0 + drawn(craft.moments, 3)
         if 2.0 * float((moments * inertia).max()) < float((moments * inertia).sum()):

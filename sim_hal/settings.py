@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from flight.schema.values import NotNegative, Positive, Quaternion, Section
+from flight.schema.values import Inertia, NotNegative, Positive, Quaternion, Section
 
 Vector = tuple[float, float, float]
 Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
@@ -39,12 +39,20 @@ class OrbitSection(Section, frozen=True, kw_only=True):
 class CraftSection(Section, frozen=True, kw_only=True):
     """A custom craft: a box of `size` (3,), m, with the origin of the body axes at its centre.
 
-    `inertia` (3,), kg m^2, holds the principal moments of inertia. `dipole_per_ampere` (m^2) is the dipole
-    per current of each coil.
+    `inertia`, kg m^2, holds the moments of inertia (3,) about the body axes, or the inertia tensor (3, 3).
+    `dipole_per_ampere` (m^2) is the dipole per current of each coil. If one of them is omitted, it equals
+    that of the flight configuration.
     """
 
-    inertia: tuple[Positive, Positive, Positive]
+    inertia: Inertia | None = None
     size: tuple[Positive, Positive, Positive]
+    dipole_per_ampere: Positive | None = None
+
+
+class CompleteCraft(CraftSection, frozen=True, kw_only=True):
+    """A custom craft with all of its values."""
+
+    inertia: Inertia
     dipole_per_ampere: Positive
 
 

@@ -10,7 +10,18 @@ from msgspec import Meta
 
 from flight.schema.document import ConfigError
 from flight.schema.sections import Config, Detumble, Estimation
-from flight.schema.values import Aim, GoalName, NotNegative, Positive, Section, Share, Vector
+from flight.schema.values import (
+    Aim,
+    GoalName,
+    Inertia,
+    NotNegative,
+    Positive,
+    Section,
+    Share,
+    Vector,
+    inertia_matrix,
+)
+from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
@@ -43,9 +54,13 @@ class Craft(Section, frozen=True, kw_only=True):
     `dipole_per_ampere` is the number of turns times the area of each coil, m^2.
     """
 
-    inertia: tuple[Positive, Positive, Positive]
+    inertia: Inertia
     dipole_per_ampere: Positive
     accuracy: CraftAccuracy = CraftAccuracy()
+
+    def inertia_matrix(self) -> FloatArray:
+        """Return the inertia tensor (3, 3) in body axes, kg m^2."""
+        return inertia_matrix(self.inertia)
 
 
 class FieldDetumble(Detumble, frozen=True, kw_only=True):

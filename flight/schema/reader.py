@@ -20,6 +20,7 @@ from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
 from flight.schema.values import Quaternion, check_aim
+from knightcube.astro.inertia import inertia_problem
 from knightcube.errors import UsageError
 
 Refuse = Callable[[str, str], None]
@@ -94,6 +95,12 @@ def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
 
 
 def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
+    try:
+        problem = inertia_problem(config.craft.inertia_matrix())
+    except ValueError:
+        problem = "mixes moments and rows: give three moments, or three rows of three values"
+    if problem:
+        refuse("craft.inertia", problem)
     times = [step.at for step in config.targets]
     _check_order("targets", times, refuse)
     for index, step in enumerate(config.targets):

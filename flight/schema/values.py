@@ -7,8 +7,10 @@ from collections.abc import Callable
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
+from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from knightcube.gnc.guidance.three_axes.pointing_target import ROLLS, Goal, PointingTarget
 
@@ -44,6 +46,12 @@ Channel = Annotated[int, Meta(ge=0, le=15)]
 BaudRate = Literal[9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600]
 Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
 Vector = tuple[float, float, float]
+Inertia = tuple[float | Vector, float | Vector, float | Vector]
+"""Three moments of inertia about the body axes, or the three rows of the inertia tensor, kg m^2.
+
+The function `inertia_problem` checks the moments. Bounds in this type would damage memory: msgspec 0.22
+cannot distinguish a number with a bound from a tuple of fixed length.
+"""
 Quaternion = tuple[float, float, float, float]
 PlainMode = Literal["testbed-demo", "hold", "detumble", "safe"]
 CommandedMode = Literal[PlainMode, "sun", "point"]
@@ -57,6 +65,12 @@ _OWN = {
 """Keys that a goal requires and no other goal accepts; the goal `object` may lack both of its keys."""
 _LENGTH_ERROR = 1e-3
 """Largest accepted deviation of a commanded quaternion's norm from 1."""
+
+
+def inertia_matrix(inertia: Inertia) -> FloatArray:
+    """Return the inertia tensor (3, 3), kg m^2. Raises ValueError if moments and rows are mixed."""
+    given = np.array(inertia, dtype=float)
+    return np.diag(given) if given.ndim == 1 else given
 
 
 class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):

@@ -272,7 +272,7 @@ def _planned(
         raise UsageError(f"{options.orbit}: a cone needs a `camera`")
     per_ampere, coils = config.craft.dipole_per_ampere, config.coils
     return plan_slew(
-        inertia=np.diag(config.craft.inertia),
+        inertia=config.craft.inertia_matrix(),
         dipole_limit=np.full(3, coils.current_limit * per_ampere),
         heat=np.array(coils.resistance) / per_ampere**2,
         elements=elements,

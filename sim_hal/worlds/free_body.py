@@ -26,17 +26,22 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from flight.schema.document import ConfigError
+from flight.schema.orbit import OrbitConfig
+from flight.schema.sections import Config
+from flight.schema.values import inertia_matrix
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.sun import DAY
+from knightcube.astro.inertia import inertia_problem, principal_axes
 from sim_hal.clock import NEVER
 from sim_hal.description_errors import NO_ERRORS, DescriptionErrors, description_errors
-from sim_hal.settings import CraftSection, Disturbances, FreeBodySection, TipOff
+from sim_hal.settings import CompleteCraft, Disturbances, FreeBodySection, TipOff
 from sim_hal.worlds.orbit import Environment, air_flow, elements, julian_date
 from sim_hal.worlds.world import BodyMotion, Floats, OrbitEnvironment, OrbitTruth, WorldInputs, WorldTruth
 
@@ -167,11 +172,13 @@ def steps_within(span: float, rate: float, longest: float) -> int:
 
 CRAFTS = {
     # The inertia is from Sease 2013, Table 5.1 (exponent corrected); a coil has 80 turns of 0.0081 m^2.
-    "knightcube": CraftSection(
+    "knightcube": CompleteCraft(
         inertia=(1.10e-3, 1.05e-3, 0.99e-3), size=(0.1, 0.1, 0.1), dipole_per_ampere=0.648
     ),
     # This craft is assumed to have 4 kg and coils of 57.8 ohm with 0.2 A m^2 at 58.8 mA, or 5 W/(A m^2)^2.
-    "cubesat_3u": CraftSection(inertia=(0.0066, 0.0333, 0.0333), size=(0.3, 0.1, 0.1), dipole_per_ampere=3.4),
+    "cubesat_3u": CompleteCraft(
+        inertia=(0.0066, 0.0333, 0.0333), size=(0.3, 0.1, 0.1), dipole_per_ampere=3.4
+    ),
 }
 
 PRESSURE_ARM = 0.02
@@ -221,12 +228,14 @@ class TrueCraft:
     walking_dipole: float
 
 
-def build(section: CraftSection, disturbances: Disturbances, generator: np.random.Generator) -> TrueCraft:
+def build(section: CompleteCraft, disturbances: Disturbances, generator: np.random.Generator) -> TrueCraft:
     """Return the craft with random errors from one seed.
 
     The number of random draws does not depend on the disturbance multiples, so the random directions of a
     seed are the same for every multiple.
     """
+    moments, axes = principal_axes(inertia_matrix(section.inertia))
+    x, y, z = moments.tolist()
     widest = math.radians(disturbances.principal_turn_deg)
     turn = generator.uniform(widest / 3.0, widest) * _direction(generator)
     arm = PRESSURE_ARM * _direction(generator)
@@ -237,8 +246,8 @@ def build(section: CraftSection, disturbances: Disturbances, generator: np.rando
     constant, sunlit = _direction(generator), _direction(generator)
     worst = disturbances.residual_dipole
     return TrueCraft(
-        inertia=section.inertia,
-        to_principal=quaternion.from_rotation_vector(turn),
+        inertia=(x, y, z),
+        to_principal=quaternion.multiply(quaternion.from_matrix(axes), quaternion.from_rotation_vector(turn)),
         faces=box(section.size, arm, mirrored),
         # Each column is the tilted axis of a coil times the coil's dipole per ampere.
         coil_dipole=section.dipole_per_ampere * scale * tilt / np.linalg.norm(tilt, axis=0),
@@ -590,9 +599,41 @@ def released(tip_off: TipOff, generator: np.random.Generator) -> tuple[FloatArra
 
 
 def built_craft(section: FreeBodySection, errors: np.random.Generator) -> TrueCraft:
-    """Return the true craft of a configuration, with its errors drawn from `errors`."""
+    """Return the true craft of a configuration, with its errors drawn from `errors`.
+
+    Raises ConfigError for a craft without inertia or dipole.
+    """
     craft = CRAFTS[section.craft] if isinstance(section.craft, str) else section.craft
-    return build(craft, section.disturbances, errors)
+    inertia, dipole = craft.inertia, craft.dipole_per_ampere
+    if inertia is None or dipole is None:
+        raise ConfigError("simulation.free_body.craft", "needs `inertia` and `dipole_per_ampere`")
+    known = CompleteCraft(inertia=inertia, size=craft.size, dipole_per_ampere=dipole)
+    return build(known, section.disturbances, errors)
+
+
+def completed(section: FreeBodySection, config: Config) -> FreeBodySection:
+    """Return the section with the craft's omitted values taken from the flight configuration.
+
+    Raises ConfigError for an inertia tensor that no body has.
+    """
+    craft = section.craft
+    if isinstance(craft, str):
+        return section
+    if craft.inertia is not None:
+        try:
+            problem = inertia_problem(inertia_matrix(craft.inertia))
+        except ValueError:
+            problem = "mixes moments and rows: give three moments, or three rows of three values"
+        if problem:
+            raise ConfigError("simulation.free_body.craft.inertia", problem)
+    if isinstance(config, OrbitConfig):
+        described = config.craft
+        craft = msgspec.structs.replace(
+            craft,
+            inertia=craft.inertia or described.inertia,
+            dipole_per_ampere=craft.dipole_per_ampere or described.dipole_per_ampere,
+        )
+    return msgspec.structs.replace(section, craft=craft)
 
 
 def differing(craft: TrueCraft, errors: DescriptionErrors) -> TrueCraft:
@@ -623,7 +664,7 @@ def make(inputs: WorldInputs) -> FreeBody:
         raise ConfigError("simulation.free_body", "is missing: the world free_body needs it")
     supply = coil_supply(inputs)
     return FreeBody(
-        section.free_body,
+        completed(section.free_body, inputs.config),
         currents,
         supply,
         section.seed,

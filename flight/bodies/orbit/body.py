@@ -296,7 +296,7 @@ def _pauses(config: OrbitConfig) -> WindowSchedule:
 
 def _tracker(config: OrbitConfig, filter_: OrbitFilter, environment: EstimatedEnvironment) -> PointingTracker:
     craft, pauses = config.craft, _pauses(config)
-    inertia = np.array(craft.inertia)
+    inertia = craft.inertia_matrix()
     return PointingTracker(filter_, environment, pauses, _limit(config), craft.dipole_per_ampere, inertia)
 
 
@@ -319,7 +319,7 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
     heat = np.array(config.coils.resistance) / config.craft.dipole_per_ampere**2
     slew = SlewRequest(section.slew, heat, np.zeros(3), np.array(boresight), section.cones.angles())
-    return PlannedCraft(np.diag(config.craft.inertia), axes, weights, limit, slew)
+    return PlannedCraft(config.craft.inertia_matrix(), axes, weights, limit, slew)
 
 
 def _sensor(config: OrbitConfig) -> Sensor | None:
@@ -388,7 +388,7 @@ def _filter(
 ) -> tuple[OrbitFilter, list[str]]:
     """Return the attitude filter, and the reasons why learned states were rejected."""
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
-    inertia, free = np.diag(craft.inertia), filter_settings(config)
+    inertia, free = craft.inertia_matrix(), filter_settings(config)
     slow, problems = start_from(learned, free.error_state(inertia), section.changed, utc)
     settings = OrbitFilterSettings(
         inertia=inertia,
@@ -425,7 +425,7 @@ def _sun_acquisition(config: OrbitConfig, services: Services) -> SunAcquisitionL
     if section is None:
         return None
     axis = np.array(config.pointing.axis)
-    settings = SunAcquisitionSettings(inertia=np.array(craft.inertia), axis=axis, limit=_limit(config))
+    settings = SunAcquisitionSettings(inertia=craft.inertia_matrix(), axis=axis, limit=_limit(config))
     law = SunAcquisition(_pauses(config), settings)
     return SunAcquisitionLaw(law, _strings(section), craft.dipole_per_ampere, services.events)
 
@@ -438,7 +438,7 @@ def _detumbler(
         round(seconds * SECOND_NS) for seconds in (section.settle, section.measure, section.act)
     )
     settings = FieldRateSettings(
-        inertia=np.diag(craft.inertia),
+        inertia=craft.inertia_matrix(),
         field_sigma=section.field_noise,
         torque_walk=section.torque_noise,
         gyro_sigma=config.estimation.bias_start,
@@ -458,7 +458,7 @@ def _detumbler(
 
 def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
     x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
-    inertia, dipole = np.diag(config.craft.inertia), config.craft.dipole_per_ampere
+    inertia, dipole = config.craft.inertia_matrix(), config.craft.dipole_per_ampere
     settle_ns = round(config.detumble.settle * SECOND_NS)
     # The field is 16 times weaker than the testbed's, so a coil's torque takes longer to detect.
     response = ResponseSettings(

@@ -149,8 +149,8 @@ class PointingTracker:
     ) -> None:
         """Create the tracker for coils with the largest dipole `limit` (A m^2).
 
-        `dipole_per_ampere` is the number of turns times the area of each coil (m^2). `inertia` (3,) holds
-        the principal moments of inertia (kg m^2).
+        `dipole_per_ampere` is the number of turns times the area of each coil (m^2). `inertia` (3, 3) is
+        the inertia tensor in body axes (kg m^2).
         """
         self._inertia = inertia
         self._filter, self._environment = filter_, environment

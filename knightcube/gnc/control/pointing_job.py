@@ -359,7 +359,8 @@ def run(job: PointingJob) -> PointingTable:
         law = following(axis, sight.direction, sight.velocity, sight.since, quaternion).attitudes
     field, wanted = ahead.field_at(times), references(law, ahead, times)
     # The initial guess lasts WAY times the time constant that follows from the weights.
-    strength, inertia = float(np.mean(np.linalg.norm(field, axis=1))), float(np.diag(job.inertia).max())
+    strength = float(np.mean(np.linalg.norm(field, axis=1)))
+    inertia = float(np.linalg.eigvalsh(job.inertia).max())
     square = strength * job.weights.dipole / (inertia * job.weights.turn)
     seconds = min(max(WAY / math.sqrt(square), 10.0 * span.step), span.kept)
     way = approach(law, quaternion, job.rate, LEAD, LEAD + seconds)

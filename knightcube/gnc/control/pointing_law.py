@@ -149,6 +149,6 @@ class PathRecovery:
 def damping_dipole(inertia: FloatArray, rate: FloatArray, field: FloatArray) -> FloatArray:
     """Return the dipole (3,) A m^2 that damps a rate (3,) rad/s in a field (3,) T, body axes.
 
-    The moments of inertia about the body axes are `inertia` (3,), kg m^2.
+    The inertia tensor in body axes is `inertia` (3, 3), kg m^2.
     """
-    return np.asarray(cross_product(field, -2.0 * DAMPING * inertia * rate) / float(field @ field))
+    return np.asarray(cross_product(field, (-2.0 * DAMPING * inertia) @ rate) / float(field @ field))

@@ -98,11 +98,12 @@ class ResidualDipole:
     """
 
     def __init__(self, inertia: FloatArray, bound: float) -> None:
-        """Create an observer for moments of inertia (3,) kg m^2.
+        """Create an observer for an inertia tensor (3, 3) kg m^2.
 
         Each component of the estimated dipole moment is limited to +-`bound`, A m^2.
         """
         self._inertia, self._bound = inertia, bound
+        self._inverse: FloatArray = np.asarray(np.linalg.inv(inertia), dtype=float)
         self._rate: FloatArray | None = None
         self.dipole: FloatArray = np.zeros(3)
         """Residual dipole moment (3,) in body axes, A m^2."""
@@ -122,10 +123,11 @@ class ResidualDipole:
             self._rate = rate
             return
         error = rate - self._rate
-        across = cross_product(field, self._inertia * error) / square
+        across = cross_product(field, self._inertia @ error) / square
         self.dipole = np.clip(self.dipole + (DIPOLE_GAIN * seconds) * across, -self._bound, self._bound)
-        torque = cross_product(coils + self.dipole, field) - cross_product(rate, self._inertia * rate)
-        self._rate = self._rate + min(1.0, RATE_GAIN * seconds) * error + seconds * torque / self._inertia
+        torque = cross_product(coils + self.dipole, field) - cross_product(rate, self._inertia @ rate)
+        change = seconds * (self._inverse @ torque)
+        self._rate = self._rate + min(1.0, RATE_GAIN * seconds) * error + change
 
 
 AGREES = 0.2
@@ -152,7 +154,7 @@ class SunAcquisitionSettings:
     """Settings of Sun acquisition.
 
     Attributes:
-        inertia: moments of inertia (3,) about the body axes, kg m^2.
+        inertia: inertia tensor (3, 3) in body axes, kg m^2.
         axis: unit vector (3,) of the body axis to align with the Sun.
         limit: dipole limit of each coil, A m^2.
     """
@@ -164,7 +166,8 @@ class SunAcquisitionSettings:
     @property
     def speed(self) -> float:
         """Bandwidth w of the Sun pointing law for this body, rad/s."""
-        return min(BANDWIDTH, math.sqrt(SHARE * self.limit * _FIELD / float(self.inertia.max())))
+        largest = float(np.linalg.eigvalsh(self.inertia).max())
+        return min(BANDWIDTH, math.sqrt(SHARE * self.limit * _FIELD / largest))
 
 
 class SunAcquisition:
@@ -242,13 +245,13 @@ class SunAcquisition:
         """Return the commanded torque (3,) N m, which is normal to the field while the Sun is tracked."""
         seeking, sun, rate = self._seeking, self._sun.direction, self._rate
         speed = seeking.speed
-        torque: FloatArray = -2.0 * DAMPING * speed * seeking.inertia * rate
+        torque: FloatArray = (-2.0 * DAMPING * speed * seeking.inertia) @ rate
         if sun is None:
             return torque
         square, roll = float(rate @ rate), float(rate @ sun)
         if square > FASTEST**2 or square - roll**2 > FASTEST_ACROSS**2:
             return torque
-        torque = torque + speed**2 * seeking.inertia * _rotation_to_sun(seeking.axis, sun)
+        torque = torque + (speed**2 * seeking.inertia) @ _rotation_to_sun(seeking.axis, sun)
         # A torque about the Sun, which disturbs the pointing least, cancels the torque along the field.
         cheap = 1.0 + (ROLL - 1.0) * math.exp(-((roll / FASTEST_ROLL) ** 2))
         spread = field + (cheap - 1.0) * float(sun @ field) * sun

@@ -27,6 +27,7 @@ from sim_hal.worlds.free_body import (
     CoilSupply,
     built_craft,
     coil_supply,
+    completed,
     generators,
     released,
 )
@@ -217,4 +218,5 @@ def make(inputs: WorldInputs) -> BasiliskWorld:
     if section.free_body is None:
         raise ConfigError("simulation.free_body", "is missing: this world needs it")
     supply = coil_supply(inputs)
-    return BasiliskWorld(section.free_body, currents, supply, section.seed, section.utc, inputs.start_ns)
+    body = completed(section.free_body, inputs.config)
+    return BasiliskWorld(body, currents, supply, section.seed, section.utc, inputs.start_ns)

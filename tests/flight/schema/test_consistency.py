@@ -5,10 +5,12 @@ from __future__ import annotations
 import socket
 from ipaddress import IPv4Network
 
+import numpy as np
 import pytest
 
 from flight.link.commands import CommandPacker, Ping, open_udp
 from flight.schema.document import ConfigError
+from flight.schema.orbit import as_orbit
 from flight.schema.reader import parse, peer_networks
 from tests.support.flights import CONFIG
 
@@ -102,6 +104,26 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
         ),
         ("  star_tracker: {}", "  objects: {}", "`camera.objects` needs `camera.star_tracker`"),
         (
+            "  inertia: [1.10e-3, 1.05e-3, 0.99e-3]",
+            "  inertia: [1.10e-3, 1.05e-3, 2.99e-3]",
+            r"`craft.inertia` has the principal moments 0.00105, 0.0011, 0.00299: the largest",
+        ),
+        (
+            "  inertia: [1.10e-3, 1.05e-3, 0.99e-3]",
+            "  inertia: [1.10e-3, 1.05e-3, -0.99e-3]",
+            "`craft.inertia` has the principal moments .*: all must be positive",
+        ),
+        (
+            "  inertia: [1.10e-3, 1.05e-3, 0.99e-3]",
+            "  inertia: [1.10e-3, 1.05e-3, [0, 0, 0.99e-3]]",
+            "`craft.inertia` mixes moments and rows: give three moments, or three rows",
+        ),
+        (
+            "  inertia: [1.10e-3, 1.05e-3, 0.99e-3]",
+            "  inertia: [[1.10e-3, 1e-5, 0], [-1e-5, 1.05e-3, 0], [0, 0, 0.99e-3]]",
+            "`craft.inertia` is not symmetric: row 1, column 2 is 1e-05, and row 2, column 1 is -1e-05: give",
+        ),
+        (
             "  star_tracker: {}",
             "  star_tracker: {}\n  objects: {needed: 7}",
             "`camera.objects.needed` is 7: must not be above `within`",
@@ -124,6 +146,19 @@ def test_values_that_contradict_each_other_are_refused(right: str, wrong: str, c
     parse(text)
     with pytest.raises(ConfigError, match=complaint):
         parse(text.replace(right, wrong, 1))
+
+
+def test_the_inertia_is_a_tensor_or_its_diagonal() -> None:
+    text = ORBIT.read_text(encoding="utf-8")
+    moments = "[1.10e-3, 1.05e-3, 0.99e-3]"
+    np.testing.assert_array_equal(
+        as_orbit(parse(text)).craft.inertia_matrix(), np.diag([1.10e-3, 1.05e-3, 0.99e-3])
+    )
+    tensor = "[[1.10e-3, 1e-5, 0], [1e-5, 1.05e-3, 0], [0, 0, 0.99e-3]]"
+    np.testing.assert_array_equal(
+        as_orbit(parse(text.replace(moments, tensor))).craft.inertia_matrix(),
+        [[1.10e-3, 1e-5, 0.0], [1e-5, 1.05e-3, 0.0], [0.0, 0.0, 0.99e-3]],
+    )
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flight.schema.values import inertia_matrix
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
@@ -64,7 +65,7 @@ class FreeFlight:
         self.body = FreeBody(section, lambda: self._currents, seed=seed, utc=UTC)
         self.body.release_at(0)
         shape = CRAFTS[craft]
-        self.inertia: FloatArray = np.diag(shape.inertia)
+        self.inertia: FloatArray = inertia_matrix(shape.inertia)
         self.limit = CRAFT[craft]
         self._dipole_per_ampere = shape.dipole_per_ampere
         self.time_ns = 0

@@ -178,7 +178,7 @@ class PointingFlight:
         command = self._law.command(since, found.quaternion, found.rate, field, residual, found.torque_sizes)
         self._turn, dipole = command.rotation, command.dipole
         if self._astray.since is not None:
-            dipole = damping_dipole(np.diag(flight.inertia), found.rate, field) - residual
+            dipole = damping_dipole(flight.inertia, found.rate, field) - residual
         dipole = dipole * CYCLE / (CYCLE - PAUSE)
         dipole = dipole * min(1.0, flight.limit / float(np.abs(dipole).max()))
         if round(time / CYCLE) % 5 == 0:

@@ -67,9 +67,7 @@ class SafeFlight:
         self._strings = SolarStringModel()
         gains = GAIN_ERROR * self._draws.standard_normal(len(self._strings.peaks))
         self._light = SolarCellsModel(self._strings.normals, self._strings.peaks, gains, noise=STRING_NOISE)
-        seeking = SunAcquisitionSettings(
-            inertia=np.diag(self._flight.inertia), axis=AXIS, limit=self._flight.limit
-        )
+        seeking = SunAcquisitionSettings(inertia=self._flight.inertia, axis=AXIS, limit=self._flight.limit)
         self.law = SunAcquisition(SCHEDULE, seeking)
         self.notes: list[tuple[float, float, float, float]] = []
 

@@ -25,7 +25,7 @@ class Seen:
         self.told: list[tuple[str, str]] = []
         law = SunAcquisition(
             WindowSchedule(SECOND_NS // 10, SECOND_NS // 10, 18 * SECOND_NS // 10),
-            SunAcquisitionSettings(inertia=np.full(3, 1e-3), axis=np.array([1.0, 0.0, 0.0]), limit=0.1),
+            SunAcquisitionSettings(inertia=1e-3 * np.eye(3), axis=np.array([1.0, 0.0, 0.0]), limit=0.1),
         )
         self.law = SunAcquisitionLaw(law, SolarStringModel(), 0.648, EventLog(self._tell))
         self.law.begin(0)

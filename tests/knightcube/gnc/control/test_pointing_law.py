@@ -169,8 +169,17 @@ def test_a_path_is_flown_up_to_where_it_turns_too_fast_unless_that_is_soon() -> 
     assert with_spike(5) is None
 
 
+def test_damping_by_a_full_tensor_is_the_same_in_rotated_body_axes() -> None:
+    rng, moments = np.random.default_rng(2), np.diag([1.1e-3, 3.05e-3, 2.2e-3])
+    for _ in range(10):
+        rate, field = 0.02 * rng.standard_normal(3), 4e-5 * rng.standard_normal(3)
+        turn = attitude_matrix(from_rotation_vector(rng.standard_normal(3)))
+        rotated = damping_dipole(turn @ moments @ turn.T, turn @ rate, turn @ field)
+        np.testing.assert_allclose(rotated, turn @ damping_dipole(moments, rate, field), rtol=1e-9)
+
+
 def test_damping_takes_energy_from_any_rate_in_any_field() -> None:
-    rng, inertia = np.random.default_rng(1), np.array([1.1e-3, 1.05e-3, 0.99e-3])
+    rng, inertia = np.random.default_rng(1), np.diag([1.1e-3, 1.05e-3, 0.99e-3])
     for _ in range(50):
         rate, field = 0.02 * rng.standard_normal(3), 4e-5 * rng.standard_normal(3)
         torque = np.cross(damping_dipole(inertia, rate, field), field)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.gnc.control.sun_acquisition import ResidualDipole
 
 INERTIA = np.array([1.10e-3, 1.05e-3, 0.99e-3])
@@ -14,7 +15,7 @@ STEP = 0.1
 
 def learned(coils: FloatArray, dipole: FloatArray, bound: float) -> FloatArray:
     """Return what is learned in 1,500 s of a field that turns as along an orbit's half."""
-    observer, rng = ResidualDipole(INERTIA, bound), np.random.default_rng(5)
+    observer, rng = ResidualDipole(np.diag(INERTIA), bound), np.random.default_rng(5)
     rate = np.array([1e-3, -2e-3, 5e-4])
     for k in range(round(1500.0 / STEP)):
         angle = 4e-3 * k * STEP
@@ -39,8 +40,21 @@ def test_nothing_is_learned_of_a_body_without_one() -> None:
 
 def test_no_dipole_beyond_the_bound_is_believed_and_a_gap_begins_again() -> None:
     assert np.abs(learned(np.zeros(3), 20.0 * DIPOLE, 5e-3)).max() <= 5e-3
-    observer = ResidualDipole(INERTIA, 5e-3)
+    observer = ResidualDipole(np.diag(INERTIA), 5e-3)
     field = np.array([0.0, 0.0, 3e-5])
     for seconds in (0.1, 5.0):
         observer.follow(seconds, np.array([seconds, 0.0, 0.0]), field, np.zeros(3))
     np.testing.assert_array_equal(observer.dipole, np.zeros(3))
+
+
+def test_a_full_tensor_gives_the_same_dipole_in_rotated_body_axes() -> None:
+    rng = np.random.default_rng(3)
+    turn = attitude_matrix(from_rotation_vector(np.array([0.3, -0.5, 0.4])))
+    moments = np.diag([1.1e-3, 3.05e-3, 2.2e-3])
+    plain, rotated = ResidualDipole(moments, 1.0), ResidualDipole(turn @ moments @ turn.T, 1.0)
+    for _ in range(50):
+        rate, field, coils = np.array([[0.01], [3e-5], [1.0]]) * rng.standard_normal((3, 3))
+        plain.follow(0.1, rate, field, coils)
+        rotated.follow(0.1, turn @ rate, turn @ field, turn @ coils)
+    assert np.linalg.norm(plain.dipole) > 1e-4
+    np.testing.assert_allclose(rotated.dipole, turn @ plain.dipole, rtol=1e-9)

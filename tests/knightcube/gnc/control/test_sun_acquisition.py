@@ -23,7 +23,7 @@ STEP_NS = 100_000_000
 
 
 def seeker() -> SunAcquisition:
-    return SunAcquisition(SCHEDULE, SunAcquisitionSettings(inertia=INERTIA, axis=Z, limit=LIMIT))
+    return SunAcquisition(SCHEDULE, SunAcquisitionSettings(inertia=np.diag(INERTIA), axis=Z, limit=LIMIT))
 
 
 def fly(sun: FloatArray | None, rate: FloatArray, seconds: float) -> tuple[FloatArray, FloatArray]:
@@ -105,3 +105,14 @@ def test_the_acquisition_of_the_sun_is_as_recorded() -> None:
     slow = np.radians([0.3, -0.2, 0.4])
     suns = (towards / np.linalg.norm(towards), None)
     check(__file__, "sun", [fly(sun, slow, 41.0) for sun in suns], 1e-4)
+
+
+def test_the_bandwidth_is_that_of_the_largest_principal_moment() -> None:
+    turn = attitude_matrix(from_rotation_vector(np.array([0.3, -0.5, 0.4])))
+    moments = np.diag([1.1e-2, 3.05e-2, 2.2e-2])
+    plain, rotated = (
+        SunAcquisitionSettings(inertia=inertia, axis=Z, limit=1e-3).speed
+        for inertia in (moments, turn @ moments @ turn.T)
+    )
+    assert plain == pytest.approx((0.6 * 1e-3 * 3e-5 / 3.05e-2) ** 0.5)
+    assert rotated == pytest.approx(plain)
