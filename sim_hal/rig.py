@@ -24,6 +24,7 @@ import numpy as np
 from flight.link.telemetry.log import FlightLog
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
+from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import lock_bus
@@ -33,6 +34,7 @@ from hal.interfaces.errors import NotResponding
 from hal.interfaces.guardian import CoilReach
 from hal.interfaces.wires import SECOND_NS, Clock, Rig, Wires
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orbit_knowledge import OrbitError
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import UsageError
 from sim_hal.assembly import (
@@ -55,10 +57,13 @@ from sim_hal.faults.host import corrupted_by, host_faults
 from sim_hal.faults.schedule import check, put, scheduled
 from sim_hal.serving.device_link import DeviceLink, RemoteI2cBus
 from sim_hal.settings import Simulation
+from sim_hal.worlds.orbit import distance_from
 from sim_hal.worlds.world import BodyMotion, TruthRecorder, WorldInputs, make_world
 
 PATIENCE_S = 5.0
 """Time (s) after which the device server ends if the flight process has died."""
+FARTHEST_ELEMENTS = 100e3
+"""Largest accepted distance (m) of the two-line elements from the first revolution of the simulated orbit."""
 _START_S = 20.0
 """Longest time (s) that the server process may take to start."""
 _FACTS = ("serial", "baud_rate", "socket", "camera", "gps", "gps_baud_rate", "wide")
@@ -125,6 +130,25 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
 
     rig = Rig(served.clock, served.wires, release, True, section.seed, reach=reach)
     return with_host_faults(rig, section)
+
+
+def check_elements(request: SimulationRequest, config: Config) -> None:
+    """Raise ConfigError if the two-line elements of a configuration do not fit its simulated orbit."""
+    section = request.section()
+    if section.free_body is None or not isinstance(config, OrbitConfig) or config.elements is None:
+        return
+    cure = "`flight elements --config FILE` makes elements of the simulated orbit"
+    try:
+        distance = distance_from(config.elements, section.free_body.orbit, section.utc)
+    except UsageError as error:
+        raise ConfigError("elements", f"are not valid two-line elements: {error}: {cure}") from error
+    except OrbitError as error:
+        raise ConfigError("elements", f"give no position at `simulation.utc`: {error}: {cure}") from error
+    if distance > FARTHEST_ELEMENTS:
+        orbit = "the first revolution of `simulation.free_body.orbit`"
+        problem = f"are up to {1e-3 * distance:,.0f} km from {orbit}"
+        limit = f"must be within {1e-3 * FARTHEST_ELEMENTS:g} km"
+        raise ConfigError("elements", f"{problem}: {limit}: {cure}")
 
 
 @dataclass(frozen=True, slots=True)

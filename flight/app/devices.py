@@ -77,6 +77,13 @@ def simulated_rig(request: RunRequest, text: str, config: Config, stack: ExitSta
     return rig.open_rig(_simulation_request(request, text), config, stack)
 
 
+def check_simulated_elements(request: RunRequest, text: str, config: Config) -> None:
+    """Raise ConfigError if the two-line elements of a configuration do not fit its simulated orbit."""
+    from sim_hal import rig  # noqa: PLC0415
+
+    rig.check_elements(_simulation_request(request, text), config)
+
+
 def simulated_camera(config_path: Path, text: str, config: Config, rate: FloatArray) -> PosedCamera:
     """Return the emulated camera of a configuration, rotating at `rate` (3,), rad/s, in camera axes."""
     from sim_hal import rig  # noqa: PLC0415

@@ -17,6 +17,7 @@ COMMANDS = {
     "report": ("report the performance of a run", "runs:configure_report"),
     "export": ("write a run's packets as CSV, Parquet or SQLite", "runs:configure_export"),
     "orbit": ("determine first orbits of the objects that a flight tracked", "runs:configure_orbit"),
+    "elements": ("make two-line elements of an orbit, or fit them to positions", "elements:configure"),
     "plan": ("plan a single slew", "plan:configure"),
     "identify": ("identify the body's constants from a short flight", "identify:configure"),
     "rate": ("estimate the body rate from a picture of star streaks", "rate:configure"),

@@ -36,6 +36,7 @@ from scipy.interpolate import CubicSpline
 from hal.interfaces.errors import OutOfRange
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import ROTATION_RATE
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, J2000, UNIX_EPOCH, sunlit_share
 from sim_hal.settings import Disturbances, OrbitSection
@@ -203,6 +204,19 @@ def elements(orbit: OrbitSection, date: float) -> KeplerianElements:
         argument_of_perigee=math.radians(orbit.argument_of_perigee_deg),
         true_anomaly=math.radians(orbit.true_anomaly_deg),
     )
+
+
+def distance_from(lines: tuple[str, str], orbit: OrbitSection, utc: str) -> float:
+    """Return the largest distance (m) of two-line elements from the first revolution of a configured orbit.
+
+    The orbit starts at `utc`. Raises UsageError for invalid elements, and OrbitError if SGP4 cannot propagate
+    them to the first revolution.
+    """
+    date = julian_date(utc)
+    start, known = elements(orbit, date), TwoLineElements(*lines)
+    times = np.linspace(0.0, start.period, 9)
+    found = np.array([known.at(date + time / DAY).position for time in times.tolist()])
+    return float(np.linalg.norm(found - propagate(start, start.period).positions_at(times), axis=1).max())
 
 
 _PROFILE = np.array(

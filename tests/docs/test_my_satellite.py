@@ -6,6 +6,7 @@ from pathlib import Path
 
 from flight.schema.orbit import as_orbit
 from flight.schema.reader import load, parse
+from tests.ground.commands.in_process import command
 from tests.support.places import ROOT
 
 PAGE = ROOT / "docs" / "fly" / "my-satellite.md"
@@ -27,3 +28,12 @@ def test_the_extended_configuration_has_the_described_values(tmp_path: Path) -> 
     )
     assert [step.point for step in own.targets] == ["sun"]
     assert own.wide_cameras == base.wide_cameras
+
+
+def test_the_commands_of_two_line_elements_print_the_same_section() -> None:
+    lines = block("python -m flight elements").splitlines()
+    assert len(lines) == 2
+    first, second = (command(*line.split()[3:]) for line in lines)
+    assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr
+    assert first.stdout == second.stdout
+    assert first.stdout.startswith("elements: ")

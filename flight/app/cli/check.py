@@ -25,7 +25,8 @@ from flight.app.devices import linux_camera, unit_settings
 from flight.app.run import RunRequest, RunResult
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera
-from flight.schema.document import config_path, merged_text, names, read_document
+from flight.schema.document import ConfigError, config_path, merged_text, names, read_document
+from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus, device_file
@@ -173,7 +174,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def check(options: argparse.Namespace) -> int:
     """Check a configuration, print the result, and return 1 if it is not ready to fly."""
     from flight.app.cli.check import probe  # noqa: PLC0415
-    from flight.app.devices import check_settings  # noqa: PLC0415
+    from flight.app.devices import check_settings, check_simulated_elements  # noqa: PLC0415
     from flight.app.flight import body_kind, placing  # noqa: PLC0415
     from flight.app.service import accepted_config  # noqa: PLC0415
 
@@ -187,13 +188,26 @@ def check(options: argparse.Namespace) -> int:
     with placing(chosen.text, str(path)):
         body_kind(config)
         check_settings(config)
+        _check_position(config)
         if config.simulation is None:
             verdict.devices = probe(config)
             verdict.problems += [f"{item.name}: missing" for item in verdict.devices if not item.found]
         else:
+            check_simulated_elements(RunRequest(path, Path()), chosen.text, config)
             _fly(verdict)
     sys.stdout.write(json.dumps(_facts(verdict)) + "\n" if options.json else _text(verdict))
     return 1 if verdict.problems else 0
+
+
+def _check_position(config: Config) -> None:
+    """Raise ConfigError for targets of a satellite whose position is never known.
+
+    Every target needs the position, because plans predict the magnetic field along the orbit.
+    """
+    if isinstance(config, OrbitConfig) and config.gps is None and config.elements is None:
+        target = config.targets[0].point
+        cure = "add `gps`, or `elements`, which `flight elements` makes"
+        raise ConfigError("targets[0].point", f"is {target}: pointing needs the position: {cure}")
 
 
 def _write(path: Path, text: str) -> None:

@@ -1,0 +1,123 @@
+"""`flight elements` makes elements that `flight check` accepts, and fits them to fixes."""
+
+from __future__ import annotations
+
+import csv
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
+from knightcube.astro.earth.orientation import celestial_to_terrestrial
+from sim_hal.worlds.orbit import julian_date
+from tests.ground.commands.in_process import command
+
+ORBIT = tuple(
+    ["--altitude", "500", "--inclination", "97.4", "--epoch", "2026-03-20T12:00:00", "--local-time", "10.5"]
+)
+
+
+def test_the_elements_of_an_orbit_are_those_of_the_shipped_configuration() -> None:
+    given, configured = command("elements", *ORBIT), command("elements", "--config", "orbit_3u")
+    assert (given.returncode, given.stderr) == (0, "")
+    assert given.stdout == configured.stdout
+    assert given.stdout.startswith("elements: ")
+    facts = json.loads(command("elements", *ORBIT, "--json").stdout)
+    assert all(f"  - '{line}'\n" in given.stdout for line in facts["elements"])
+    assert facts["rms_m"] < 500.0
+    assert facts["largest_m"] == max(facts["residuals_m"]) < 1e3
+    assert (facts["positions"], facts["span_s"]) == (145, pytest.approx(86_400.0))
+
+
+def test_elements_are_fitted_to_noisy_fixes(tmp_path: Path) -> None:
+    lines = json.loads(command("elements", *ORBIT, "--json").stdout)["elements"]
+    known, rng, start = (
+        TwoLineElements(*lines),
+        np.random.default_rng(1),
+        datetime(2026, 3, 20, 12, tzinfo=UTC),
+    )
+    path = tmp_path / "fixes.csv"
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["utc", "x", "y", "z", "satellites"])
+        for minute in range(0, 720, 5):
+            utc = (start + timedelta(minutes=minute)).replace(tzinfo=None).isoformat()
+            date = julian_date(f"{utc}Z")
+            ground = celestial_to_terrestrial(date) @ known.at(date).position
+            writer.writerow([utc, *(ground + 10.0 * rng.standard_normal(3)), 9])
+    facts = json.loads(command("elements", "--fixes", path, "--json").stdout)
+    assert facts["rms_m"] == pytest.approx(10.0 * 3**0.5, rel=0.3)
+    found = TwoLineElements(*facts["elements"])
+    for hours in (0.0, 12.0, 24.0):
+        date = julian_date("2026-03-20T12:00:00Z") + hours / 24.0
+        assert np.linalg.norm(found.at(date).position - known.at(date).position) < 200.0
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--altitude", "500", "--inclination", "97.4"), "--altitude needs --epoch"),
+        (("--altitude", "50", *ORBIT[2:]), "this orbit is not supported: Expected `float` >= 200000.0"),
+        ((*ORBIT[:5], "noon"), "--epoch: 'noon': give a time such as"),
+        (("--config", "step_demo"), "this needs the configuration of a satellite in orbit"),
+        (("--config", "orbit", "--anomaly", "3"), "--anomaly: goes with --altitude"),
+        (("--fixes", "absent.csv"), "absent.csv: cannot be read"),
+    ],
+)
+def test_wrong_use_is_reported_in_one_line(words: tuple[str, ...], complaint: str) -> None:
+    done = command("elements", *words)
+    assert done.returncode == 2
+    assert complaint in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("utc,x,y\n", "the column z is missing: give utc, x, y, z"),
+        ("utc,x,y,z\n2026-03-20T12:00:00,1,2,far\n", "fixes.csv:2: 'far' is not a number"),
+        ("utc,x,y,z\nnoon,1,2,3\n", "fixes.csv:2: 'noon': give a time"),
+        ("utc,x,y,z\n", "0 positions: elements need at least four"),
+    ],
+)
+def test_a_wrong_file_is_reported_with_its_line(tmp_path: Path, text: str, complaint: str) -> None:
+    path = tmp_path / "fixes.csv"
+    path.write_text(text, encoding="utf-8")
+    done = command("elements", "--fixes", path)
+    assert (done.returncode, complaint in done.stderr) == (2, True), done.stderr
+
+
+def test_check_refuses_elements_that_do_not_fit_and_accepts_those_that_are_made(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    orbit = "simulation: {free_body: {orbit: {altitude: 420.0e3, inclination_deg: 51.6}}}\n"
+    path.write_text(f"extends: orbit_3u\nduration: 1.0\n{orbit}", encoding="utf-8")
+    done = command("check", path)
+    assert done.returncode == 2
+    assert "orbit_3u.yaml:" in done.stderr
+    assert "`elements` are up to " in done.stderr
+    assert "km from the first revolution of `simulation.free_body.orbit`" in done.stderr
+    assert "must be within 100 km: `flight elements --config FILE` makes" in done.stderr
+    made = command("elements", "--config", path)
+    assert made.returncode == 0, made.stderr
+    path.write_text(f"{path.read_text(encoding='utf-8')}{made.stdout}", encoding="utf-8")
+    done = command("check", path)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_check_refuses_damaged_elements_with_their_place(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: orbit_3u\nelements: ['1 99999U', '2 99999']\n", encoding="utf-8")
+    done = command("check", path)
+    assert done.returncode == 2
+    assert f"{path}:2: `elements` are not valid two-line elements: '1 99999U': line 1" in done.stderr
+
+
+def test_check_refuses_a_target_if_the_position_is_never_known(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: orbit_3u\ngps: none\nelements: null\n", encoding="utf-8")
+    done = command("check", path)
+    assert done.returncode == 2
+    assert "`targets[0].point` is nadir: pointing needs the position: add `gps`, or `elements`" in done.stderr
