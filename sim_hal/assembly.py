@@ -135,7 +135,7 @@ def assemble(
         if isinstance(world, OrbitingWorld):
             from sim_hal.star_camera.objects import from_orbit  # noqa: PLC0415 - see above
 
-            make = from_orbit(make, world, config.camera)
+            make = from_orbit(make, world, config.camera, section.sky)
         misaligned = from_rotation_vector(description_errors(config, section).camera)
         mounting = multiply(np.array(config.camera.mounting), misaligned)
         camera = emulated_camera(

@@ -17,6 +17,7 @@ from flight.schema.values import Inertia, NotNegative, Positive, Quaternion, Sec
 
 Vector = tuple[float, float, float]
 Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
+ExclusionAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 
 
 class OrbitSection(Section, frozen=True, kw_only=True):
@@ -168,7 +169,10 @@ class CageTruth(Section, frozen=True, kw_only=True):
 class SkySection(Section, frozen=True, kw_only=True):
     """Sky and optics of the emulated star camera.
 
-    The thesis (Sease, chapter 2) uses `psf: bilinear` and `noise: uniform`.
+    The thesis (Sease, chapter 2) uses `psf: bilinear` and `noise: uniform`. In orbit, stray light saturates a
+    frame if the boresight is within `sun_exclusion_deg` of the Sun or within `earth_exclusion_deg` of sunlit
+    ground, and whenever one of them is in the field of view. The default angles are those of a star tracker
+    with a baffle that fits into a CubeSat.
     """
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5
@@ -181,6 +185,8 @@ class SkySection(Section, frozen=True, kw_only=True):
     line_time: NotNegative = 0.0
     psf: Literal["integrated", "bilinear"] = "integrated"
     noise: Literal["poisson", "uniform"] = "poisson"
+    sun_exclusion_deg: ExclusionAngle = 40.0
+    earth_exclusion_deg: ExclusionAngle = 18.0
 
 
 class Tumble(Section, frozen=True, kw_only=True):

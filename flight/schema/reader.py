@@ -16,7 +16,7 @@ import msgspec
 
 from flight.schema.devices import Camera, SolarStringsSection
 from flight.schema.document import ConfigError, Document, convert, read_document, read_text
-from flight.schema.orbit import OrbitConfig
+from flight.schema.orbit import ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
 from flight.schema.values import Quaternion, check_aim
@@ -115,6 +115,18 @@ def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
     if abs(cosine) > 1e-6:
         degrees = math.degrees(math.acos(cosine))
         refuse("pointing.across", f"is {degrees:.1f} deg from `pointing.axis`: must be 90 deg from it")
+    if config.camera is not None:
+        _check_cones(config.camera, config.pointing.cones, refuse)
+
+
+def _check_cones(camera: Camera, cones: ExclusionCones, refuse: Refuse) -> None:
+    """Refuse an exclusion cone that lets its body into the star camera's field of view."""
+    half_width = math.tan(math.radians(0.5 * camera.field_of_view_deg))
+    corner = math.degrees(math.atan(half_width * math.hypot(1.0, camera.rows / camera.columns)))
+    for name, angle in cones.angles().items():
+        if math.degrees(angle) < corner:
+            problem = f"is {math.degrees(angle):g}: the corner of the star camera's field of view is"
+            refuse(f"pointing.cones.{name}_deg", f"{problem} {corner:.1f} deg from its boresight")
 
 
 def _check_order(section: str, times: list[float], refuse: Refuse) -> None:

@@ -32,6 +32,7 @@ from ground.report.signals import (
     streaks,
     true_attitude,
 )
+from ground.report.star_camera import star_camera
 from ground.report.steps import against_thesis, judged_steps, step_row
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
@@ -69,6 +70,7 @@ def summarise(run: Run) -> Object:
         "estimate": estimate_errors(run),
         "streaks": streaks(run),
         "stars": star_attitudes(run),
+        "star_camera": None if config is None else star_camera(run, config),
         "failed_frames": failed_frames(run),
         "objects": objects(run),
         "modes": _modes(run["mode"]),

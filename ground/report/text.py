@@ -336,6 +336,7 @@ def _sensing(summary: Object) -> list[str]:
             f"median of {number(stars['matched'], 0)} matches, {stars['accepted']} used by the estimator"
         )
         lines += _errors(stars, "about x, y, z", "arcsec", 2, ARCSECONDS, "attitudes")
+    lines += _star_camera(summary["star_camera"])
     frames = summary["failed_frames"]
     if not frames:
         return lines
@@ -347,6 +348,19 @@ def _sensing(summary: Object) -> list[str]:
     head = ["frame", "exposed at s", "streaks", "stars"]
     lines += [f"Frames without rate or attitude: {len(frames)}", *table(head, rows)]
     return lines + ([f"  and {more} more; --json lists all"] if more > 0 else [])
+
+
+def _star_camera(found: Object | None) -> list[str]:
+    """Return the lines of the star camera's availability, or nothing without a star camera or a truth log."""
+    if found is None:
+        return []
+    share = f" ({number(found['share'], 1, 100.0)} %)" if found["share"] is not None else ""
+    return [
+        f"Star camera: attitude or rate at {found['measured']} of {found['unobstructed']} unobstructed instants"
+        f"{share}; longest gap {number(found['longest_gap_s'], 0)} s",
+        f"  {found['instants']} scheduled instants, {found['slow']} below camera.max_rate; unobstructed means "
+        "also outside pointing.cones of Sun and Earth",
+    ]
 
 
 def _errors(found: Object, axes: str, unit: str, digits: int, scale: float, what: str) -> list[str]:

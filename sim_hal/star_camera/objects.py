@@ -13,8 +13,8 @@ Sun for that object.
 Stellar aberration by the camera's motion is modelled as a rotation of the whole frame by the aberration at
 the boresight (26" at most). The variation of the aberration across 20 deg, 4", is not modelled. An object in
 orbit shares the Earth's motion, so its track is shifted back by the aberration that the Earth's motion
-causes. The frame saturates if the Sun is near the field of view or if sunlit ground is in the field. The dark
-Earth hides the stars behind it.
+causes. The frame saturates if the Sun or sunlit ground is closer to the boresight than the exclusion angles
+of the camera's baffle (`SkySection`) or in the field of view. The dark Earth hides the stars behind it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.sun import DAY, SPEED_OF_LIGHT, UNIX_EPOCH, Shadow, earth_velocity, sunlit_share
 from knightcube.vision.camera.lens import Pinhole
-from sim_hal.settings import LineOfSight, ObjectState, SkyObject, Tumble
+from sim_hal.settings import LineOfSight, ObjectState, SkyObject, SkySection, Tumble
 from sim_hal.star_camera.image import SourceTrack
 from sim_hal.worlds.orbit import Orbit, propagate, sun_position
 from sim_hal.worlds.world import OrbitEnvironment, OrbitingWorld, World, orbiting, utc_date
@@ -53,8 +53,10 @@ _FIRST_DURATION = 1000.0
 """Shortest time (s) over which an object's orbit is integrated."""
 _SAMPLES = 17
 """Number of samples of a great-circle track, whose chords err by 6e-5 rad at 20 deg/s over 1 s."""
-BAFFLE = np.radians(25.0)
-"""Angle (rad) beyond the corner of the field within which the Sun blinds the camera."""
+_LIT_AIR = -0.1
+"""Sine of the Sun's elevation above which the air over the ground is lit, 6 deg beyond the terminator."""
+_RINGS, _SPOKES = 46, 120
+"""Numbers of nadir angles and azimuths at which the ground is sampled, 1.5 deg and 3 deg apart."""
 
 
 def hidden_by_earth(position: FloatArray, target: FloatArray) -> BoolArray:
@@ -260,10 +262,11 @@ def _dimming(tumble: Tumble, start: float, end: float) -> float:
     return float(-2.5 * math.log10(np.mean(10.0 ** (-0.4 * tumble.amplitude * np.sin(phase)))))
 
 
-def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera) -> Expose:
+def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera, sky: SkySection) -> Expose:
     """Return the exposure function of a camera in orbit.
 
-    The function `expose` renders the stars without Earth and Sun.
+    The function `expose` renders the stars without Earth and Sun. `sky` holds the exclusion angles of the
+    baffle.
     """
     pinhole = Pinhole.from_field_of_view(camera.columns, camera.rows, np.radians(camera.field_of_view_deg))
     top = (1 << camera.bits) - 1
@@ -275,7 +278,7 @@ def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera) -> Expose:
         turned = aberrated(attitudes, earth_velocity(utc_date(world)) + around.velocity)
         rendered = expose(sequence, times, turned, tracks)
         to_camera = quaternion.attitude_matrix(attitudes[len(attitudes) // 2])
-        blinded, hidden = view(pinhole, to_camera, around)
+        blinded, hidden = view(pinhole, to_camera, around, sky)
         if not blinded and hidden is None:
             return rendered
         seen: Future[Image] = Future()
@@ -308,27 +311,55 @@ def aberrated(attitudes: FloatArray, velocity: FloatArray) -> FloatArray:
     return quaternion.multiply(quaternion.from_rotation_vector(-in_camera), attitudes)
 
 
-def view(pinhole: Pinhole, to_camera: FloatArray, around: OrbitEnvironment) -> tuple[bool, BoolArray | None]:
-    """Return whether sunlight blinds the camera, and the pixels (rows, columns) behind the dark Earth."""
+def view(
+    pinhole: Pinhole, to_camera: FloatArray, around: OrbitEnvironment, sky: SkySection
+) -> tuple[bool, BoolArray | None]:
+    """Return whether stray light blinds the camera, and the pixels (rows, columns) behind the dark Earth.
+
+    `sky` holds the exclusion angles of the baffle. Sun and sunlit ground in the field always blind.
+    """
     corner = float(np.arccos(pinhole.unit_vectors(np.zeros((1, 2)))[0, 2]))
-    sun = to_camera @ around.sun
-    if around.sunlit > 0.0 and np.arccos(np.clip(sun[2], -1.0, 1.0)) < corner + BAFFLE:
+    sun_excluded = max(corner, math.radians(sky.sun_exclusion_deg))
+    earth_excluded = max(corner, math.radians(sky.earth_exclusion_deg))
+    boresight = to_camera[2]
+    if around.sunlit > 0.0 and math.acos(np.clip(boresight @ around.sun, -1.0, 1.0)) < sun_excluded:
         return True, None
-    distance = float(np.linalg.norm(around.position))
-    down = to_camera @ around.position / -distance
-    disc = float(np.arcsin(EARTH_RADIUS / distance))
-    if np.arccos(np.clip(down[2], -1.0, 1.0)) > corner + disc:
+    position = np.array(around.position)
+    down = -position / np.linalg.norm(position)
+    disc = math.asin(EARTH_RADIUS / float(np.linalg.norm(position)))
+    away = math.acos(np.clip(boresight @ down, -1.0, 1.0)) - disc
+    if (
+        away < earth_excluded
+        and sunlit_ground_angle(position, np.array(around.sun), boresight) < earth_excluded
+    ):
+        return True, None
+    if away > corner:
         return False, None
     rows, columns = np.mgrid[0 : pinhole.rows, 0 : pinhole.columns]
     rays = pinhole.unit_vectors(np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float))
-    hidden = rays @ down > np.cos(disc)
-    if not hidden.any():
-        return False, None
-    # About 1,000 points of the visible ground are sampled; air is lit up to 6 deg beyond the terminator.
-    sample = rays[hidden]
-    sample = sample[:: max(1, len(sample) // 1000)]
-    along = distance * (sample @ down)
+    hidden = rays @ (to_camera @ down) > math.cos(disc)
+    return False, hidden.reshape(pinhole.rows, pinhole.columns) if hidden.any() else None
+
+
+def sunlit_ground_angle(position: FloatArray, sun: FloatArray, boresight: FloatArray) -> float:
+    """Return the smallest angle (rad) between `boresight` (3,) and visible ground under lit air.
+
+    `position` (3,) is geocentric, m, and `sun` (3,) is the direction to the Sun; all vectors have the same
+    axes. The angle is found to about 1.5 deg, and exactly if the nearest point of the limb is lit. Returns pi
+    if all visible ground is dark.
+    """
+    distance = float(np.linalg.norm(position))
+    down = -position / distance
+    # The azimuths start at the boresight's own, so that the nearest point of the limb is among the samples.
+    across = boresight - (boresight @ down) * down
+    if float(np.linalg.norm(across)) < 1e-9:
+        across = np.cross(down, np.eye(3)[int(np.argmin(np.abs(down)))])
+    ahead = across / np.linalg.norm(across)
+    off = np.linspace(0.0, math.asin(EARTH_RADIUS / distance), _RINGS)[:, None, None]
+    azimuth = np.linspace(0.0, 2.0 * np.pi, _SPOKES, endpoint=False)[None, :, None]
+    around = np.cos(azimuth) * ahead + np.sin(azimuth) * np.cross(down, ahead)
+    rays = np.cos(off) * down + np.sin(off) * around
+    along = distance * np.cos(off)
     reach = along - np.sqrt(np.maximum(0.0, along**2 - distance**2 + EARTH_RADIUS**2))
-    ground = reach[:, None] * sample - distance * down
-    lit = bool(np.any(ground @ sun / EARTH_RADIUS > -0.1))
-    return lit, hidden.reshape(pinhole.rows, pinhole.columns)
+    lit = (reach * rays + position) @ sun / EARTH_RADIUS > _LIT_AIR
+    return math.acos(np.clip(np.max(rays[lit] @ boresight), -1.0, 1.0)) if lit.any() else math.pi

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -24,8 +25,10 @@ from sim_hal.assembly import wide_model
 from sim_hal.clock import SimClock
 from sim_hal.faults.schedule import parse, put
 from sim_hal.rig import LockStep, build_lockstep, opened_lockstep, utc_ns
-from sim_hal.star_camera.objects import aberrated, view
+from sim_hal.settings import SkySection
+from sim_hal.star_camera.objects import aberrated, sunlit_ground_angle, view
 from sim_hal.worlds.free_body import FreeBody
+from sim_hal.worlds.world import OrbitEnvironment
 from tests.sim_hal.faults.benches import bench_of
 from tests.support.flights import TEXT, demo_world
 from tests.support.orbit_devices import UTC, at_first, orbit_config, orbit_world
@@ -213,12 +216,64 @@ def test_the_dark_earth_hides_the_stars_behind_it() -> None:
     disc = np.arcsin(EARTH_RADIUS / 7e6)
     limb = np.array([np.cos(disc), np.sin(disc), 0.0])
     to_camera = np.stack([np.array([-limb[1], limb[0], 0.0]), [0.0, 0.0, -1.0], limb])
-    blinded, hidden = view(pinhole, to_camera, around)
+    blinded, hidden = view(pinhole, to_camera, around, SkySection())
     assert not blinded
     assert hidden is not None
     assert np.mean(hidden) == pytest.approx(0.5, abs=0.05)
     assert hidden[100, 0]
     assert not hidden[100, 199]
+
+
+def edge_on(limb_deg: float, sun: FloatArray) -> tuple[FloatArray, OrbitEnvironment]:
+    """Return a camera on +x, `limb_deg` outside the limb, as rotation from ICRS, and its environment."""
+    around = at_first()._replace(position=(7e6, 0.0, 0.0), sun=tuple(sun.tolist()), sunlit=1.0)
+    angle = math.pi - math.asin(EARTH_RADIUS / 7e6) - math.radians(limb_deg)
+    boresight = np.array([math.cos(angle), math.sin(angle), 0.0])
+    return np.stack([[-boresight[1], boresight[0], 0.0], [0.0, 0.0, -1.0], boresight]), around
+
+
+PINHOLE = Pinhole.from_field_of_view(200, 200, math.radians(20.0))
+ABOVE = np.array([1.0, 0.0, 0.0])
+SIDES = np.array([0.0, -1.0, 0.0])
+"""The Sun over the side of the Earth that the camera does not face."""
+
+
+@pytest.mark.parametrize(
+    ("limb_deg", "excluded_deg", "blinded"), [(19, 20, True), (21, 20, False), (13, 5, True)]
+)
+def test_the_baffle_and_the_field_exclude_the_limb_of_the_sunlit_earth(
+    limb_deg: float, excluded_deg: float, blinded: bool
+) -> None:
+    """The corner of the field is 14 deg from the boresight."""
+    sky = SkySection(sun_exclusion_deg=30.0, earth_exclusion_deg=excluded_deg)
+    assert view(PINHOLE, *edge_on(limb_deg, ABOVE), sky)[0] == blinded
+    assert not view(PINHOLE, *edge_on(limb_deg, SIDES), sky)[0], "the near side of the Earth is dark"
+
+
+@pytest.mark.parametrize(
+    ("sun_deg", "excluded_deg", "blinded"), [(29, 30, True), (31, 30, False), (13, 5, True)]
+)
+def test_the_baffle_and_the_field_exclude_the_sun(sun_deg: float, excluded_deg: float, blinded: bool) -> None:
+    to_camera, around = edge_on(90.0, ABOVE)
+    sun = math.cos(math.radians(sun_deg)) * to_camera[2] + math.sin(math.radians(sun_deg)) * to_camera[1]
+    sky = SkySection(sun_exclusion_deg=excluded_deg, earth_exclusion_deg=0.0)
+    assert view(PINHOLE, to_camera, around._replace(sun=tuple(sun.tolist())), sky)[0] == blinded
+    shaded = around._replace(sun=tuple(sun.tolist()), sunlit=0.0)
+    assert not view(PINHOLE, to_camera, shaded, sky)[0], "the Sun is behind the Earth"
+
+
+def test_the_sunlit_ground_is_found_at_the_limb_and_at_the_terminator() -> None:
+    to_camera, around = edge_on(25.0, ABOVE)
+    position = np.array(around.position)
+    assert sunlit_ground_angle(position, ABOVE, to_camera[2]) == pytest.approx(math.radians(25.0), abs=1e-9)
+    assert sunlit_ground_angle(position, -ABOVE, to_camera[2]) == math.pi
+    # With the Sun to the side, the ground is lit from 6 deg (0.1 rad) beyond the subsatellite point on.
+    ground = EARTH_RADIUS * np.array([math.cos(0.1), math.sin(0.1), 0.0])
+    away = ground - position
+    expected = math.acos(away @ to_camera[2] / float(np.linalg.norm(away)))
+    found = sunlit_ground_angle(position, SIDES, to_camera[2])
+    assert found == pytest.approx(expected, abs=math.radians(3.0))
+    assert sunlit_ground_angle(position, ABOVE, -ABOVE) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_aberration_moves_the_stars_towards_the_velocity() -> None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import socket
 from ipaddress import IPv4Network
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from flight.link.commands import CommandPacker, Ping, open_udp
 from flight.schema.document import ConfigError
-from flight.schema.orbit import as_orbit
-from flight.schema.reader import parse, peer_networks
+from flight.schema.orbit import OrbitConfig, as_orbit
+from flight.schema.reader import load, parse, peer_networks, simulation_section
+from sim_hal.settings import Simulation
 from tests.support.flights import CONFIG
 
 ORBIT = CONFIG.parent / "orbit.yaml"
@@ -171,3 +173,29 @@ def test_the_inertia_is_a_tensor_or_its_diagonal() -> None:
 )
 def test_values_at_a_limit_are_accepted(right: str) -> None:
     parse(ORBIT.read_text(encoding="utf-8").replace("duration:", f"{right}\nduration:", 1))
+
+
+@pytest.mark.parametrize("name", ["sun", "earth", "moon"])
+def test_a_cone_that_reaches_into_the_field_of_view_is_refused(name: str) -> None:
+    """The corner of a square field of 20 deg is atan(sqrt(2) tan(10 deg)) = 14.0 deg from the boresight."""
+    text = ORBIT.read_text(encoding="utf-8")
+    start = text.index("  cones: {")
+    line = text[start : text.index("\n", start)]
+    parse(text.replace(line, f"  cones: {{{name}_deg: 14.1}}"))
+    with pytest.raises(
+        ConfigError, match=rf"`pointing\.cones\.{name}_deg` is 13\.9: the corner .* 14\.0 deg"
+    ):
+        parse(text.replace(line, f"  cones: {{{name}_deg: 13.9}}"))
+
+
+@pytest.mark.parametrize("path", sorted(CONFIG.parent.glob("orbit*.yaml")), ids=lambda path: path.stem)
+def test_the_cones_of_the_shipped_satellites_are_wider_than_the_baffle_of_the_simulated_camera(
+    path: Path,
+) -> None:
+    flown = load(path)
+    assert isinstance(flown, OrbitConfig)
+    section = simulation_section(path.read_text(encoding="utf-8"), str(path), Simulation)
+    assert section is not None
+    sky, cones = section.sky, flown.pointing.cones
+    assert cones.sun_deg is None or cones.sun_deg > sky.sun_exclusion_deg
+    assert cones.earth_deg is None or cones.earth_deg > sky.earth_exclusion_deg

@@ -1,0 +1,114 @@
+"""Availability of the star camera in orbit: the share of its unobstructed instants that gave a measurement."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from flight.link.telemetry.packets import PacketArray, to_text
+from flight.schema.orbit import OrbitConfig
+from ground.report.signals import seconds
+from ground.telemetry import Run
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.vision.streaks.streak_result import StreakStatus
+
+Object = dict[str, Any]
+FINE = 2
+"""Level of attitude knowledge in the navigation packet from which frames are taken every `fine_period`."""
+
+
+def star_camera(run: Run, config: OrbitConfig) -> Object | None:
+    """Return how often the unobstructed star camera gave an attitude or a rate.
+
+    The instants are those of the camera's schedule: every `camera.period` s, and every `camera.fine_period` s
+    while the attitude is fine. An instant is unobstructed if the true body rate is below `camera.max_rate` and
+    the true boresight is outside `pointing.cones` of Sun and Earth. It gave a measurement if the frame exposed
+    before the next instant contains an attitude or a rate. Returns None without a star camera or a truth log.
+    """
+    camera = config.camera
+    if camera is None or not len(run["truth"]) or not len(run["orbit_truth"]):
+        return None
+    instants, ends = _schedule(run, camera.period, camera.fine_period)
+    slow = _rates(run["truth"], instants) < (math.inf if camera.max_rate is None else camera.max_rate)
+    boresight = attitude_matrix(np.array(camera.mounting))[2]
+    clear = _outside_cones(run, instants, boresight, config.pointing.cones.angles())
+    measured = _measured_at(run)
+    first = np.searchsorted(measured, instants)
+    gave = np.searchsorted(measured, ends) > first
+    free = slow & clear
+    return {
+        "instants": len(instants),
+        "slow": int(slow.sum()),
+        "unobstructed": int(free.sum()),
+        "measured": int((free & gave).sum()),
+        "share": float(np.mean(gave[free])) if free.any() else math.nan,
+        "longest_gap_s": _longest_gap(instants, ends, free, gave),
+    }
+
+
+def _schedule(run: Run, period: float, fine_period: float | None) -> tuple[FloatArray, FloatArray]:
+    """Return the scheduled times (n,) of exposures and the times (n,) of the next ones, s."""
+    packets = run["navigation"]
+    times, fine = seconds(packets), packets["knowledge"] == FINE
+    begin = float(seconds(run["truth"])[0])
+    end = min(float(seconds(run[name])[-1]) for name in ("truth", "orbit_truth"))
+    instants = []
+    at = max(0.0, begin)
+    while at <= end:
+        instants.append(at)
+        row = int(np.searchsorted(times, at, side="right")) - 1
+        at += fine_period if fine_period is not None and row >= 0 and fine[row] else period
+    return np.array(instants), np.array([*instants[1:], at])
+
+
+def _rates(truth: PacketArray, instants: FloatArray) -> FloatArray:
+    """Return the true body rates (n,), rad/s."""
+    return np.asarray(np.linalg.norm(truth["rate"][_rows(truth, instants)].astype(float), axis=1))
+
+
+def _outside_cones(
+    run: Run, instants: FloatArray, boresight: FloatArray, cones: dict[str, float]
+) -> BoolArray:
+    """Return whether (n,) the boresight (3,), body axes, is outside the cones of Sun and Earth."""
+    body, around = run["truth"], run["orbit_truth"]
+    to_body = attitude_matrix(body["quaternion"][_rows(body, instants)].astype(float))
+    shown = np.einsum("nij,i->nj", to_body, boresight)
+    around = around[_rows(around, instants)]
+    position = around["position"].astype(float)
+    distance = np.linalg.norm(position, axis=1)
+    from_sun = _angles(shown, around["sun"].astype(float))
+    from_limb = _angles(shown, -position / distance[:, None]) - np.arcsin(EARTH_RADIUS / distance)
+    return np.asarray((from_sun >= cones.get("sun", 0.0)) & (from_limb >= cones.get("earth", 0.0)))
+
+
+def _angles(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the angles (n,), rad, between unit vectors (n, 3)."""
+    return np.asarray(np.arccos(np.clip(np.sum(first * second, axis=1), -1.0, 1.0)))
+
+
+def _rows(packets: PacketArray, instants: FloatArray) -> FloatArray:
+    """Return the indices (n,) of the packets nearest before the instants."""
+    return np.maximum(np.searchsorted(seconds(packets), instants, side="right") - 1, 0)
+
+
+def _measured_at(run: Run) -> FloatArray:
+    """Return the sorted times (m,), s, of the exposures that gave an attitude or a rate."""
+    streaks, stars = run["streak"], run["stars"]
+    rates = np.array([to_text(status) == StreakStatus.RATE.value for status in streaks["status"]], dtype=bool)
+    starts = streaks["exposure_start_ns"] * 1e-9
+    fixed = set(stars["sequence"][np.isfinite(stars["quaternion"][:, 0])].tolist())
+    attitudes = np.array([sequence in fixed for sequence in streaks["sequence"].tolist()], dtype=bool)
+    return np.sort(starts[rates | attitudes])
+
+
+def _longest_gap(instants: FloatArray, ends: FloatArray, free: BoolArray, gave: BoolArray) -> float:
+    """Return the longest time, s, of consecutive unobstructed instants without a measurement."""
+    longest = gap = 0.0
+    for at, end, wanted in zip(instants, ends, free & ~gave, strict=True):
+        gap = gap + float(end - at) if wanted else 0.0
+        longest = max(longest, gap)
+    return longest

@@ -1,0 +1,114 @@
+"""The share of the star camera's unobstructed instants that gave an attitude or a rate."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from flight.link.telemetry import definitions as table
+from flight.link.telemetry.packets import Layout, Packet, PacketArray
+from flight.schema import reader
+from flight.schema.orbit import OrbitConfig, as_orbit
+from ground.report.star_camera import star_camera
+from ground.telemetry import Run
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.quaternion import from_rotation_vector
+from tests.support.flights import CONFIG
+
+END = 200
+"""s, duration of the flight."""
+PERIOD, FINE_PERIOD, FINE_FROM = 5, 10, 100
+"""s, periods of the configuration's camera, and the time from which the attitude is fine."""
+FAST_UNTIL, HIDDEN = 20, (50, 80)
+"""s, until when the body is too fast for the camera, and when the Earth is in its cone."""
+
+
+def packets(packet: Packet, times: list[float], **fields: Any) -> PacketArray:
+    """Return packets at times (n,), s, whose other fields are zero."""
+    rows = np.zeros(len(times), dtype=Layout(packet).dtype)
+    rows["time_ns"] = (np.array(times) * 1e9).astype(np.int64)
+    for name, values in fields.items():
+        rows[name] = values
+    return rows
+
+
+def config() -> OrbitConfig:
+    """Return a configuration whose camera looks along body +z."""
+    found = as_orbit(reader.load(CONFIG.with_name("orbit.yaml")))
+    assert found.camera is not None
+    assert (found.camera.period, found.camera.fine_period) == (PERIOD, FINE_PERIOD)
+    return reader.replace(found, camera=reader.replace(found.camera, mounting=(0.0, 0.0, 0.0, 1.0)))
+
+
+def flight(gave: list[float]) -> Run:
+    """Return a flight with frames at the times `gave`, alternately with a rate and an attitude.
+
+    The camera looks up with the Sun behind the Earth, and to the limb during `HIDDEN`.
+    """
+    seconds = [float(at) for at in range(END + 1)]
+    limb = math.pi - math.asin(EARTH_RADIUS / 7e6) - 0.1
+    down = [HIDDEN[0] <= at < HIDDEN[1] for at in seconds]
+    turns = np.array([[0.0, limb, 0.0] if turned else [0.0, 0.0, 0.0] for turned in down])
+    rates = np.array([[0.0, 0.0, 0.1 if at < FAST_UNTIL else 0.001] for at in seconds])
+    numbers = np.arange(len(gave))
+    nan = np.full((len(gave), 4), math.nan)
+    nan[1::2] = [0.0, 0.0, 0.0, 1.0]
+    return cast(
+        Run,
+        {
+            "truth": packets(table.TRUTH, seconds, quaternion=from_rotation_vector(turns), rate=rates),
+            "orbit_truth": packets(
+                table.ORBIT_TRUTH, seconds, position=[0.0, 0.0, 7e6], sun=[0.0, 0.0, -1.0]
+            ),
+            "navigation": packets(
+                table.NAVIGATION, seconds, knowledge=[2 if at >= FINE_FROM else 1 for at in seconds]
+            ),
+            "streak": packets(
+                table.STREAK,
+                [at + 0.5 for at in gave],
+                sequence=numbers,
+                exposure_start_ns=(np.array(gave) * 1e9).astype(np.int64),
+                status=[b"saturated" if number % 2 else b"rate" for number in numbers],
+            ),
+            "stars": packets(table.STARS, [at + 0.5 for at in gave], sequence=numbers, quaternion=nan),
+        },
+    )
+
+
+SLOW = [*range(FAST_UNTIL, FINE_FROM, PERIOD), *range(FINE_FROM, END + 1, FINE_PERIOD)]
+FREE = [at for at in SLOW if not HIDDEN[0] <= at < HIDDEN[1]]
+
+
+def test_every_unobstructed_instant_counts_and_no_other() -> None:
+    found = star_camera(flight([at + 0.3 for at in FREE]), config())
+    assert found is not None
+    assert found["instants"] == len(SLOW) + FAST_UNTIL // PERIOD
+    assert found["slow"] == len(SLOW)
+    assert found["unobstructed"] == found["measured"] == len(FREE)
+    assert (found["share"], found["longest_gap_s"]) == (1.0, 0.0)
+
+
+def test_missing_measurements_lower_the_share_and_the_longest_gap_is_stated() -> None:
+    missing = [20, 25, 110, 120, 130]
+    found = star_camera(flight([at + 0.3 for at in FREE if at not in missing]), config())
+    assert found is not None
+    assert found["share"] == pytest.approx(1.0 - len(missing) / len(FREE))
+    assert found["longest_gap_s"] == 3 * FINE_PERIOD
+
+
+def test_the_sun_in_its_cone_leaves_no_unobstructed_instant() -> None:
+    run = cast(dict[str, PacketArray], flight([21.0]))
+    run["orbit_truth"]["sun"] = [0.0, 0.5, math.sqrt(0.75)]
+    found = star_camera(cast(Run, run), config())
+    assert found is not None
+    assert found["unobstructed"] == 0
+    assert math.isnan(found["share"])
+
+
+def test_without_a_truth_log_nothing_is_said() -> None:
+    run = cast(dict[str, PacketArray], flight([21.0]))
+    run["truth"] = run["truth"][:0]
+    assert star_camera(cast(Run, run), config()) is None
