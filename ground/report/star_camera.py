@@ -1,4 +1,4 @@
-"""Availability of the star camera in orbit: the share of its unobstructed instants that gave a measurement."""
+"""Availability of the star camera in orbit: the share of unobstructed instants that gave a measurement."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from flight.link.telemetry.packets import PacketArray, to_text
+from flight.schema.devices import Camera
 from flight.schema.orbit import OrbitConfig
 from ground.report.signals import seconds
 from ground.telemetry import Run
-from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.streaks.streak_result import StreakStatus
@@ -25,15 +26,16 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
     """Return how often the unobstructed star camera gave an attitude or a rate.
 
     The instants are those of the camera's schedule: every `camera.period` s, and every `camera.fine_period` s
-    while the attitude is fine. An instant is unobstructed if the true body rate is below `camera.max_rate` and
-    the true boresight is outside `pointing.cones` of Sun and Earth. It gave a measurement if the frame exposed
-    before the next instant contains an attitude or a rate. Returns None without a star camera or a truth log.
+    while the attitude is fine. An instant is unobstructed if the true body rate is below `camera.max_rate`
+    and the true boresight is outside `pointing.cones` of Sun and Earth. It gave a measurement if the frame
+    exposed before the next instant contains an attitude or a rate. The longest gap is the longest time of
+    consecutive unobstructed instants without a measurement. Returns None without a star camera or a truth
+    log.
     """
     camera = config.camera
     if camera is None or not len(run["truth"]) or not len(run["orbit_truth"]):
         return None
-    instants, ends = _schedule(run, camera.period, camera.fine_period)
-    slow = _rates(run["truth"], instants) < (math.inf if camera.max_rate is None else camera.max_rate)
+    instants, ends, slow = _schedule(run, camera)
     boresight = attitude_matrix(np.array(camera.mounting))[2]
     clear = _outside_cones(run, instants, boresight, config.pointing.cones.angles())
     measured = _measured_at(run)
@@ -50,24 +52,25 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
     }
 
 
-def _schedule(run: Run, period: float, fine_period: float | None) -> tuple[FloatArray, FloatArray]:
-    """Return the scheduled times (n,) of exposures and the times (n,) of the next ones, s."""
-    packets = run["navigation"]
-    times, fine = seconds(packets), packets["knowledge"] == FINE
-    begin = float(seconds(run["truth"])[0])
-    end = min(float(seconds(run[name])[-1]) for name in ("truth", "orbit_truth"))
-    instants = []
-    at = max(0.0, begin)
-    while at <= end:
-        instants.append(at)
-        row = int(np.searchsorted(times, at, side="right")) - 1
-        at += fine_period if fine_period is not None and row >= 0 and fine[row] else period
-    return np.array(instants), np.array([*instants[1:], at])
+def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return the scheduled times (n,) of exposures, s, the times (n,) of the next ones, and which are slow.
 
-
-def _rates(truth: PacketArray, instants: FloatArray) -> FloatArray:
-    """Return the true body rates (n,), rad/s."""
-    return np.asarray(np.linalg.norm(truth["rate"][_rows(truth, instants)].astype(float), axis=1))
+    As in flight, an instant at which the body is too fast does not delay the next one.
+    """
+    last = min(float(seconds(run[name])[-1]) for name in ("truth", "orbit_truth"))
+    ticks = np.arange(0.0, last + camera.period, camera.period)
+    truth, known = run["truth"], run["navigation"]
+    rates = np.linalg.norm(truth["rate"][_rows(truth, ticks)].astype(float), axis=1)
+    slow = rates < (math.inf if camera.max_rate is None else camera.max_rate)
+    fine = known["knowledge"][_rows(known, ticks)] == FINE if len(known) else np.zeros(len(ticks), dtype=bool)
+    rest = camera.period if camera.fine_period is None else camera.fine_period
+    chosen, exposed = [], -math.inf
+    for tick, at in enumerate(ticks):
+        if not slow[tick] or not fine[tick] or at - exposed >= rest:
+            chosen.append(tick)
+            exposed = at if slow[tick] else exposed
+    instants, ends = ticks[chosen[:-1]], ticks[chosen[1:]]
+    return instants, ends, slow[chosen[:-1]]
 
 
 def _outside_cones(
@@ -90,7 +93,7 @@ def _angles(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(np.arccos(np.clip(np.sum(first * second, axis=1), -1.0, 1.0)))
 
 
-def _rows(packets: PacketArray, instants: FloatArray) -> FloatArray:
+def _rows(packets: PacketArray, instants: FloatArray) -> IntArray:
     """Return the indices (n,) of the packets nearest before the instants."""
     return np.maximum(np.searchsorted(seconds(packets), instants, side="right") - 1, 0)
 

@@ -356,10 +356,10 @@ def _star_camera(found: Object | None) -> list[str]:
         return []
     share = f" ({number(found['share'], 1, 100.0)} %)" if found["share"] is not None else ""
     return [
-        f"Star camera: attitude or rate at {found['measured']} of {found['unobstructed']} unobstructed instants"
-        f"{share}; longest gap {number(found['longest_gap_s'], 0)} s",
-        f"  {found['instants']} scheduled instants, {found['slow']} below camera.max_rate; unobstructed means "
-        "also outside pointing.cones of Sun and Earth",
+        f"Star camera: attitude or rate at {found['measured']} of {found['unobstructed']} unobstructed "
+        f"instants{share}; longest gap {number(found['longest_gap_s'], 0)} s",
+        f"  {found['instants']} scheduled instants, {found['slow']} of them below camera.max_rate; "
+        "unobstructed: also outside pointing.cones of Sun and Earth",
     ]
 
 

@@ -27,6 +27,7 @@ EMPTY: dict[str, Any] = {
     "estimate": None,
     "streaks": {"frames": 0},
     "stars": {"frames": 0},
+    "star_camera": None,
     "failed_frames": [],
     "objects": [],
     "modes": [],
@@ -277,6 +278,16 @@ def test_estimate_streaks_and_stars_have_their_errors() -> None:
         "  rms error about x, y, z 1.00, 2.00, 30.00 arcsec over 3 attitudes; mean e' P^-1 e / 3 = 0.90",
     ]
     assert len(blocks(streaks={**streaks, "rms_error": None})[-1].splitlines()) == 1
+
+
+def test_the_availability_of_the_star_camera_is_stated() -> None:
+    found = {"instants": 90, "slow": 60, "unobstructed": 48, "measured": 42, "share": 0.875}
+    lines = blocks(star_camera={**found, "longest_gap_s": 30.0})[-1].splitlines()
+    first = "Star camera: attitude or rate at 42 of 48 unobstructed instants (87.5 %); longest gap 30 s"
+    assert lines[0] == first
+    assert lines[1].startswith("  90 scheduled instants, 60 of them below camera.max_rate;")
+    never = {**found, "unobstructed": 0, "measured": 0, "share": None, "longest_gap_s": 0.0}
+    assert "0 of 0 unobstructed instants; longest" in blocks(star_camera=never)[-1]
 
 
 @pytest.mark.parametrize(("count", "more"), [(20, ""), (23, "  and 3 more; --json lists all")])
