@@ -25,7 +25,7 @@ from sim_hal.settings import Simulation
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"
 DEMO = (FOLDER / "step_demo.yaml").read_text(encoding="utf-8")
-ORBIT = (FOLDER / "orbit.yaml").read_text(encoding="utf-8")
+ORBIT = (FOLDER / "orbit.yaml").read_text(encoding="utf-8").replace(", roll_deg: 188.0}", "}")
 SECOND_TARGET = as_orbit(reader.parse(ORBIT, "orbit.yaml")).targets[1].at
 
 

@@ -37,11 +37,13 @@ def packets(packet: Packet, times: list[float], **fields: Any) -> PacketArray:
 
 
 def config() -> OrbitConfig:
-    """Return a configuration whose camera looks along body +z."""
+    """Return a configuration whose camera looks along body +z, up to a rate of 0.02 rad/s."""
     found = as_orbit(reader.load(CONFIG.with_name("orbit.yaml")))
     assert found.camera is not None
     assert (found.camera.period, found.camera.fine_period) == (PERIOD, FINE_PERIOD)
-    return reader.replace(found, camera=reader.replace(found.camera, mounting=(0.0, 0.0, 0.0, 1.0)))
+    return reader.replace(
+        found, camera=reader.replace(found.camera, mounting=(0.0, 0.0, 0.0, 1.0), max_rate=0.02)
+    )
 
 
 def flight(gave: list[float]) -> Run:

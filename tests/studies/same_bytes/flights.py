@@ -101,7 +101,7 @@ FLIGHTS: tuple[Flight, ...] = (
         "{targets: [{at: 0.0, point: sun}, {at: 120.0, point: nadir, roll_deg: 0.0}],"
         " simulation: {free_body: {release: {speed: 0.01}}}}",
     ),
-    # A 3U as configured: it tumbles at 10 deg/s, too fast for stars; rate by the magnetometer, Sun and limb.
+    # A 3U as configured: it tumbles at 10 deg/s; streaks, rate by the magnetometer, Sun and limb.
     Flight("orbit_3u", "config/orbit_3u.yaml", 60),
     # A passing object is found among the stars and followed, and its orbit determined.
     Flight("orbit_object", "config/orbit_object.yaml", 90, questions=("report . --no-figures", "orbit .")),
