@@ -121,10 +121,13 @@ def slew(
 ) -> SlewPath | None:
     """Return a slew, slower than `fastest` rad/s, into the attitude law of a target, or None.
 
-    The slew avoids the exclusion cones, unless the body is already inside a cone or no such slew is found.
+    The slew avoids the exclusion cones that do not contain the camera at the start, unless no such slew is
+    found.
     """
     first = float(begin.times[0])
     craft = SlewCraft(begin.inertia, np.full(3, RESERVE * begin.limit), wish.heat, wish.residual)
+    start = begin.quaternion[None]
+    avoided = cones(ahead, first, wish.camera, **wish.angles)
     task = SlewTask(
         craft.facing(begin.sizes),
         along(ahead, first),
@@ -133,7 +136,7 @@ def slew(
         end_law(target, axes, ahead, first),
         wish.seconds,
         LONGEST,
-        cones=cones(ahead, first, wish.camera, **wish.angles),
+        cones=tuple(cone for cone in avoided if float(cone.clearance(start, np.zeros(1))[0]) >= 0.0),
     )
     found = _slow_enough(task, fastest)
     if found is None and task.cones:

@@ -121,3 +121,19 @@ def test_a_body_within_a_cone_slews_out_of_it() -> None:
     sun = attitude_matrix(q) @ ORBIT.sun_at(TIMES[:1])[0]
     inside = SlewRequest(700.0, WISH.heat, RESIDUAL, sun, {"sun": 0.3})
     assert slew(BEGIN, inside, NADIR, AXES, ORBIT, np.inf) is not None
+
+
+def test_a_body_within_one_cone_still_avoids_the_other() -> None:
+    """The camera would cross the Sun halfway, and starts near the limb of the Earth."""
+    free = slew(BEGIN, WISH, NADIR, AXES, ORBIT, np.inf)
+    assert free is not None
+    halfway = len(free.quaternion) // 2
+    camera = attitude_matrix(free.quaternion[halfway]) @ ORBIT.sun_at(TIMES[:1])[0]
+    angle = 0.2
+    request = SlewRequest(700.0, WISH.heat, RESIDUAL, camera, {"sun": angle, "earth": 1.8})
+    found = slew(BEGIN, request, NADIR, AXES, ORBIT, np.inf)
+    assert found is not None
+    for path, crosses in ((free, True), (found, False)):
+        shown = attitude_matrix(path.quaternion) @ ORBIT.sun_at(TIMES[:1])[0]
+        nearest = float(np.arccos(np.clip(shown @ camera, -1.0, 1.0)).min())
+        assert (nearest < 0.9 * angle) == crosses
