@@ -17,15 +17,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flight.schema.devices import Camera, WideCamera
+from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.drivers.ads1115 import StringWiring
 from hal.drivers.coils import CoilSettings, wirings
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
-from knightcube.astro.quaternion import from_rotation_vector, multiply
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.vision.camera.lens import Lens, Pinhole
 from sim_hal.clock import EmulatedDevice, FaultTimeline, SerialEnd, TimedSimulation
-from sim_hal.description_errors import NO_ERRORS, description_errors, true_description
+from sim_hal.description_errors import NO_ERRORS, description_errors
 from sim_hal.emulators.camera import EmulatedCamera, Expose, no_objects
 from sim_hal.emulators.coil_circuit import CoilCircuit, EmulatedIna219
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
@@ -148,7 +149,7 @@ def assemble(
         coils.bus.attach(part)
     faults = FaultTimeline()
     if truth is not None:
-        truth.watch(world, true_description(config, section, world))
+        truth.watch(world, _true_description(config, section, world))
     # Devices with events at the same time run in the order of this list.
     devices: list[EmulatedDevice | None] = [unit, camera, orbit.gps, *orbit.wide, faults, truth]
     simulation = TimedSimulation(world.advance_to, [device for device in devices if device is not None])
@@ -166,6 +167,23 @@ def assemble(
         orbit,
         objects,
     )
+
+
+def _true_description(config: Config, section: Simulation, world: World) -> dict[str, FloatArray] | None:
+    """Return the fields of the true-description packet; None for a world without a craft."""
+    craft = getattr(world, "craft", None)
+    if craft is None or not isinstance(config, OrbitConfig):
+        return None
+    errors = description_errors(config, section)
+    to_principal = attitude_matrix(craft.to_principal)
+    inertia = to_principal.T @ np.diag(craft.inertia) @ to_principal
+    return {
+        "inertia": inertia[(0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)],
+        "coils": craft.coil_dipole / config.craft.dipole_per_ampere,
+        "gyro": errors.gyro,
+        "field": errors.field,
+        "camera": errors.camera,
+    }
 
 
 def assemble_coils(

@@ -16,9 +16,7 @@ from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.inertia import principal_axes
-from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.settings import Simulation
-from sim_hal.worlds.world import World
 
 _STREAM = 0xD1FF
 
@@ -85,20 +83,3 @@ def description_errors(config: Config, section: Simulation) -> DescriptionErrors
         camera=drawn(camera, 3),
         horizon=np.array([drawn(math.radians(one.mounting_deg), 3) for one in config.wide_cameras]),
     )
-
-
-def true_description(config: Config, section: Simulation, world: World) -> dict[str, FloatArray] | None:
-    """Return the fields of the true-description packet; None for a world without a craft."""
-    craft = getattr(world, "craft", None)
-    if craft is None or not isinstance(config, OrbitConfig):
-        return None
-    errors = description_errors(config, section)
-    to_principal = attitude_matrix(craft.to_principal)
-    inertia = to_principal.T @ np.diag(craft.inertia) @ to_principal
-    return {
-        "inertia": inertia[(0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)],
-        "coils": craft.coil_dipole / config.craft.dipole_per_ampere,
-        "gyro": errors.gyro,
-        "field": errors.field,
-        "camera": errors.camera,
-    }
