@@ -294,7 +294,7 @@ class FieldRate:
         """Set the errors (6,) of the elements of the assumed inertia, relative to its trace."""
         self._error = error
         self._inertia = self._assumed + self._trace * tensor(error)
-        self._inverse = np.linalg.inv(self._inertia)
+        self._inverse: FloatArray = np.asarray(np.linalg.inv(self._inertia), dtype=float)
         self._inertia_rows, self._inverse_rows = rows_of(self._inertia), rows_of(self._inverse)
 
     def _step(self, dipole: Vector, dt: float) -> None:

@@ -137,17 +137,17 @@ class PointingFlight:
         flight.act(np.zeros(3))
         before = flight.motion.rate
         flight.advance(round((time + PAUSE) * SECOND))
+        found.begin_mean()
         found.advance(PAUSE, np.zeros(3), around)
-        rest = found.acceleration
         found.field(flight.field(SAMPLES), self._field_at(time + PAUSE), FIELD_NOISE**2 / SAMPLES * np.eye(3))
         dipole = self._command(time + PAUSE, around)
         flight.act(dipole)
-        acting, began = flight.motion.rate, found.rate
+        acting = flight.motion.rate
         flight.advance(round((time + CYCLE) * SECOND))
         found.advance(CYCLE - PAUSE, dipole, around)
-        # The mean over the cycle, compared with the rate at its end.
+        # The gyro gives the mean over the cycle. The filter adds its own curvature since `begin_mean`.
         mean = _mean(before, acting, flight.motion.rate)
-        change = found.rate - _mean(began - PAUSE * rest, began, found.rate)
+        change = 0.5 * CYCLE * found.acceleration
         spread = COIL_ERROR**2 * float(change @ change) + GYRO_NOISE**2 / CYCLE
         found.gyro(self._gyro(mean, CYCLE), spread * np.eye(3), change, 0.5 * CYCLE)
         self._see_stars(time + CYCLE)
