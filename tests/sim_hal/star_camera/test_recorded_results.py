@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from sim_hal.settings import FreeBodySection, LineOfSight, ObjectState, SkyObject, Tumble
+from sim_hal.settings import FreeBodySection, LineOfSight, ObjectState, SkyObject, SkySection, Tumble
 from sim_hal.star_camera import (
     SourceTrack,
     StarCameraModel,
@@ -104,7 +104,7 @@ def test_directions_and_shadow_of_objects_are_as_recorded() -> None:
         directions(observer, targets),
         hidden_by_earth(observer, targets),
         aberrated(turning((0.1, 0.2, 0.0), 1.0, 4)[1], np.array([1e4, -2e4, 3e4])),
-        view(MODEL.pinhole, np.eye(3), here),
-        view(MODEL.pinhole, -np.eye(3), here),
+        view(MODEL.pinhole, np.eye(3), here, SkySection()),
+        view(MODEL.pinhole, -np.eye(3), here, SkySection()),
     ]
     check(__file__, "sight", found)

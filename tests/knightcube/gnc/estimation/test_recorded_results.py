@@ -55,7 +55,7 @@ def test_the_states_of_a_free_satellite_are_as_recorded() -> None:
     states = [found.quaternion, found.rate, found.covariance, found.gyro_bias, found.magnet_bias]
     learned = [
         found.torque_sizes,
-        found.axes_rotation,
+        found.description(),
         found.residual_dipole(1.0),
         found.residual_dipole(0.0),
     ]
