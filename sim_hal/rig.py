@@ -57,7 +57,6 @@ from sim_hal.faults.host import corrupted_by, host_faults
 from sim_hal.faults.schedule import check, put, scheduled
 from sim_hal.serving.device_link import DeviceLink, RemoteI2cBus
 from sim_hal.settings import Simulation
-from sim_hal.worlds.orbit import distance_from
 from sim_hal.worlds.world import BodyMotion, TruthRecorder, WorldInputs, make_world
 
 PATIENCE_S = 5.0
@@ -134,6 +133,8 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
 
 def check_elements(request: SimulationRequest, config: Config) -> None:
     """Raise ConfigError if the two-line elements of a configuration do not fit its simulated orbit."""
+    from sim_hal.worlds.orbit import distance_from  # noqa: PLC0415 - loads SciPy
+
     section = request.section()
     if section.free_body is None or not isinstance(config, OrbitConfig) or config.elements is None:
         return
