@@ -56,7 +56,7 @@ MUTE = FaultEntry(fault="gps: off", at=35.0, span=60.0)
 
 
 def skyward() -> Simulation:
-    """Return the world with the star camera's boresight, body -y, across the orbit."""
+    """Return the world with body -y across the orbit; the star camera's boresight is 22 deg above it."""
     section = world(NEAR_REST, MUTE)
     craft = section.free_body
     assert craft is not None

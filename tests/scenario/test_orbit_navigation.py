@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ground.report import format_report, summarise
-from ground.report.orbit import FINE, AttitudeErrors, attitude_errors
+from ground.report.orbit import FINE, AttitudeErrors, attitude_errors, camera_errors
 from ground.telemetry import Run
 from tests.scenario.orbit_flights import ACQUIRED, navigating, skyward
 from tests.support.flights import event_names, fly
@@ -36,14 +36,24 @@ def test_lost_in_space_it_becomes_fine_and_stays_so(flown: Run) -> None:
     assert "attitude-knowledge" in event_names(flown)
 
 
-def test_its_attitude_is_within_a_hundredth_of_a_degree_and_within_its_claim(settled: AttitudeErrors) -> None:
+def test_its_star_camera_is_within_a_hundredth_of_a_degree_and_within_its_claim(flown: Run) -> None:
+    found = camera_errors(flown)
+    later = found.times > ACQUIRED
+    error, sigma = found.error[later], found.sigma[later]
+    assert len(error) > 2
+    assert np.degrees(np.sqrt(np.mean(np.sum(error**2, axis=1)))) < 0.01
+    assert np.degrees(sigma).max() < 0.02
+    assert (np.abs(error) < 5.0 * sigma).all()
+
+
+def test_its_attitude_is_within_the_accuracy_of_the_mounting_and_within_its_claim(
+    settled: AttitudeErrors,
+) -> None:
+    """The mountings of the cameras are known to 0.1 deg about each axis."""
     angle = np.degrees(np.linalg.norm(settled.error, axis=1))
-    assert np.sqrt(np.mean(angle**2)) < 0.01
+    assert np.sqrt(np.mean(angle**2)) < 0.15
+    assert np.degrees(settled.sigma).max() < 0.06
     assert (np.abs(settled.error) < 5.0 * settled.sigma).all()
-
-
-def test_it_claims_what_it_can_do(settled: AttitudeErrors) -> None:
-    assert np.degrees(settled.sigma).max() < 0.02
 
 
 def test_it_learns_the_biases_of_the_inertial_unit(flown: Run) -> None:
