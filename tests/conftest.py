@@ -29,6 +29,15 @@ LIST = Path(__file__).with_name("slow.txt")
 _spent: dict[str, float] = {}
 
 
+@pytest.fixture(scope="session")
+def session_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder that all worker processes of this session share."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option that measures."""
     parser.addoption("--write-slow-list", action="store_true", help=f"write {LIST.name} from this run")

@@ -29,6 +29,7 @@ from flight.schema.testbed import TestbedConfig
 from ground.telemetry import Run
 from sim_hal.settings import FaultEntry, Simulation
 from tests.support.flights import demo_config, demo_world, fly, thesis_config
+from tests.support.shared_results import made_once
 
 RECORD = Path(__file__).with_suffix(".json")
 TOLERANCE = 1e-5
@@ -230,9 +231,12 @@ def flown(name: str, folder: Path) -> Run:
     return fly(config, folder, section=section)
 
 
-def unlike_record(name: str, folder: Path) -> list[str]:
-    """Return the differences of a flight from its record."""
-    return differences(recorded(name), record_of(flown(name, folder)))
+def unlike_record(name: str, session_folder: Path) -> list[str]:
+    """Return the differences of a flight from its record; the tests of a session fly it once."""
+    folder = session_folder / "recorded_flights"
+    folder.mkdir(exist_ok=True)
+    found = made_once(folder, name, lambda: record_of(flown(name, folder / name)))
+    return differences(recorded(name), found)
 
 
 def main() -> None:

@@ -7,17 +7,17 @@ from pathlib import Path
 from tests.support.recorded_flights import unlike_record
 
 
-def test_a_flight_with_a_silent_inertial_unit_is_as_recorded(tmp_path: Path) -> None:
-    assert unlike_record("blind", tmp_path) == []
+def test_a_flight_with_a_silent_inertial_unit_is_as_recorded(session_folder: Path) -> None:
+    assert unlike_record("blind", session_folder) == []
 
 
-def test_a_flight_with_wrong_measurements_is_as_recorded(tmp_path: Path) -> None:
-    assert unlike_record("doubtful", tmp_path) == []
+def test_a_flight_with_wrong_measurements_is_as_recorded(session_folder: Path) -> None:
+    assert unlike_record("doubtful", session_folder) == []
 
 
-def test_a_flight_with_failing_coils_is_as_recorded(tmp_path: Path) -> None:
-    assert unlike_record("coils", tmp_path) == []
+def test_a_flight_with_failing_coils_is_as_recorded(session_folder: Path) -> None:
+    assert unlike_record("coils", session_folder) == []
 
 
-def test_a_flight_with_failing_receivers_is_as_recorded(tmp_path: Path) -> None:
-    assert unlike_record("receivers", tmp_path) == []
+def test_a_flight_with_failing_receivers_is_as_recorded(session_folder: Path) -> None:
+    assert unlike_record("receivers", session_folder) == []

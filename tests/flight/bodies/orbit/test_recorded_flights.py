@@ -7,13 +7,13 @@ from pathlib import Path
 from tests.support.recorded_flights import unlike_record
 
 
-def test_a_detumbling_flight_is_as_recorded(tmp_path: Path) -> None:
-    assert unlike_record("detumbling", tmp_path) == []
+def test_a_detumbling_flight_is_as_recorded(session_folder: Path) -> None:
+    assert unlike_record("detumbling", session_folder) == []
 
 
-def test_a_flight_that_navigates_in_orbit_is_as_recorded(tmp_path: Path) -> None:
-    assert unlike_record("navigation", tmp_path) == []
+def test_a_flight_that_navigates_in_orbit_is_as_recorded(session_folder: Path) -> None:
+    assert unlike_record("navigation", session_folder) == []
 
 
-def test_a_flight_with_failing_receivers_is_as_recorded(tmp_path: Path) -> None:
-    assert unlike_record("receivers", tmp_path) == []
+def test_a_flight_with_failing_receivers_is_as_recorded(session_folder: Path) -> None:
+    assert unlike_record("receivers", session_folder) == []

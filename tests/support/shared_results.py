@@ -1,0 +1,24 @@
+"""Results that the tests of a session share, whatever worker process each test runs in."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def made_once(folder: Path, name: str, make: Callable[[], Any]) -> Any:
+    """Return what `make` returns, as JSON keeps it; only the first caller of a session calls `make`.
+
+    `folder` is below the fixture `session_folder`. A caller in another process waits for the result.
+    If `make` raises an exception, the next caller calls it again.
+    """
+    kept = folder / f"{name}.json"
+    with (folder / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not kept.exists():
+            text = json.dumps(make())
+            kept.write_text(text, encoding="utf-8")
+    return json.loads(kept.read_text(encoding="utf-8"))
