@@ -8,7 +8,7 @@ TESTS  := $(RUN) -m pytest -n auto
 # The tests start hundreds of processes: without kept bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo cage orbit orbit-3u object console quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
+.PHONY: demo cage orbit orbit-3u object console quick test test-container lint types arrows docs house unit fast explore slow-list pictures lock clean help
 
 help:           ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -84,6 +84,9 @@ unit: $(TOOLS)  ## the tests, on all cores
 
 fast: $(TOOLS)  ## the tests that are not slow, on all cores
 	$(TESTS) --dist worksteal -m "not slow"
+
+explore: $(TOOLS) ## the property tests with new random examples; `make test` draws the same ones each time
+	$(TESTS) --dist worksteal -m hypothesis --hypothesis-profile explore
 
 slow-list: $(TOOLS)  ## measure every test alone and write tests/slow.txt
 	$(RUN) -m pytest --write-slow-list
