@@ -41,7 +41,8 @@ Reactor = Callable[[EventKind, int, str], None]
 class EventLog:
     """Passes events to a sink, and limits the number of written events of each kind.
 
-    The attributes `count` and `counts` include the events that were held back.
+    The attributes `count` and `counts` include the events that were held back. The attribute `first_texts`
+    holds the text of the first event of each kind.
     """
 
     def __init__(self, sink: Sink, throttle_ns: int = THROTTLE_NS) -> None:
@@ -52,6 +53,7 @@ class EventLog:
         self._held_back: dict[int, int] = {}
         self.count = 0
         self.counts: Counter[EventKind] = Counter()
+        self.first_texts: dict[EventKind, str] = {}
 
     def react_by(self, react: Reactor) -> None:
         """Call `react` for every event with a reaction beyond its record, including events held back."""
@@ -61,6 +63,7 @@ class EventLog:
         """Write an event or, if it is held back, only count it; then carry out its reaction."""
         self.count += 1
         self.counts[kind] += 1
+        self.first_texts.setdefault(kind, text)
         last_ns = self._last_written.get(kind.code)
         if last_ns is not None and time_ns - last_ns < self._throttle_ns:
             self._held_back[kind.code] = self._held_back.get(kind.code, 0) + 1
@@ -177,6 +180,7 @@ def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]
 class _State:
     holds: bool = False
     count: int = 0
+    cause: str = ""
 
 
 class Facts:
@@ -200,7 +204,7 @@ class Facts:
             return
         if not state.holds and state.count < fact.after:
             return
-        state.holds, state.count = holds, 0
+        state.holds, state.count, state.cause = holds, 0, text if holds else ""
         kind = fact.begins if holds else fact.ends
         if kind is not None:
             self._events.report(kind, now_ns, text)
@@ -212,6 +216,10 @@ class Facts:
     def held(self) -> tuple[Fact, ...]:
         """Return the active facts, in the order of the table."""
         return tuple(fact for fact in FACTS if self._states[fact.name].holds)
+
+    def cause(self, fact: Fact) -> str:
+        """Return the text of the event with which an active fact began, or "" for an inactive fact."""
+        return self._states[fact.name].cause
 
     def clear(self, event_name: str) -> bool:
         """Make the latched facts of an event inactive, and return whether there were any."""

@@ -61,6 +61,8 @@ class FlightEnding:
         alarms: names of the facts that are active at the end.
         faults: number of events of severity fault, by kind, including events that the throttle held back.
         warnings: number of events of severity warning, by kind, including events that the throttle held back.
+        causes: text of the first event of each kind of fault and warning, and text with which each alarm
+            began, by the name of the event or alarm.
         coils_left_out: axes of the coils that were excluded because they are broken.
         coils_at_zero: whether the last command that the PWM chip acknowledged was zero current.
         coil_error: why the last write to the PWM chip failed; empty if it succeeded.
@@ -72,6 +74,7 @@ class FlightEnding:
     alarms: tuple[str, ...] = ()
     faults: Mapping[str, int] = field(default_factory=dict)
     warnings: Mapping[str, int] = field(default_factory=dict)
+    causes: Mapping[str, str] = field(default_factory=dict)
     coils_left_out: tuple[str, ...] = ()
     coils_at_zero: bool = False
     coil_error: str = "the flight did not begin"
@@ -171,8 +174,12 @@ class FlightLoop:
         """Return the state of the flight; after `run`, this is the state at its end."""
         facts, coils = self._services.facts, self._tasks.housekeeping.coils()
         counts: dict[Severity, dict[str, int]] = {Severity.FAULT: {}, Severity.WARNING: {}}
+        causes: dict[str, str] = {}
         for kind, count in self._services.events.counts.items():
             counts.setdefault(kind.severity, {})[kind.name] = count
+            if kind.severity is not Severity.INFORMATION:
+                causes[kind.name] = self._services.events.first_texts[kind]
+        causes |= {fact.name: facts.cause(fact) for fact in facts.held()}
         return FlightEnding(
             mission_time=self._ended_ns * 1e-9,
             cycles=self._groups[0].completed,
@@ -180,6 +187,7 @@ class FlightLoop:
             alarms=tuple(fact.name for fact in facts.held()),
             faults=counts[Severity.FAULT],
             warnings=counts[Severity.WARNING],
+            causes=causes,
             coils_left_out=tuple(axis for axis, fact in _BROKEN.items() if facts.holds(fact)),
             coils_at_zero=not coils.error and not coils.current.any(),
             coil_error=coils.error,

@@ -23,6 +23,7 @@ from typing import Any
 from flight.app.cli.run import counts_text, summary_facts
 from flight.app.devices import linux_camera, unit_settings
 from flight.app.run import RunRequest, RunResult
+from flight.loop.flight_loop import FlightEnding
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera
 from flight.schema.document import ConfigError, config_path, merged_text, names, read_document
@@ -239,9 +240,18 @@ def flight_problems(result: RunResult) -> list[str]:
     if not ending.coils_at_zero and not ending.coil_error:
         problems.append("the coils were not left at zero")
     if not result.faults:
-        problems += [f"alarm: {name}" for name in ending.alarms]
-        problems += [f"fault noticed: {name} ({count})" for name, count in sorted(ending.faults.items())]
+        problems += [f"alarm: {with_cause(name, ending)}" for name in ending.alarms]
+        problems += [
+            f"fault noticed: {with_cause(name, ending, f' ({count})')}"
+            for name, count in sorted(ending.faults.items())
+        ]
     return problems
+
+
+def with_cause(name: str, ending: FlightEnding, count: str = "") -> str:
+    """Return the name of an alarm or event, its `count` and its cause, which is the text of the event."""
+    cause = ending.causes.get(name, "")
+    return f"{name}{count}: {cause}" if cause else f"{name}{count}"
 
 
 def _facts(verdict: CheckResult) -> dict[str, Any]:
@@ -277,6 +287,7 @@ def _text(verdict: CheckResult) -> str:
         noticed = f"{counts_text(ending.faults, 'faults')}; {counts_text(ending.warnings, 'warnings')}"
         lines.append(("flown", f"{ending.mission_time:.0f} s in lock-step; mode {ending.mode}"))
         lines.append(("noticed", noticed))
+        lines += [("", with_cause(name, ending)) for name in sorted(ending.warnings)]
         if result.faults:
             lines.append(("injected", "; ".join(result.faults)))
     lines += [("problem", problem) for problem in verdict.problems]

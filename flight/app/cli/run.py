@@ -48,6 +48,7 @@ def summary_facts(result: RunResult, elapsed: float) -> dict[str, Any]:
         "alarms": ending.alarms,
         "noticed_faults": dict(ending.faults),
         "noticed_warnings": dict(ending.warnings),
+        "causes": dict(ending.causes),
         "coils_at_zero": ending.coils_at_zero,
         "coils_left_out": ending.coils_left_out,
         "log_error": result.log_error or None,

@@ -73,7 +73,10 @@ def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> Non
     steps = [{"at": 0.0, "q2": 0.0}]
     done = command("check", write(tmp_path, DEMO, camera="none", duration=6.0, steps=steps, simulation=world))
     assert done.returncode == 1, done.stdout
-    assert "problem:       fault noticed: coil-broken" in done.stdout
+    cause = "coil z open: no current when driven (supply current 1 mA, expected 148 mA)"
+    assert f"\nproblem:       alarm: coil-z-broken: {cause}\n" in done.stdout
+    assert "\nproblem:       fault noticed: coil-broken (2): coil x broken in one of " in done.stdout
+    assert "\n               coil-suspect: supply current " in done.stdout, "warnings have causes too"
     assert done.stdout.endswith("verdict:       not ready\n")
 
 
@@ -84,6 +87,16 @@ def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> Non
         (replace(WELL, warnings={"cycle-slip": 1}), {}, None),
         (replace(WELL, alarms=("imu-silent",)), {}, "alarm: imu-silent"),
         (replace(WELL, faults={"blind": 2}), {}, "fault noticed: blind (2)"),
+        (
+            replace(WELL, alarms=("imu-silent",), causes={"imu-silent": "no packet for 0.3 s"}),
+            {},
+            "alarm: imu-silent: no packet for 0.3 s",
+        ),
+        (
+            replace(WELL, faults={"blind": 2}, causes={"blind": "no estimate for 60 s"}),
+            {},
+            "fault noticed: blind (2): no estimate for 60 s",
+        ),
         (replace(WELL, alarms=("imu-silent",), faults={"blind": 2}), {"faults": ("imu: silent",)}, None),
         (replace(WELL, coils_at_zero=False), {}, "the coils were not left at zero"),
         (replace(WELL, coils_at_zero=False, coil_error="no answer"), {}, "no answer"),
