@@ -19,16 +19,18 @@ from tests.scenario.mode_flights import modes_of
 from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
-BEGIN, SLEW, TURN = 20.0, 150.0, np.radians([10.0, 20.0, -10.0])
-"""s; s and rad of the slew."""
+BEGIN, SLEW, TURN = 20.0, 150.0, np.radians([20.0, 20.0, -10.0])
+"""Begin (s) and duration (s) of the slew, and its rotation vector (rad). The rotation about x, along the
+field, is one that the field's own rotation permits at 0.7 deg/s; a path may rotate at 0.8 deg/s."""
 BROKEN = 22.0
-"""s, when two of the three coils break: what is left does not keep the body on the path."""
+"""Time (s) at which the coils x and z break. The remaining coil causes no torque about its own axis y, about
+which the slew rotates most."""
 PATIENCE = 15.0
 """s that the body is held still before it is planned for though not slow: 180 in flight."""
 
 
 def slewing(duration: float, *faults: FaultEntry) -> tuple[OrbitConfig, Simulation]:
-    """Return a KnightCube near rest that slews by 24 deg."""
+    """Return a KnightCube near rest that slews by 30 deg."""
     section = skyward()
     assert section.free_body is not None
     attitude = section.free_body.release.attitude
@@ -57,7 +59,7 @@ def slewed(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module")
 def crippled(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    faults = [FaultEntry(fault=f"coil-{axis}: open", at=BROKEN) for axis in "yz"]
+    faults = [FaultEntry(fault=f"coil-{axis}: open", at=BROKEN) for axis in "xz"]
     config, section = slewing(105.0, *faults)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pointing_law, "DAMPING_TIMEOUT", PATIENCE)
@@ -96,18 +98,20 @@ def test_a_slew_is_handed_over_to_pointing_without_a_jump(slewed: Run) -> None:
     arrived, there = (
         np.degrees(angle_between(found["quaternion"], found["target"])) for found in (last, over)
     )
-    assert arrived < 0.6
+    assert arrived < 1.0
     assert there.max() < 2.0
 
 
 def test_a_body_that_leaves_its_path_is_held_still_and_planned_for_again(crippled: Run) -> None:
     begun, lost = at(crippled, "slew-begun"), at(crippled, "astray")
-    assert len(begun) == len(lost) == 1
+    assert len(lost) == 1
     assert BROKEN < lost[0] < begun[0] + SLEW
     before, held = (part(crippled, lost[0] + since, lost[0] + since + 1.0) for since in (-3.0, 2.0))
     off = [np.degrees(angle_between(found["quaternion"], found["wanted"])) for found in (before, held)]
     assert off[0].max() < 15.0 < off[1].min()
     again = lost[0] + PATIENCE
+    assert len(begun) == 2
+    assert again < begun[1] < again + 3.0
     later = part(crippled, again + 3.0, again + 8.0)
     assert np.degrees(angle_between(later["quaternion"], later["wanted"])).max() < 2.0
     still = part(crippled, again - 2.0, again - 0.5)
