@@ -14,6 +14,7 @@ both directions. CLTUs are not created by this software. A radio that transmits 
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -81,6 +82,8 @@ NO_HEADER = 0x7FF
 IDLE = 0x7FF
 """APID of idle packets."""
 
+_COUNTS = 256  # number of values of a frame count
+
 _STATUS = 0b11 << 11  # frame status field: segment length identifier 11, all flags zero
 _LEAST_IDLE = HEADER_BYTES + 1
 
@@ -145,42 +148,63 @@ def idle_packet(length: int) -> bytes:
 
 
 class PacketAssembler:
-    """Decoder that extracts the packets of one virtual channel from telemetry frames."""
+    """Decoder that extracts the packets of one virtual channel from telemetry frames.
+
+    The frame count in a frame header has only 8 bits, and neither it nor the first header pointer is
+    authenticated. A packet is therefore continued from one frame to the next only if three conditions hold:
+    the frame counts are consecutive, the authenticated counters leave no room for 256 lost frames, and the
+    first header pointer is where the next packet has to begin.
+    """
 
     def __init__(self) -> None:
         self._count: int | None = None
+        self._missing = 0
         self._rest: bytes | None = None  # received bytes of an incomplete packet
-        self.lost_frames = 0
 
-    def add(self, header: bytes, data: bytes) -> list[bytes]:
+    def add(self, header: bytes, data: bytes, missing: int = 0) -> list[bytes]:
         """Return the packets that end in a frame, except idle packets.
 
-        If frames were lost, packets that began before or in the lost frames are discarded.
+        After lost frames, a packet that began before or in the lost frames is discarded, and decoding
+        continues at the first header pointer.
+
+        Args:
+            header: header of the frame, 6 bytes.
+            data: decrypted data of the frame.
+            missing: number of frames of all virtual channels that were lost since the link was opened,
+                according to the authenticated counters.
         """
         _, _, count, status = TELEMETRY_HEADER.unpack(header)
-        if self._count is not None and (gap := (count - self._count - 1) % 256):
-            self.lost_frames += gap
+        if self._count != (count - 1) % _COUNTS or missing - self._missing >= _COUNTS:
             self._rest = None
-        self._count = count
+        self._count, self._missing = count, missing
         pointer = status & NO_HEADER
-        if self._rest is None:
-            if pointer >= len(data):
-                return []
-            data = data[pointer:]
-            self._rest = b""
-        return self._split(self._rest + data)
+        if self._rest is not None:
+            joined, begun = self._rest + data, len(self._rest)
+            starts = _packet_starts(joined)
+            first = next((start - begun for start in starts if begun <= start < len(joined)), NO_HEADER)
+            if first == pointer:
+                return self._split(joined, starts)
+        if pointer >= len(data):
+            self._rest = None
+            return []
+        return self._split(data[pointer:], _packet_starts(data[pointer:]))
 
-    def _split(self, data: bytes) -> list[bytes]:
-        found, begin = [], 0
-        while begin + HEADER_BYTES <= len(data):
-            end = begin + HEADER_BYTES + 1 + int.from_bytes(data[begin + 4 : begin + 6], "big")
-            if end > len(data):
-                break
-            if int.from_bytes(data[begin : begin + 2], "big") & NO_HEADER != IDLE:
-                found.append(data[begin:end])
-            begin = end
-        self._rest = data[begin:]
-        return found
+    def _split(self, data: bytes, starts: list[int]) -> list[bytes]:
+        """Return the complete packets in `data`, which begin at the offsets `starts`, and keep the rest."""
+        self._rest = data[starts[-1] :]
+        packets = [data[begin:end] for begin, end in itertools.pairwise(starts)]
+        return [packet for packet in packets if int.from_bytes(packet[:2], "big") & IDLE != IDLE]
+
+
+def _packet_starts(data: bytes) -> list[int]:
+    """Return the offset of each packet in `data`. The last offset is that of the incomplete packet."""
+    starts = [0]
+    while (begin := starts[-1]) + HEADER_BYTES <= len(data):
+        end = begin + HEADER_BYTES + 1 + int.from_bytes(data[begin + 4 : begin + 6], "big")
+        if end > len(data):
+            break
+        starts.append(end)
+    return starts
 
 
 def open_telemetry(frame: bytes, spacecraft: int) -> tuple[bytes, bytes, int]:

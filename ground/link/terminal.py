@@ -106,6 +106,8 @@ class Terminal:
 
     Attributes:
         gate: authentication of the telemetry frames, with the numbers of refused frames.
+        lost_frames: number of telemetry frames that are missing according to their authenticated counters.
+            Counters that the satellite's link process skips when it starts again are included.
     """
 
     def __init__(self, line: GroundLine, vault: Vault, settings: TerminalSettings) -> None:
@@ -116,12 +118,9 @@ class Terminal:
         self._sequence = 0
         self._sealers: dict[int, Sealer] = {}
         self._channels: dict[int, PacketAssembler] = {}
+        self._expected: dict[int, int] = {}  # next counter of each SPI
+        self.lost_frames = 0
         self.gate = Gate(vault, TELEMETRY_SPIS, self._parse, TELEMETRY_MASK, _ANY_AHEAD, _STORE_EVERY)
-
-    @property
-    def lost_frames(self) -> int:
-        """Number of missing telemetry frames according to their counts."""
-        return sum(channel.lost_frames for channel in self._channels.values())
 
     def fileno(self) -> int:
         """Return the line's file descriptor for `select`."""
@@ -159,9 +158,13 @@ class Terminal:
                 admitted = self.gate.admit(frame)
             except RefusedError:  # counted by the gate
                 continue
+            # A new key begins at counter 0.
+            expected = self._expected.get(admitted.spi, admitted.counter)
+            self.lost_frames += max(admitted.counter - expected, 0)
+            self._expected[admitted.spi] = admitted.counter + 1
             channel = admitted.header[1] >> 1 & 7
             assembler = self._channels.setdefault(channel, PacketAssembler())
-            for packet in assembler.add(admitted.header, admitted.data):
+            for packet in assembler.add(admitted.header, admitted.data, self.lost_frames):
                 yield channel, packet
 
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:

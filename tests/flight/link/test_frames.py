@@ -104,7 +104,46 @@ def test_a_lost_frame_costs_the_packets_that_it_touched_and_no_others() -> None:
             whole.append(one)
         begin = end
     assert found == whole
-    assert assembler.lost_frames == len(lost - {len(frames) - 1})
+
+
+@pytest.mark.parametrize("gap", [1, 2, 255, 256, 257, 511, 512, 513, 1024])
+@pytest.mark.parametrize("size", [60, 300])
+def test_a_gap_of_any_length_costs_only_the_packets_that_it_cut(gap: int, size: int) -> None:
+    made = framer()
+    sent = [packet(n, size) for n in range(3 * (gap + 8) * ROOM // size)]
+    frames = [frame for one in sent for frame in made.add(one)]
+    begins = [n * len(sent[0]) for n in range(len(sent) + 1)]
+    whole = [
+        one
+        for one, begin, end in zip(sent, begins, begins[1:], strict=False)
+        if (end <= 3 * ROOM or begin >= (3 + gap) * ROOM) and end <= len(frames) * ROOM
+    ]
+    assembler, found = PacketAssembler(), []
+    for n, frame in enumerate(frames):
+        if not 3 <= n < 3 + gap:
+            header, data, _ = open_telemetry(frame, SPACECRAFT)
+            found += assembler.add(header, data, gap if n > 3 else 0)
+    assert found == whole
+
+
+def test_frames_of_other_channels_that_were_received_do_not_interrupt_a_packet() -> None:
+    made, assembler = framer(), PacketAssembler()
+    first, second = made.add(packet(0, 2 * ROOM - 6))
+    found = []
+    for frame, missing in ((first, 0), (second, 255)):
+        header, data, _ = open_telemetry(frame, SPACECRAFT)
+        found += assembler.add(header, data, missing)
+    assert found == [packet(0, 2 * ROOM - 6)]
+
+
+def test_a_packet_is_not_continued_where_the_pointer_says_that_another_begins() -> None:
+    made, assembler = framer(), PacketAssembler()
+    frames = made.add(packet(0, ROOM)) + made.add(packet(1, 2 * ROOM))
+    header, data, _ = open_telemetry(frames[0], SPACECRAFT)
+    assert assembler.add(header, data) == []
+    header, data, _ = open_telemetry(frames[1], SPACECRAFT)
+    displaced = header[:4] + (int.from_bytes(header[4:], "big") + 1).to_bytes(2, "big")
+    assert assembler.add(displaced, data) == []
 
 
 def test_the_header_is_that_of_the_standard() -> None:
