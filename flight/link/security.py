@@ -392,16 +392,21 @@ class Gate:
 class Sealer:
     """Sender that protects frames of one SPI. A counter is reserved on disk before it is used in a frame."""
 
-    def __init__(self, vault: Vault, name: int | str, mask: bytes, block: int = 1) -> None:
+    def __init__(
+        self, vault: Vault, name: int | str, mask: bytes, block: int = 1, shared: bool = False
+    ) -> None:
         """Protect frames with the association `name`, and reserve `block` counters at a time.
 
-        Counters that were reserved but not used before a crash are skipped.
+        Counters that were reserved but not used before a crash are skipped. If several processes share the
+        association, `shared` must be true: the rest of a block is skipped as soon as another process has
+        reserved counters, because the receiver refuses counters below the highest one it has received.
         """
         self._vault = vault
         self._name = name
         self._spi = int(str(name).partition("-")[0])
         self._mask = mask
         self._block = block
+        self._shared = shared
         self._next = 0
         self._end = 0
         self._cipher: AESGCM | None = None
@@ -418,12 +423,17 @@ class Sealer:
 
         Raises FlightError if no further counter can be reserved.
         """
-        if self._next == self._end:
+        if self._next == self._end or (self._shared and self._is_overtaken()):
             self._reserve()
         assert self._cipher is not None
         counter = self._next
         self._next += 1
         return protect(self._cipher, self._spi, counter, header, self._mask, data), counter
+
+    def _is_overtaken(self) -> bool:
+        """Return whether another process has changed the key or reserved counters after this block."""
+        entry = self._vault.read(self._name)
+        return entry is not None and entry.unused != self._end
 
     def _reserve(self) -> None:
         with self._vault.locked():

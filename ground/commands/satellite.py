@@ -74,6 +74,7 @@ from ground.link.commanding import (
     add_link_options,
     change_key,
     exchange,
+    explained,
     failed,
     obeyed,
     sha256_of,
@@ -205,7 +206,7 @@ def _command_by_link(options: argparse.Namespace) -> int:
 
     def show(report: Report) -> None:
         if not options.json:
-            sys.stdout.write(f"{report.stage.name.lower()}: {report.text}\n")
+            sys.stdout.write(f"{report.stage.name.lower()}: {explained(report)}\n")
             sys.stdout.flush()
 
     try:
@@ -218,7 +219,7 @@ def _command_by_link(options: argparse.Namespace) -> int:
         terminal.close()
     done = obeyed(reports)
     if options.json:
-        stages = [{"stage": report.stage.name.lower(), "text": report.text} for report in reports]
+        stages = [{"stage": report.stage.name.lower(), "text": explained(report)} for report in reports]
         facts = {"obeyed": done, "counter": reports[-1].counter, "stages": stages}
         sys.stdout.write(json.dumps(facts) + "\n")
     return 0 if done else 1
@@ -346,6 +347,7 @@ def _ask_by_link(
     """Send a command in protected frames, and find the parameter table in the live telemetry."""
     table: ParameterTable | None = None
     refused: str | None = None
+    reported = False
     kinds = {TELEMETRY_LAYOUTS[kind.name].identifier: kind for kind in (PARAMETERS, VERIFICATION)}
     terminal = terminal_of(options)
     try:
@@ -357,8 +359,10 @@ def _ask_by_link(
                 table = ParameterTable.of(row)
             elif kind is VERIFICATION:
                 report = report_of(data)
-                if (report.counter, report.spi) == (counter, options.spi) and report.stage.final:
-                    refused = "" if report.stage is Stage.COMPLETED else report.text
+                if (report.counter, report.spi) == (counter, options.spi):
+                    if report.stage.final or (report.stage is Stage.REPEATED and not reported):
+                        refused = "" if report.stage is Stage.COMPLETED else explained(report)
+                    reported = True
             if refused or (refused is not None and (table is not None or not wants_table)):
                 break
     finally:

@@ -32,7 +32,7 @@ from flight.schema.document import merged_text, read_text
 from flight.schema.reader import parse
 from flight.schema.sections import Commands
 from ground.console.history import values
-from ground.link.commanding import exchange, obeyed
+from ground.link.commanding import exchange, explained, obeyed
 from ground.link.terminal import Terminal, report_of
 from ground.telemetry import decode, scan
 from knightcube.errors import FlightError, UsageError
@@ -174,7 +174,9 @@ class LinkFeed:
         for row in found[VERIFICATION.name]:
             report = report_of(row.tobytes())
             if report.spi == _SPI:
-                self._reports.setdefault(report.counter, []).append(report)
+                earlier = self._reports.setdefault(report.counter, [])
+                if report.stage is not Stage.REPEATED or not earlier:
+                    earlier.append(report)
         while len(self._reports) > _KEPT_REPORTS:
             del self._reports[next(iter(self._reports))]
         return found
@@ -189,7 +191,7 @@ class LinkFeed:
             if reports and reports[-1].stage is not Stage.ACCEPTED:
                 # The lines of a list arrive as reports after the report of acceptance.
                 listed = reports[1:] if reports[-1].name == LIST.name else reports[-1:]
-                text = "; ".join(report.text for report in listed)
+                text = "; ".join(explained(report) for report in listed)
                 return {"obeyed": int(obeyed(reports)), "text": text, "counter": counter}
             time.sleep(0.02)
         raise FlightError(f"no answer over the link within {_ANSWER_S:g} s")

@@ -120,8 +120,18 @@ def obeyed(reports: list[Report]) -> bool:
 
 def failed(reports: list[Report]) -> str:
     """Return the reason why a command failed, or an empty text."""
-    bad = (report.text for report in reports if report.stage in {Stage.REFUSED, Stage.FAILED})
-    return next(bad, "")
+    bad = {Stage.REFUSED, Stage.FAILED, Stage.REPEATED}
+    return next((explained(report) for report in reports if report.stage in bad), "")
+
+
+def explained(report: Report) -> str:
+    """Return the text of a report, with the cure if the counter of the frame was used before."""
+    if report.stage is not Stage.REPEATED:
+        return report.text
+    return (
+        f"{report.text}: the ground's folder of keys is an older copy; its counter is raised as soon as "
+        "telemetry arrives, so send the command again"
+    )
 
 
 def command(terminal: Terminal, packet: bytes, spi: int, seconds: float, show: Show) -> list[Report]:
@@ -197,14 +207,15 @@ class FileSession:
         self.received_ns = now_ns
         self._texts: dict[tuple[int, int], str] = {}
         self._asked: tuple[Directive, int] | None = None
-        self._counters: set[int] = set()
+        self._counters: dict[int, bool] = {}  # counters of sent commands, and whether a report has arrived
         self._reports: deque[Report] = deque()
         self._credit, self._credit_ns = 0.0, now_ns
 
     def ask(self, directive: Directive, now_ns: int) -> None:
         """Send a command, and repeat it until the satellite answers."""
         self._asked = (directive, now_ns + _REPEAT_NS)
-        self._counters.add(self._terminal.send_by(self._sealer, directives.pack(directive, utc_ns())))
+        counter = self._terminal.send_by(self._sealer, directives.pack(directive, utc_ns()))
+        self._counters[counter] = False
 
     def put(self, path: Path, name: str, now_ns: int) -> Progress:
         """Start or continue the transfer of a file to the satellite. Raises FlightError."""
@@ -221,7 +232,9 @@ class FileSession:
                     continue
             elif packet[:2] == _VERIFICATION:
                 report = report_of(packet)
-                if report.counter in self._counters:
+                reported = self._counters.get(report.counter)
+                if reported is not None and not (reported and report.stage is Stage.REPEATED):
+                    self._counters[report.counter] = True
                     if report.stage is not Stage.ACCEPTED:
                         self._asked = None
                     self._reports.append(report)

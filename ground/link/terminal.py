@@ -8,7 +8,7 @@ import select
 import socket
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -27,6 +27,7 @@ from flight.link.frames import (
     telemetry_stream,
 )
 from flight.link.process.commanding import Report, Request, Stage
+from flight.link.process.downlink import LIVE
 from flight.link.process.station import host_port
 from flight.link.security import (
     COMMAND_SPIS,
@@ -40,7 +41,7 @@ from flight.link.security import (
     Vault,
     new_key,
 )
-from flight.link.telemetry.definitions import VERIFICATION
+from flight.link.telemetry.definitions import LINK, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
 from flight.schema.sections import Link
 from knightcube.errors import FlightError, UsageError
@@ -53,6 +54,7 @@ _STORE_EVERY = 256
 _ANY_AHEAD = 2**63
 """Width of the anti-replay window, which accepts any gap after lost telemetry."""
 _READ_BYTES = 1 << 16
+_LINK, _VERIFICATION = (LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION))
 
 
 def make_keys(folder: Path) -> list[Path]:
@@ -133,7 +135,7 @@ class Terminal:
 
     def sealer(self, spi: int, block: int) -> Sealer:
         """Return a frame sealer for `send_by`, which reserves `block` counters at once."""
-        return Sealer(self._vault, spi, TELECOMMAND_MASK, block)
+        return Sealer(self._vault, spi, TELECOMMAND_MASK, block, shared=True)
 
     def send_by(self, sealer: Sealer, packet: bytes) -> int:
         """Send a command packet with a sealer's key and return the counter of its frame."""
@@ -165,24 +167,43 @@ class Terminal:
             channel = admitted.header[1] >> 1 & 7
             assembler = self._channels.setdefault(channel, PacketAssembler())
             for packet in assembler.add(admitted.header, admitted.data, self.lost_frames):
+                if channel == LIVE and packet[:2] == _LINK:
+                    self._pass_by(packet)
                 yield channel, packet
 
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
-        """Yield the reports on a command until the final report, for at most `seconds` s."""
-        identifier = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
+        """Yield the reports on a command until the final report, for at most `seconds` s.
+
+        A report of a repeated frame is final if no other report came before. Otherwise somebody has repeated
+        the command's frame, and this report is skipped.
+        """
+        reported = False
         for _, packet in self.packets(seconds):
-            if packet[:2] != identifier:
+            if packet[:2] != _VERIFICATION:
                 continue
             found = report_of(packet)
-            if (found.counter, found.spi) == (counter, spi):
+            repeated = found.stage is Stage.REPEATED
+            if (found.counter, found.spi) == (counter, spi) and not (repeated and reported):
                 yield found
-                if found.stage.final:
+                if found.stage.final or repeated:
                     return
+                reported = True
 
     def close(self) -> None:
         """Store the frame counters and close the line."""
         self.gate.close()
         self._line.close()
+
+    def _pass_by(self, packet: bytes) -> None:
+        """Continue the counters of commands above those that the satellite has accepted.
+
+        The stored counters are behind if the folder of keys is an older copy.
+        """
+        (row,) = LAYOUTS[LINK.name].array(packet)
+        for spi, highest, generation in zip(COMMAND_SPIS, row["highest"], row["generation"], strict=False):
+            own = self._vault.read(spi)
+            if own is not None and own.generation == generation and own.unused <= highest:
+                self._vault.advance(replace(own, unused=int(highest) + 1))
 
     def _parse(self, frame: bytes) -> tuple[bytes, bytes]:
         header, protected, _ = open_telemetry(frame, self._settings.spacecraft)

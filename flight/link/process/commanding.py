@@ -51,6 +51,8 @@ class Stage(IntEnum):
     STARTED = 3
     COMPLETED = 4
     FAILED = 5
+    REPEATED = 6
+    """A frame with an already used counter was refused, which says nothing about the command that used it."""
 
     @property
     def final(self) -> bool:

@@ -9,10 +9,12 @@ therefore executes no command twice.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import socket
+import struct
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from ipaddress import IPv4Address, IPv4Network
 from typing import Any, Protocol
 
@@ -67,7 +69,14 @@ AT_MOST = 512
 _BUFFER = 1 << 20
 _HEARD_NS = 60_000_000_000
 _CONNECTIONS = 4
+"""Maximum number of TCP connections that have sent an authentic frame."""
+_STRANGERS = 32
+"""Maximum number of TCP connections that have not sent an authentic frame.
+
+If 200 strangers connect per second, a new connection has 160 ms for its first frame.
+"""
 _UNSENT = 1 << 18
+_SO_ATTACH_FILTER = 26  # Linux, asm-generic/socket.h; not in Python's module socket
 _PIECE = 1 << 14
 
 
@@ -119,6 +128,9 @@ class UdpLine:
         except (OSError, OverflowError) as error:
             self._socket.close()
             raise UsageError(f"link.udp: {address} cannot be listened to: {error}") from error
+        if peers is not None:
+            with contextlib.suppress(OSError):  # a kernel without socket filters leaves the work to `receive`
+                _accept_only(self._socket, peers)
 
     @property
     def port(self) -> int:
@@ -157,10 +169,45 @@ class UdpLine:
         self._socket.close()
 
 
-class TcpLine:
-    """TCP server for up to four connections, on which each frame follows a sync marker.
+def _accept_only(udp: socket.socket, peers: Sequence[IPv4Network]) -> None:
+    """Let the kernel discard datagrams from addresses outside `peers`, before they fill the socket's buffer.
 
-    A fifth connection replaces the oldest connection.
+    The filter is a classic BPF program (Linux, `Documentation/networking/filter.rst`). Raises OSError.
+    """
+    load, keep, restore, mask, compare, end = 0x20, 0x07, 0x87, 0x54, 0x15, 0x06
+    source_address = 2**32 - 0x100000 + 12  # SKF_NET_OFF, and the offset in the IPv4 header
+    accepted = [
+        step
+        for peer in peers
+        for step in (
+            (restore, 0, 0, 0),
+            (mask, 0, 0, int(peer.netmask)),
+            (compare, 0, 1, int(peer.network_address)),
+            (end, 0, 0, 0xFFFF),
+        )
+    ]
+    steps = [(load, 0, 0, source_address), (keep, 0, 0, 0), *accepted, (end, 0, 0, 0)]
+    program = b"".join(struct.pack("=HBBI", *step) for step in steps)
+    buffer = ctypes.create_string_buffer(program, len(program))
+    udp.setsockopt(
+        socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("HP", len(steps), ctypes.addressof(buffer))
+    )
+
+
+@dataclass(slots=True)
+class _Connection:
+    """TCP connection: its decoder, its unsent bytes, and whether it has sent an authentic frame."""
+
+    stream: FrameStream = field(default_factory=telecommand_stream)
+    unsent: bytearray = field(default_factory=bytearray)
+    trusted: bool = False
+
+
+class TcpLine:
+    """TCP server on which each frame follows a sync marker.
+
+    Connections that have sent an authentic frame are limited to four, other connections to 32. A further
+    connection replaces the oldest connection of the same kind, so that strangers displace only strangers.
     """
 
     def __init__(self, address: str, peers: Sequence[IPv4Network] | None = None) -> None:
@@ -174,7 +221,7 @@ class TcpLine:
         """
         self.name = f"TCP {address}"
         self._peers = peers
-        self._connections: dict[socket.socket, tuple[FrameStream, bytearray]] = {}
+        self._connections: dict[socket.socket, _Connection] = {}
         try:
             self._listener = socket.create_server(host_port(address))
         except (OSError, OverflowError) as error:
@@ -190,7 +237,7 @@ class TcpLine:
         """Return the frames received from all connections."""
         self._accept()
         found: list[tuple[bytes, Any]] = []
-        for connection, (stream, _) in list(self._connections.items()):
+        for connection, state in list(self._connections.items()):
             try:
                 data = connection.recv(_PIECE)
             except BlockingIOError:
@@ -200,16 +247,21 @@ class TcpLine:
             if not data:
                 self._drop(connection)
                 continue
-            found += [(frame, connection) for frame in stream.add(data)]
+            found += [(frame, connection) for frame in state.stream.add(data)]
         return found
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Do nothing, because all connections receive the telemetry anyway."""
+        """Keep the connection `sender` when strangers connect. All connections receive the telemetry."""
+        state = self._connections.get(sender)
+        if state is not None and not state.trusted:
+            self._make_room(trusted=True, most=_CONNECTIONS)
+            state.trusted = True
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
         """Send frames to all connections, and close connections that do not read the frames."""
         marked = b"".join(SYNC + frame for frame in frames)
-        for connection, (_, unsent) in list(self._connections.items()):
+        for connection, state in list(self._connections.items()):
+            unsent = state.unsent
             unsent.extend(marked)
             try:
                 del unsent[: connection.send(unsent) if unsent else 0]
@@ -228,7 +280,7 @@ class TcpLine:
         self._listener.close()
 
     def _accept(self) -> None:
-        for _ in range(_CONNECTIONS):
+        for _ in range(_STRANGERS):
             try:
                 connection, (host, _) = self._listener.accept()
             except OSError:
@@ -237,9 +289,14 @@ class TcpLine:
                 connection.close()
                 continue
             connection.setblocking(False)
-            if len(self._connections) == _CONNECTIONS:
-                self._drop(next(iter(self._connections)))
-            self._connections[connection] = (telecommand_stream(), bytearray())
+            self._make_room(trusted=False, most=_STRANGERS)
+            self._connections[connection] = _Connection()
+
+    def _make_room(self, trusted: bool, most: int) -> None:
+        """Drop the oldest connection of one kind if there are `most` of this kind."""
+        same = [one for one, state in self._connections.items() if state.trusted == trusted]
+        if len(same) >= most:
+            self._drop(same[0])
 
     def _drop(self, connection: socket.socket) -> None:
         self._connections.pop(connection, None)
@@ -448,7 +505,8 @@ class Station:
             if error.counter is not None and now_ns - self._refusals_ns[0] > SECOND_NS:
                 self._refusals_ns.append(now_ns)
                 counter = min(error.counter, _HIGHEST_REPORTED)
-                self._report(Report(error.spi, counter, Stage.REFUSED, "", str(error)))
+                stage = Stage.REPEATED if error.cause is Refusal.REPEATED else Stage.REFUSED
+                self._report(Report(error.spi, counter, stage, "", str(error)))
             return
         line.trust(sender, now_ns)
         request = request_of(admitted.data)

@@ -163,7 +163,14 @@ KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
 """States of the quality of the attitude estimate (`flight.bodies.orbit.body`)."""
 COILS: States = ((0, "x"), (1, "y"), (2, "z"))
 """Torque coils, numbered by body axis."""
-STAGES: States = ((1, "accepted"), (2, "refused"), (3, "started"), (4, "completed"), (5, "failed"))
+STAGES: States = (
+    (1, "accepted"),
+    (2, "refused"),
+    (3, "started"),
+    (4, "completed"),
+    (5, "failed"),
+    (6, "repeated"),
+)
 """Stages of a command (`flight.link.process.commanding.Stage`)."""
 
 SAFE_ALARM: Alarms = ((int(Mode.SAFE), "warning"),)

@@ -75,7 +75,7 @@ export class History extends Rows {
     }
     for (const step of listed.verification ?? []) {
       const name = label(step.stage, this.stage);
-      this.add(row([seconds(step), `link ${step.spi}:${step.counter}`, name, step.text], ["refused", "failed"].includes(name) ? "warn" : ""));
+      this.add(row([seconds(step), `link ${step.spi}:${step.counter}`, name, step.text], ["refused", "failed", "repeated"].includes(name) ? "warn" : ""));
     }
   }
 }

@@ -19,6 +19,7 @@ from flight.link.security import (
     Gate,
     Refusal,
     RefusedError,
+    Sealer,
     Vault,
     decode,
     encode,
@@ -199,6 +200,14 @@ def test_no_counter_is_used_twice_by_senders_that_share_a_folder(ground: Vault) 
     makers = [Ground(ground), Ground(ground)]
     counters = [maker.frame(b"")[7:19] for _ in range(3) for maker in makers]
     assert len(set(counters)) == len(counters)
+
+
+def test_a_block_of_counters_ends_when_another_sender_has_reserved_counters(ground: Vault) -> None:
+    blocks = Sealer(ground, 1, bytes(5), 64, shared=True)
+    single = Sealer(ground, 1, bytes(5))
+    order = [blocks, blocks, single, blocks, single, single, blocks, blocks]
+    counters = [sealer.seal(bytes(5), b"x")[1] for sealer in order]
+    assert counters == sorted(set(counters)), "the receiver refuses a counter below the highest"
 
 
 def test_keys_are_for_their_owner_only_and_not_in_what_is_printed(sky: Vault, tmp_path: Path) -> None:

@@ -109,4 +109,8 @@ def test_only_the_reports_on_the_own_command_are_followed_up_to_the_final_one(
     monkeypatch.setattr(Terminal, "packets", lambda self, seconds: ((0, packet) for packet in received))
     with contextlib.closing(open_terminal("127.0.0.1:9", keys)) as terminal:
         assert [one.stage for one in terminal.follow(5, 1, 1.0)] == [Stage.ACCEPTED, Stage.COMPLETED]
+        received[1:1] = [report(5, 1, Stage.ACCEPTED), report(5, 1, Stage.REPEATED)]
+        assert [one.stage for one in terminal.follow(5, 1, 1.0)] == [Stage.ACCEPTED] * 2 + [Stage.COMPLETED]
+        received[1:2] = []
+        assert [one.stage for one in terminal.follow(5, 1, 1.0)] == [Stage.REPEATED]
         assert terminal.lost_frames == 0

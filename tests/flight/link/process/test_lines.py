@@ -51,16 +51,61 @@ def test_datagrams_of_a_sender_other_than_the_peer_are_ignored() -> None:
     stream.close()
 
 
-def test_of_five_connections_the_oldest_goes_and_who_does_not_read_too() -> None:
+def test_strangers_do_not_fill_the_buffer_of_the_peers_datagrams() -> None:
+    line = UdpLine("127.0.0.1:0", peers=[IPv4Network("127.0.0.1/32"), IPv4Network("192.0.2.0/24")])
+    with ExitStack() as stack:
+        stranger, peer = (
+            stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
+        )
+        stranger.bind(("127.0.0.2", 0))
+        for _ in range(10_000):  # far more than the buffer holds
+            stranger.sendto(FRAME, ("127.0.0.1", line.port))
+        peer.sendto(FRAME, ("127.0.0.1", line.port))
+        assert [frame for frame, _ in line.receive()] == [FRAME]
+    line.close()
+
+
+def callers_of(line: TcpLine, stack: ExitStack, count: int) -> list[socket.socket]:
+    callers = []
+    for _ in range(count):
+        callers.append(stack.enter_context(socket.create_connection(("127.0.0.1", line.port), timeout=5.0)))
+        line.receive()
+    return callers
+
+
+def received_by(line: TcpLine) -> list[tuple[bytes, object]]:
+    while not (found := line.receive()):
+        pass
+    return found
+
+
+def is_closed(caller: socket.socket) -> bool:
+    caller.setblocking(False)
+    try:
+        return caller.recv(1) == b""
+    except BlockingIOError:
+        return False
+
+
+def test_strangers_displace_the_oldest_stranger_and_no_connection_with_an_authentic_frame() -> None:
     line = TcpLine("127.0.0.1:0")
     with ExitStack() as stack:
-        callers = []
-        for _ in range(5):
-            caller = stack.enter_context(socket.create_connection(("127.0.0.1", line.port), timeout=5.0))
-            callers.append(caller)
-            line.receive()
-        assert callers[0].recv(1) == b""
-        callers[4].sendall(SYNC + FRAME)
+        operators = callers_of(line, stack, 5)
+        for operator in operators:
+            operator.sendall(SYNC + FRAME)
+            line.trust(received_by(line)[0][1], 0)
+        assert [is_closed(operator) for operator in operators] == [True, False, False, False, False]
+        strangers = callers_of(line, stack, 40)
+        assert [is_closed(stranger) for stranger in strangers] == [True] * 8 + [False] * 32
+        assert not any(is_closed(operator) for operator in operators[1:])
+    line.close()
+
+
+def test_a_connection_that_does_not_read_is_closed() -> None:
+    line = TcpLine("127.0.0.1:0")
+    with ExitStack() as stack:
+        callers = callers_of(line, stack, 2)
+        callers[1].sendall(SYNC + FRAME)
         found: list[tuple[bytes, object]] = []
         while not found:
             found = line.receive()
