@@ -11,10 +11,13 @@ The current monitor measures the sum of |I| over the three H-bridges. The curren
 reversed coil, and it detects an open coil only while that coil is driven. Every reading is compared with the
 prediction of each hypothesis: all coils healthy, or one axis open, shorted, or with one leg of an input stuck
 (`flight.loop.coil_response`). A verdict is given when the hypothesis `healthy` is rejected and all hypotheses
-that explain the later readings name the same axis. If the axes are not driven, a small probe current on one
-axis after another decides which axis is broken. A reversed coil is detected from the angular acceleration,
+that explain the later readings name the same axis. If several axes remain possible, because no axis or
+several axes are driven, each of these axes is driven alone by a small probe current, one after another. The
+other coils carry no current for the 1.6 s of a probe, so that one probe shows whether its coil draws current.
+A reversed coil is detected from the angular acceleration,
 which also distinguishes a wrong current monitor from a broken coil. Averaged over longer bins, the
-acceleration reveals missing torque at currents that are too small for the current monitor.
+acceleration reveals missing torque at currents that are too small for the current monitor. The probe then
+shows whether the coil is open.
 
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
@@ -46,7 +49,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
@@ -302,7 +305,7 @@ class CoilMonitorSettings:
             circuit.
         settle: number of further readings until the averaging window begins after the fault.
         evidence: number of readings that are needed for a verdict.
-        probe_current: amplitude (A) of the square wave that reveals which of the undriven axes is faulty.
+        probe_current: amplitude (A) of the square wave that reveals which of several axes is faulty.
         probe_half_ns: half the period (ns) of the probe's square wave.
         response: settings for judging coils by the body's motion; None if the motion is not used.
         slow: as `response`, but with longer bins, which reveal missing torque at small currents.
@@ -385,7 +388,7 @@ class CoilKnowledge:
 
 
 class Probe:
-    """Applies a probe current to one axis after another: a square wave with zero mean.
+    """Drives one axis after another alone by a square wave with zero mean.
 
     The two halves of the wave last `half_ns` each, with the currents +`current` and -`current` (A).
     """
@@ -411,16 +414,17 @@ class Probe:
         self._running = None
         self._tried.clear()
 
-    def wave(self, now_ns: int) -> FloatArray:
-        """Return the probe's currents (3,), A, which are added to the commands at `now_ns`."""
+    def wave(self, now_ns: int) -> FloatArray | None:
+        """Return the probe's currents (3,), A, at `now_ns`, or None while no wave is running."""
+        if self._running is None:
+            return None
+        axis, since_ns = self._running
+        half = (now_ns - since_ns) // self._half_ns
+        if half >= 2:
+            self._running = None
+            return None
         wave = np.zeros(3)
-        if self._running is not None:
-            axis, since_ns = self._running
-            half = (now_ns - since_ns) // self._half_ns
-            if half < 2:
-                wave[axis] = self._current * (1.0 if half == 0 else -1.0)
-            else:
-                self._running = None
+        wave[axis] = self._current * (1.0 if half == 0 else -1.0)
         return wave
 
 
@@ -432,13 +436,73 @@ _STUCK_EXCESS = 0.3
 _LEAST_SHORT = 0.02
 """Smallest excess current (A) of a shorted coil that the motion of the body can confirm."""
 _READING_NS = 200_000_000
-_MOST_EVIDENCE = 40
+_MOST_EVIDENCE, _MOST_SEGMENTS = 40, 4
 _IN_DOUBT = 5
 """Number of readings after which a verdict may name an axis with an uncertain kind of fault."""
 _LONGEST_REST_NS = 600_000_000_000
 """Longest time (ns) for which a coil whose sign changes repeatedly is kept at zero current."""
 _MOST_CHANGES = 2
 """Largest number of changes of a coil's sign in that time."""
+
+
+class Evidence:
+    """Predictions of the readings since a suspicion, in one segment for each probe.
+
+    A hypothesis must explain the readings of each segment. Otherwise, the few readings of the probe that
+    rejects a hypothesis would be outliers among the readings that do not depend on the hypothesis.
+    """
+
+    def __init__(self, bounds: Bounds) -> None:
+        self._bounds = bounds
+        self._segments: deque[deque[Predicted]] = deque(maxlen=_MOST_SEGMENTS)
+        self.clear()
+
+    def __len__(self) -> int:
+        """Return the number of predictions."""
+        return sum(len(segment) for segment in self._segments)
+
+    def clear(self) -> None:
+        """Discard all predictions."""
+        self._segments.clear()
+        self.begin_segment()
+
+    def begin_segment(self) -> None:
+        """Begin a new segment for the readings from now on."""
+        self._segments.append(deque(maxlen=_MOST_EVIDENCE))
+
+    def add(self, predictions: Sequence[Predicted]) -> None:
+        """Append the predictions of a reading to the newest segment."""
+        self._segments[-1].extend(predictions)
+
+    def readings(self) -> list[Predicted]:
+        """Return all predictions in order of time."""
+        return [one for segment in self._segments for one in segment]
+
+    def possible_faults(self, known: Mapping[int, CoilFault]) -> list[tuple[int, CoilFault]]:
+        """Return axes and faults that explain the readings, together with the known faults."""
+        segments = [segment for segment in self._segments if segment]
+        return [
+            (axis, fault)
+            for axis in range(3)
+            if axis not in known
+            for fault in ELECTRICAL
+            if all(fits(segment, self._bounds, known, axis, fault) for segment in segments)
+        ]
+
+    def is_normal_again(
+        self, known: Mapping[int, CoilFault], possible: Sequence[tuple[int, CoilFault]]
+    ) -> bool:
+        """Return whether the newest readings agree with healthy coils.
+
+        The newest readings must also reject the `possible` faults, unless all coils were commanded to zero.
+        Coils at zero show no fault, and their currents are known.
+        """
+        newest = self.readings()[-8:]
+        if not fits(newest, self._bounds, known):
+            return False
+        if not any(one.mean[:, 0].any() for one in newest):
+            return True
+        return not any(fits(newest, self._bounds, known, axis, fault) for axis, fault in possible)
 
 
 class CoilCorrection:
@@ -534,7 +598,7 @@ class CoilMonitor:
         self._judge_ns = 0  # time (ns) after which a verdict may leave the kind of fault open
         self._sound_ns = 0  # time (ns) at which a driven coil last drew the expected current
         self._unmixed_ns = 0  # time (ns) since which the circuit, as averaged in a reading, has not changed
-        self._evidence: deque[Predicted] = deque(maxlen=_MOST_EVIDENCE)
+        self._evidence = Evidence(self._bounds)
         self._probe = Probe(settings.probe_current, settings.probe_half_ns)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
@@ -737,13 +801,13 @@ class CoilMonitor:
         if self._suspected_ns is None:
             self._check_healthy(predictions, reading)
         elif reading.time_ns - self._suspected_ns > self._settle_ns:
-            self._evidence.extend(predictions)
+            self._evidence.add(predictions)
             self._judge(reading.time_ns)
 
     @property
-    def probe(self) -> FloatArray:
-        """Currents (3,), A, to add to the commands now: the probe's square wave, or zero."""
-        return self._probe.wave(self._commands.newest_ns) if self._commands else np.zeros(3)
+    def probe(self) -> FloatArray | None:
+        """Currents (3,), A, on the wire that replace all commands during a probe; None without a probe."""
+        return self._probe.wave(self._commands.newest_ns) if self._commands else None
 
     @property
     def monitor_doubted(self) -> str:
@@ -823,19 +887,13 @@ class CoilMonitor:
 
     def _judge(self, now_ns: int) -> None:
         """Give a verdict if all evidence names one axis; drop the suspicion if readings are normal again."""
-        evidence = tuple(self._evidence)
+        evidence = self._evidence
         if len(evidence) < self._settings.evidence:
             return
-        if fits(evidence[-8:], self._bounds, self._known):
+        left = evidence.possible_faults(self._known)
+        if evidence.is_normal_again(self._known, left):
             self._reset()
             return
-        sound = [axis for axis in range(3) if axis not in self._verdicts]
-        left = [
-            (axis, fault)
-            for axis in sound
-            for fault in ELECTRICAL
-            if fits(evidence, self._bounds, self._known, axis, fault)
-        ]
         axes = {axis for axis, _ in left}
         waited = now_ns >= self._judge_ns
         if len(axes) == 1 and (len(left) == 1 or waited):
@@ -845,7 +903,7 @@ class CoilMonitor:
             self._look_further(axes, now_ns)
 
     def _conclude(self, axis: int, fault: CoilFault, now_ns: int) -> None:
-        excess = max(one.current - float(one.mean[:, 0].sum()) for one in self._evidence)
+        excess = max(one.current - float(one.mean[:, 0].sum()) for one in self._evidence.readings())
         if fault is CoilFault.SHORTED and excess < _LEAST_SHORT:
             self._reset()  # a small excess may be an error of the current monitor
             return
@@ -872,6 +930,7 @@ class CoilMonitor:
         monitor.
         """
         ends_ns = self._probe.begin(axes, now_ns)
+        self._evidence.begin_segment()
         if ends_ns is None:
             self._evidence.clear()
             self._judge_ns = now_ns + _IN_DOUBT * _READING_NS

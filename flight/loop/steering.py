@@ -182,7 +182,10 @@ class CoilDrive:
                     usable.astype(float),
                     settings.free_axis,
                 ).currents
-        wire = np.zeros(3) if watch.at_rest else watch.correction.wire(currents) + watch.probe
+        probe = watch.probe
+        wire = watch.correction.wire(currents) if probe is None else probe
+        if watch.at_rest:
+            wire = np.zeros(3)
         self.command = watch.correction.effective(wire)
         self._coils.command(wire)
 

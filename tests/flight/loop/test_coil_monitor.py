@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings, StuckLeg
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings, Evidence, StuckLeg
 from flight.loop.coil_response import (
     MEAN,
     NEWEST,
     PLACE,
     Bounds,
     CoilFault,
+    Predicted,
     Supplied,
     fits,
     predict,
@@ -50,6 +51,63 @@ def test_a_broken_axis_is_found_and_named(fault: str, names: set[str], within: f
     assert name in names
     assert FAULT_AT < when < FAULT_AT + within
     assert not seen.watch.available["xyz".index(axis)]
+
+
+def full(time: float, _: ImuReading) -> FloatArray:
+    """Return currents of all three coils at their limit, as in a fast tumble, with a change of sign."""
+    return np.array([FULL, FULL, -FULL if time < 4.0 else FULL])
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_open_coil_of_three_that_are_all_driven_fully_is_found_by_the_probe(axis: int) -> None:
+    seen = observe(full, FAULT_AT + 8.0, [f"coil-{'xyz'[axis]}: open @ {FAULT_AT}"], monitor_only=True)
+    ((when, found, name),) = seen.found
+    assert found == "xyz"[axis]
+    assert name in {"OPEN", "UNCERTAIN"}
+    assert FAULT_AT < when < FAULT_AT + 7.5
+    driven = np.count_nonzero(np.abs(seen.carried[(seen.times > FAULT_AT) & (seen.times < when)]), axis=1)
+    assert (driven == 1).any() or axis == 0, "a healthy coil was probed alone before the open coil"
+
+
+def test_after_a_fault_that_ends_all_coils_are_used_and_not_suspected() -> None:
+    seen = observe(full, 16.0, [f"coil-z: open @ {FAULT_AT} for 1.5"], monitor_only=True)
+    assert seen.found == []
+    assert seen.suspicious > 0
+    assert seen.watch.suspicion == ""
+    assert seen.watch.probe is None
+
+
+def _alone(axis: int, current: float) -> Predicted:
+    """Return a sample of the supply current (A) while one axis alone is commanded 40 mA."""
+    commands = np.zeros((12, 3))
+    commands[:, axis] = 0.04
+    return predict(current, commands, BOUNDS, NEWEST)
+
+
+def test_a_probe_of_few_readings_rejects_a_fault_that_explains_all_earlier_readings() -> None:
+    evidence = Evidence(BOUNDS)
+    two_of_three = predict(2 * FULL, np.full((12, 3), FULL), BOUNDS, NEWEST)
+    evidence.add([two_of_three] * 40)
+    assert [axis for axis, fault in evidence.possible_faults({}) if fault is CoilFault.OPEN] == [0, 1, 2]
+    evidence.begin_segment()
+    evidence.add([_alone(0, 0.04)] * 2)
+    assert [axis for axis, fault in evidence.possible_faults({}) if fault is CoilFault.OPEN] == [1, 2]
+    assert len(evidence) == 42
+
+
+def test_normal_readings_of_another_coil_do_not_end_a_suspicion() -> None:
+    """While coil x is probed, an open coil y draws as little as a healthy coil y."""
+    evidence = Evidence(BOUNDS)
+    evidence.add([predict(2 * FULL, np.full((12, 3), FULL), BOUNDS, NEWEST)] * 4)
+    evidence.begin_segment()
+    evidence.add([_alone(0, 0.04)] * 8)
+    left = evidence.possible_faults({})
+    assert (1, CoilFault.OPEN) in left
+    assert not evidence.is_normal_again({}, left)
+    evidence.add([predict(3 * FULL, np.full((12, 3), FULL), BOUNDS, NEWEST)] * 8)
+    assert evidence.is_normal_again({}, left)
+    evidence.add([predict(0.0, np.zeros((12, 3)), BOUNDS, NEWEST)] * 8)
+    assert evidence.is_normal_again({}, left), "the currents of coils at zero are known"
 
 
 def test_a_reversed_coil_on_the_thread_is_used_with_its_sign_changed() -> None:

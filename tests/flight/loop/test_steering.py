@@ -35,7 +35,7 @@ def _drive(resting: list[bool]) -> tuple[CoilDrive, Coils, SimpleNamespace]:
     watch = SimpleNamespace(
         resting=np.array(resting),
         at_rest=False,
-        probe=np.zeros(3),
+        probe=None,
         suspicion="",
         tumble_rate=0.0175,
         correction=CoilCorrection(),
@@ -67,6 +67,18 @@ def test_coils_that_do_not_rest_get_what_is_asked() -> None:
     drive, coils, _ = _drive([False, False, False])
     drive.send(np.array([0.02, 0.03, -0.01]), lambda: FIELD)
     assert coils.currents.tolist() == [0.02, 0.03, -0.01]
+
+
+def test_a_probe_replaces_the_commands_of_all_coils_and_the_filter_gets_it() -> None:
+    drive, coils, watch = _drive([False, False, False])
+    watch.correction.reverse(1, 0, in_tumble=True)
+    watch.probe = np.array([0.0, 0.04, 0.0])
+    drive.send(np.array([0.02, 0.03, -0.01]), lambda: FIELD)
+    assert coils.currents.tolist() == [0.0, 0.04, 0.0]
+    assert drive.command.tolist() == [0.0, -0.04, 0.0]
+    watch.at_rest = True
+    drive.send(np.array([0.02, 0.03, -0.01]), lambda: FIELD)
+    assert not coils.currents.any()
 
 
 def test_a_loaded_parameter_changes_the_rate_below_which_coils_are_reviewed() -> None:

@@ -126,7 +126,8 @@ def observe(
         if newest is not None:
             wanted = command(time, newest)
             usable = watch.available & (not watch.at_rest)
-            coils.command(np.where(usable, watch.correction.wire(wanted), 0.0) + watch.probe)
+            own = np.where(usable, watch.correction.wire(wanted), 0.0)
+            coils.command(own if watch.probe is None else watch.probe)
         coils.brake(watch.braked)
     seen.times, seen.carried = (np.array(column) for column in zip(*carried, strict=True))
     assert isinstance(lock.hardware.world, Testbed)
