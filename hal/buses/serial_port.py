@@ -16,7 +16,7 @@ from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock
 
 _READ_TIMEOUT_S = 0.1  # longest delay until the thread notices that the port closes
-_WRITE_TIMEOUT_S = 0.5
+_WRITE_TIMEOUT_S = 0.005  # a fifth of a control cycle; the kernel's buffer takes a command at once
 _PENDING_LIMIT = 1 << 16
 _REOPEN_S = 0.25
 
@@ -35,15 +35,24 @@ class PySerialPort:
         lost_bytes: number of received bytes that were dropped because `receive` was not called for too long.
     """
 
-    def __init__(self, device: str, baud_rate: int, clock: Clock, patient: bool = False) -> None:
+    def __init__(
+        self,
+        device: str,
+        baud_rate: int,
+        clock: Clock,
+        patient: bool = False,
+        write_timeout: float = _WRITE_TIMEOUT_S,
+    ) -> None:
         """Open the port.
 
         Raises NotResponding if the port cannot be opened. If `patient` is true, the port counts as lost
-        instead and is opened later.
+        instead and is opened later. A call of `send` takes at most `write_timeout`, s; the default is short
+        enough for the thread that drives the coils.
         """
         self.baud_rate = baud_rate
         self.lost_bytes = 0
         self._device = device
+        self._write_timeout = write_timeout
         self._clock = clock
         self._pending: deque[tuple[int, bytes]] = deque()
         self._pending_bytes = 0
@@ -111,7 +120,7 @@ class PySerialPort:
             self._device,
             self.baud_rate,
             timeout=_READ_TIMEOUT_S,
-            write_timeout=_WRITE_TIMEOUT_S,
+            write_timeout=self._write_timeout,
             exclusive=True,
         )
 

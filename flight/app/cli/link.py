@@ -28,6 +28,7 @@ from hal.buses.serial_port import PySerialPort
 from knightcube.errors import FlightError, UsageError
 
 _NICE = 10
+_WRITE_TIMEOUT_S = 0.5  # longest wait for a radio that takes telemetry more slowly than configured
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +148,8 @@ def _open_lines(section: Link, clock: SystemClock, stack: ExitStack) -> list[Lin
     if section.tcp is not None:
         add(TcpLine(section.tcp, peers))
     if section.serial is not None:
-        port = PySerialPort(section.serial.device, section.serial.baud, clock, patient=True)
+        device, baud = section.serial.device, section.serial.baud
+        port = PySerialPort(device, baud, clock, patient=True, write_timeout=_WRITE_TIMEOUT_S)
         add(SerialLine(section.serial.device, port))
     return lines
 

@@ -83,6 +83,7 @@ class SegmentStore:
 
     Attributes:
         packets: number of completely written packets.
+        doubtful: number of written packets that may be lost because a sync to disk failed.
         dropped: number of segment files deleted to stay within the budget.
     """
 
@@ -103,7 +104,9 @@ class SegmentStore:
         self._finished: deque[tuple[Path, int]] = deque()  # paths and sizes (bytes), oldest first
         self._number = 0
         self.packets = 0
+        self.doubtful = 0
         self.dropped = 0
+        self._unsynced = 0  # written packets since the last sync
         self._open_next()
 
     def append(self, packets: Sequence[bytes]) -> None:
@@ -132,8 +135,17 @@ class SegmentStore:
         return False
 
     def sync(self) -> None:
-        """Sync the written packets to disk. Raises OSError."""
-        os.fsync(self._file.fileno())
+        """Sync the written packets to disk.
+
+        Raises OSError and counts the packets since the last sync as doubtful, because after a failed sync
+        Linux may drop their data without reporting another error.
+        """
+        unsynced, self._unsynced = self._unsynced, 0
+        try:
+            os.fsync(self._file.fileno())
+        except OSError:
+            self.doubtful += unsynced
+            raise
 
     def close(self) -> None:
         """Sync and close the current segment file. Raises OSError."""
@@ -170,6 +182,7 @@ class SegmentStore:
             raise
         self._size += len(data)
         self.packets += len(chunk)
+        self._unsynced += len(chunk)
 
     def _make_room(self, coming: int) -> None:
         """Delete finished segment files, oldest first, until `coming` further bytes fit into the budget."""
@@ -188,6 +201,7 @@ class SegmentStore:
                 break
             whole += len(packet)
             self.packets += 1
+            self._unsynced += 1
         try:
             self._file.truncate(self._size + whole)
             self._size += whole
@@ -389,8 +403,9 @@ class FlightLog:
 
     @property
     def lost(self) -> int:
-        """Number of packets passed to `write` that were lost."""
-        return self._refused + self._unwritten
+        """Number of packets passed to `write` that were lost, or may be lost because a sync failed."""
+        doubtful = self._store.doubtful if self._store is not None else 0
+        return self._refused + self._unwritten + doubtful
 
     @property
     def dropped_segments(self) -> int:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flight.schema.sections import CONTROL_RATE_HZ
 from hal.buses.clock import SystemClock
 from hal.buses.serial_port import PySerialPort
 from hal.drivers.vn100.driver import Vn100
@@ -115,6 +116,19 @@ def test_a_patient_port_is_gone_until_it_is_there(tmp_path: Path) -> None:
     assert words == b"first words"
     port.close()
     os.close(near)
+    os.close(far)
+
+
+def test_a_port_that_takes_no_bytes_costs_less_than_a_control_cycle_and_is_not_responding() -> None:
+    near, far = os.openpty()
+    port = PySerialPort(os.ttyname(far), 115200, SystemClock())
+    timeout = port._serial.write_timeout
+    assert timeout is not None
+    assert timeout < 1.0 / CONTROL_RATE_HZ
+    with pytest.raises(NotResponding, match="writing failed"):
+        port.send(bytes(1 << 20))  # nobody reads the other end
+    os.close(near)
+    port.close()
     os.close(far)
 
 

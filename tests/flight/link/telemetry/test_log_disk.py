@@ -174,6 +174,26 @@ def test_the_disk_is_synced_about_once_a_second_or_only_at_the_end(tmp_path: Pat
         assert disk.syncs == expected + 1
 
 
+def test_packets_since_the_last_sync_count_as_lost_when_a_sync_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = ManualClock(0)
+    log = FlightLog(tmp_path, clock=clock, sync_period_ns=SECOND)
+    fsync = os.fsync
+    for second, lost in enumerate((0, 10, 20, 20)):
+        monkeypatch.setattr("flight.link.telemetry.log.os.fsync", fsync if second in (0, 3) else failing_sync)
+        for i, packet in enumerate(timing_packets(10)):
+            log.write(packet)
+            clock.sleep_until_ns(second * SECOND + (i + 1) * SECOND // 10)
+        assert log.lost == lost
+    log.close()
+    assert len(content(tmp_path)) == 40 * len(timing_packets(1)[0])
+
+
+def failing_sync(file: int) -> None:
+    raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
 def test_a_hung_disk_blocks_neither_write_nor_close(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flight.link.telemetry.log._HUNG_DISK_S", 0.1)
     release = threading.Event()
