@@ -213,9 +213,9 @@ def learned_description(run: Run) -> list[Object]:
     rows = []
     for name in ("inertia", "coils", "gyro", "field", "camera"):
         found, target = last[name].astype(float), real[name].astype(float)
-        sigma, first = last[f"{name}_sigma"].astype(float), packets[0][name].astype(float)
-        if name == "inertia":
-            sigma = sigma / found[:3].sum()
+        ratio = "_ratio" if name == "inertia" else ""
+        sigma, first = last[f"{name}{ratio}_sigma"].astype(float), packets[0][name].astype(float)
+        if ratio:
             found, target, first = (one / one[:3].sum() for one in (found, target, first))
         errors = {"first_error": _rms(first - target), "error": _rms(found - target), "sigma": _rms(sigma)}
         rows.append({"name": name, **errors})

@@ -531,6 +531,22 @@ DESCRIPTION = Packet(
             "standard deviations of the attitude of the star camera about the body axes",
             3,
         ),
+        Field("inertia_ratio_sigma", "f4", "-", _ONE_SIGMA + "inertia divided by its trace", 6),
+        Field(
+            "coils_ratio_sigma",
+            "f4",
+            "-",
+            _ONE_SIGMA + "coils divided by the ratio of the traces of the estimated and configured inertia",
+            9,
+        ),
+        Field("gyro_bias", "f8", "rad/s", "gyro bias, body axes", 3),
+        Field("gyro_bias_sigma", "f4", "rad/s", _ONE_SIGMA + "gyro_bias", 3),
+        Field("field_bias", "f8", "T", "magnetometer bias, body axes", 3),
+        Field("field_bias_sigma", "f4", "T", _ONE_SIGMA + "field_bias", 3),
+        Field("dipole", "f8", "A m^2", "residual dipole in shadow, body axes", 3),
+        Field("dipole_sigma", "f4", "A m^2", _ONE_SIGMA + "dipole", 3),
+        Field("sunlit_dipole", "f8", "A m^2", "increase of the residual dipole in sunlight, body axes", 3),
+        Field("sunlit_dipole_sigma", "f4", "A m^2", _ONE_SIGMA + "sunlit_dipole", 3),
     ),
 )
 

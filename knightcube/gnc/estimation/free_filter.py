@@ -291,6 +291,7 @@ CURRENTS = 1e-7
 """Error (T per axis) of the field model due to auroral currents, which must not cause the rejection of a
 measurement."""
 _EYE: FloatArray = np.eye(3)
+_BODY = slice(INERTIA.start, COILS.stop)
 _FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
 
 
@@ -455,9 +456,11 @@ class FreeFilter:
         """Return the estimated description of body and sensors, and its standard deviations.
 
         `inertia` (6,) kg m^2 holds xx, yy, zz, yz, zx and xy. `coils`, `gyro` and `field` (9,) are matrices,
-        row by row. `camera` (3,) rad is the rotation vector of the star camera. The standard deviations have
-        the same names with `_sigma`. `camera_attitude_sigma` (3,) rad is that of the attitude of the star
-        camera, which is known more accurately than the attitude of the body.
+        row by row. `camera` (3,) rad is the rotation vector of the star camera, and `dipole` and
+        `sunlit_dipole` (3,) A m^2 are the parts of the residual dipole. The standard deviations have the same
+        names with `_sigma`. `camera_attitude_sigma` (3,) rad is that of the attitude of the star camera,
+        which is known more accurately than the attitude of the body. `inertia_ratio_sigma` and
+        `coils_ratio_sigma` are those of `per_trace`.
         """
         self.motion.correct(self._constants[INERTIA])
         sigma = np.sqrt(self.covariance.diagonal())
@@ -467,11 +470,21 @@ class FreeFilter:
         }
         for name, at in (("coils", COILS), ("gyro", GYRO_MATRIX), ("field", FIELD_MATRIX)):
             found |= {name: _EYE.ravel() + self._constants[at], f"{name}_sigma": sigma[at]}
-        own = np.sqrt(self.camera_covariance.diagonal())
+        for name, at in (
+            ("camera", CAMERA),
+            ("gyro_bias", GYRO),
+            ("field_bias", MAGNET),
+            ("dipole", DIPOLE),
+            ("sunlit_dipole", SUNLIT),
+        ):
+            found |= {name: self._constants[at].copy(), f"{name}_sigma": sigma[at]}
+        rows = per_trace(found["inertia"] / self.motion.trace, found["coils"])
+        variances = (rows @ self.covariance[_BODY, _BODY] @ rows.T).diagonal()
+        ratios = np.sqrt(np.maximum(variances, 0.0))  # rounding makes the variance of a known ratio negative
         return found | {
-            "camera": self._constants[CAMERA].copy(),
-            "camera_sigma": sigma[CAMERA],
-            "camera_attitude_sigma": own,
+            "camera_attitude_sigma": np.sqrt(self.camera_covariance.diagonal()),
+            "inertia_ratio_sigma": ratios[:6],
+            "coils_ratio_sigma": ratios[6:],
         }
 
     def residual_dipole(self, sunlit: float) -> FloatArray:
@@ -661,6 +674,20 @@ class FreeFilter:
 
 _CAMERA_ROWS: FloatArray = np.zeros((3, STATES))
 _CAMERA_ROWS[:, ATTITUDE] = _CAMERA_ROWS[:, CAMERA] = _EYE
+
+
+def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
+    """Return the Jacobian (15, 15) of the inertia and the matrix of the coils, both divided by the trace.
+
+    `inertia` (6,) holds the elements xx, yy, zz, yz, zx and xy, relative to the trace of the assumed inertia,
+    and `coils` (9,) the matrix row by row. The motion of a satellite shows these ratios only, because a body
+    of twice the inertia with coils of twice the dipole moves in the same way.
+    """
+    trace = inertia[:3].sum()
+    rows: FloatArray = np.eye(15) / trace
+    rows[:6, :3] -= inertia[:, None] / trace**2
+    rows[6:, :3] -= coils[:, None] / trace**2
+    return rows
 
 
 def plausible(values: FloatArray, variances: FloatArray) -> BoolArray:

@@ -218,8 +218,8 @@ def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it
         stars=[(10.0, {"accepted": 1})],
         truth=[(t, {"quaternion": UPRIGHT}) for t in (0.5, 10.5, 40.5)],
         description=[
-            (t, {**matrices, **sigmas, "inertia": doubled, "inertia_sigma": [0.02] * 6, "camera": [0.0] * 3,
-                 "camera_sigma": [2e-3] * 3, "camera_attitude_sigma": [1e-4] * 3})
+            (t, {**matrices, **sigmas, "inertia": doubled, "inertia_ratio_sigma": [0.01] * 6,
+                 "camera": [0.0] * 3, "camera_sigma": [2e-3] * 3, "camera_attitude_sigma": [1e-4] * 3})
             for t in (0.5, 10.5, 40.5)
         ],
         true_description=[(0.0, {**matrices, "inertia": inertia, "camera": (-tilt).tolist()})],

@@ -19,6 +19,7 @@ from knightcube.astro.quaternion import (
 from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.free_filter import (
     ATTITUDE,
+    COILS,
     DIPOLE,
     GYRO,
     RATE,
@@ -26,7 +27,9 @@ from knightcube.gnc.estimation.free_filter import (
     FilterEnvironment,
     FreeFilter,
     FreeFilterSettings,
+    per_trace,
 )
+from knightcube.gnc.estimation.free_filter import INERTIA as INERTIA_ERROR
 from tests.knightcube.gnc.estimation.filter_states import NO_ERRORS
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])
@@ -139,3 +142,28 @@ def test_a_new_start_keeps_what_was_learned_of_the_slow_states() -> None:
     assert np.all(found.covariance[RATE, GYRO].diagonal() < 0.0)
     assert np.linalg.eigvalsh(found.covariance)[0] > -1e-18 * STATES
     assert np.linalg.norm(found.rate - w) < 1e-4
+
+
+def test_the_jacobian_of_the_ratios_is_the_derivative_of_the_ratios() -> None:
+    rng = np.random.default_rng(11)
+    whole = np.concatenate([[0.10, 0.42, 0.46, 0.02, -0.01, 0.03], np.eye(3).ravel()])
+    whole += 0.02 * rng.standard_normal(15)
+
+    def ratios(values: FloatArray) -> FloatArray:
+        return np.asarray(values / values[:3].sum())
+
+    step = 1e-6
+    found = [(ratios(whole + step * e) - ratios(whole - step * e)) / (2.0 * step) for e in np.eye(15)]
+    np.testing.assert_allclose(per_trace(whole[:6], whole[6:]), np.transpose(found), atol=1e-8)
+
+
+def test_the_ratios_are_known_better_than_the_inertia_when_only_the_scale_is_uncertain() -> None:
+    found = FreeFilter(INERTIA, FreeFilterSettings())
+    found.covariance[:] = 0.0
+    scale = np.concatenate([INERTIA[np.diag_indices(3)] / np.trace(INERTIA), np.zeros(3), np.eye(3).ravel()])
+    body = slice(INERTIA_ERROR.start, COILS.stop)
+    found.covariance[body, body] = 0.03**2 * np.outer(scale, scale)
+    made = found.description()
+    assert made["inertia_sigma"].max() > 0.02 * 0.0333
+    np.testing.assert_allclose(made["inertia_ratio_sigma"], 0.0, atol=1e-7)
+    np.testing.assert_allclose(made["coils_ratio_sigma"], 0.0, atol=1e-7)
