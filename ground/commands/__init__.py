@@ -17,6 +17,7 @@ COMMANDS = {
     "report": ("report the performance of a run", "runs:configure_report"),
     "export": ("write a run's packets as CSV, Parquet or SQLite", "runs:configure_export"),
     "orbit": ("determine first orbits of the objects that a flight tracked", "runs:configure_orbit"),
+    "new-satellite": ("write the configuration of a satellite of one's own", "new_satellite:configure"),
     "elements": ("make two-line elements of an orbit, or fit them to positions", "elements:configure"),
     "plan": ("plan a single slew", "plan:configure"),
     "identify": ("identify the body's constants from a short flight", "identify:configure"),

@@ -1,0 +1,339 @@
+"""Command `flight new-satellite`, which writes the configuration of a satellite."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from flight.app.cli import PROGRAM
+from flight.app.devices import check_settings, check_simulated_elements
+from flight.app.run import RunRequest
+from flight.schema import reader as configuration
+from ground.commands.elements import elements_of
+from ground.commands.options import write_new
+from ground.commands.satellite_questions import (
+    COIL_EXAMPLE,
+    COIL_QUESTIONS,
+    QUESTIONS,
+    Question,
+    Values,
+    check_values,
+    coil_number,
+)
+from ground.satellite_description import (
+    Derived,
+    Satellite,
+    configuration_text,
+    derived,
+    sun_synchronous_inclination,
+)
+from knightcube.errors import UsageError
+from sim_hal.settings import OrbitSection
+from sim_hal.worlds.orbit import julian_date
+
+_WEAK = 3.0
+"""Ratio of the coils' torque to the worst disturbance torque below which a warning is given."""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight new-satellite` to the parser."""
+    parser.description = (
+        "Write the configuration of a satellite, which `flight check` and `flight run` accept. On a "
+        "terminal, the values that are not given are asked for, and an empty answer takes the value in "
+        "brackets. The inertia is that of a homogeneous cuboid, two-line elements are fitted to the orbit, "
+        "and weights and limits are computed. The file extends the configuration `orbit` and states the "
+        "source of each value."
+    )
+    parser.epilog = (
+        "examples:\n"
+        f"  {PROGRAM} new-satellite\n"
+        f"  {PROGRAM} new-satellite --mass 4 --size 3u --altitude 550 --coil {COIL_EXAMPLE}\n"
+        f"  {PROGRAM} new-satellite --mass 8 --size 6u --inclination 51.6 --out six.yaml \\\n"
+        "    --coil axis=xy,dipole=0.5,current=0.1,resistance=50 \\\n"
+        "    --coil axis=z,turns=200,area=0.02,resistance=33,current=0.12"
+    )
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    for question in QUESTIONS:
+        repeated = question.name == "coil"
+        default = f"default {question.default}" if question.default is not None else "required"
+        parser.add_argument(
+            f"--{question.name}",
+            action="append" if repeated else "store",
+            metavar="KEY=VALUE,..." if repeated else question.name.rpartition("-")[2].upper(),
+            help=f"{question.text} ({default}{'; repeatable' if repeated else ''})",
+        )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default NAME.yaml)")
+    parser.add_argument("--force", action="store_true", help="replace the file if it exists")
+    parser.add_argument("--json", action="store_true", help="print one JSON object, and ask nothing")
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Complete the description, write the configuration and print the computed values."""
+    answers = Answers(options.out, options.force)
+    answers.take_options(options)
+    if missing := answers.missing():
+        if options.json or not sys.stdin.isatty():
+            verb = "is" if len(missing) == 1 else "are"
+            raise UsageError(
+                f"{', '.join(missing)} {verb} missing; on a terminal the command asks for values"
+            )
+        with _interruptible():
+            answers.ask()
+    else:
+        answers.take_defaults()
+    path, satellite = answers.path(), satellite_of(answers.values)
+    date = julian_date(satellite.utc)
+    values, made = derived(satellite, date), elements_of(satellite.orbit, date)
+    text = configuration_text(satellite, values, made, answers.command())
+    _check(text, path)
+    if options.force:
+        _replace(path, text)
+    else:
+        write_new(path, text)
+    facts = {
+        "file": str(path),
+        "command": answers.command(),
+        "elements": list(made.lines),
+        "inclination_deg": satellite.orbit.inclination_deg,
+        "derived": asdict(values),
+        "warnings": warnings_of(values),
+    }
+    sys.stdout.write(json.dumps(facts) + "\n" if options.json else _text(satellite, values, path))
+    return 0
+
+
+class Answers:
+    """The texts of options and answers, and their values."""
+
+    def __init__(self, out: Path | None, force: bool) -> None:
+        """`out` is the file to write, if it is given; `force` states whether it may be replaced."""
+        self._out, self._force = out, force
+        self._texts: dict[str, list[str]] = {}
+        self.values: dict[str, Any] = {}
+
+    def take_options(self, options: argparse.Namespace) -> None:
+        """Take the given options. Raises UsageError for an impossible value, and if the file exists."""
+        for question in QUESTIONS:
+            given = getattr(options, question.name.replace("-", "_"))
+            if given is not None:
+                self._take(question, given if isinstance(given, list) else [given])
+        if self._out is not None or "name" in self._texts:
+            self.path()
+
+    def missing(self) -> list[str]:
+        """Return the required options that are not given."""
+        return [f"--{one.name}" for one in QUESTIONS if one.default is None and one.name not in self.values]
+
+    def take_defaults(self) -> None:
+        """Take the default of each value that is not given. Raises UsageError for a contradiction."""
+        for question in self._open():
+            if question.default is not None:
+                self._take(question, [question.default])
+
+    def path(self) -> Path:
+        """Return the file to write. Raises UsageError if it exists, unless it may be replaced."""
+        path = self._out or Path(f"{self.values.get('name', QUESTIONS[0].default)}.yaml")
+        if not self._force and os.path.lexists(path):
+            raise UsageError(f"{path}: this file exists: give another --out, or --force to replace it")
+        return path
+
+    def command(self) -> str:
+        """Return the command with the values that are known so far."""
+        words = [PROGRAM, "new-satellite"]
+        for name, texts in self._texts.items():
+            for text in texts:
+                words += [f"--{name}", shlex.quote(text)]
+        return " ".join([*words, *(["--out", shlex.quote(str(self._out))] if self._out is not None else [])])
+
+    def ask(self) -> None:
+        """Ask for the values that are not given.
+
+        If the questions end early, the command with the answers so far is shown. Raises KeyboardInterrupt
+        after Ctrl-C, and UsageError at the end of the input.
+        """
+        try:
+            for question in self._open():
+                if question.name == "coil":
+                    self._ask_coils(question)
+                else:
+                    self._ask(question.text, question.default, self._taker(question))
+        except KeyboardInterrupt:
+            sys.stderr.write(f"\nflight: nothing was written; to continue:\n  {self.command()}\n")
+            raise
+        except EOFError:
+            raise UsageError(f"the input has ended; to continue: {self.command()}") from None
+
+    def _open(self) -> Iterator[Question]:
+        """Yield the questions without a value, in order."""
+        yield from (question for question in QUESTIONS if question.name not in self.values)
+
+    def _taker(self, question: Question) -> Callable[[str], None]:
+        return lambda text: self._take(question, [text])
+
+    def _ask_coils(self, question: Question) -> None:
+        """Ask for three equal coils on the body axes."""
+        texts = {"axis": "xyz"}
+
+        def taker(key: str) -> Callable[[str], None]:
+            def take(text: str) -> None:
+                try:
+                    coil_number(key, text)
+                except ValueError as error:
+                    raise UsageError(str(error)) from error
+                texts[key] = text
+
+            return take
+
+        while question.name not in self.values:
+            for key, text in COIL_QUESTIONS:
+                self._ask(text, None, taker(key))
+            try:
+                self._take(question, [",".join(f"{key}={text}" for key, text in texts.items())])
+            except UsageError as error:
+                sys.stderr.write(f"  {error}\n")
+
+    def _ask(self, text: str, default: str | None, take: Callable[[str], None]) -> None:
+        """Ask until an answer is accepted. Raises EOFError at the end of the input."""
+        while True:
+            sys.stderr.write(f"{text}{'' if default is None else f' [{default}]'}: ")
+            sys.stderr.flush()
+            line = sys.stdin.readline()
+            if not line:
+                raise EOFError
+            if not (answer := line.strip() or default):
+                continue
+            try:
+                return take(answer)
+            except UsageError as error:
+                sys.stderr.write(f"  {error}\n")
+
+    def _take(self, question: Question, texts: list[str]) -> None:
+        """Take the texts of a value. Raises UsageError if it is impossible."""
+        name = question.name
+        for text in texts:
+            try:
+                value = question.read(text)
+                if name == "coil":
+                    value = [*self.values.get(name, ()), *value]
+                self.values[name] = value
+            except ValueError as error:
+                self.values.pop(name, None)
+                raise UsageError(f"--{name} {text}: {error}") from error
+        try:
+            check_values(name, self.values)
+        except UsageError as error:
+            del self.values[name]
+            raise UsageError(f"--{name} {' '.join(texts)}: {error}") from error
+        self._texts[name] = texts
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Let Ctrl-C raise KeyboardInterrupt; elsewhere it ends a command at once."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def satellite_of(values: Values) -> Satellite:
+    """Return the satellite that complete values describe. Raises UsageError."""
+    altitude, eccentricity = 1e3 * values["altitude"], values["eccentricity"]
+    inclination = values["inclination"]
+    if inclination is None:
+        inclination = sun_synchronous_inclination(altitude, eccentricity)
+    orbit = {
+        "altitude": altitude,
+        "eccentricity": eccentricity,
+        "inclination_deg": inclination,
+        "local_time": values["local-time"],
+    }
+    coils = tuple(values["coil"])
+    try:
+        section = msgspec.convert(orbit, OrbitSection)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"this orbit is not supported: {error}") from error
+    return Satellite(
+        name=values["name"],
+        mass=values["mass"],
+        size=values["size"],
+        orbit=section,
+        utc=values["utc"],
+        coils=coils,
+        supply_voltage=max(coil.resistance * coil.current_limit for coil in coils),
+        field_of_view_deg=values["star-camera"],
+        wide_cameras=values["horizon-cameras"],
+        release_deg=values["release"],
+    )
+
+
+def _check(text: str, path: Path) -> None:
+    """Check a configuration text as `flight check` does, without flying it. Raises ConfigError."""
+    config = configuration.parse(text, str(path))
+    check_settings(config)
+    check_simulated_elements(RunRequest(path, Path()), text, config)
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a file, which replaces an existing file only when it is complete. Raises UsageError."""
+    try:
+        with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=path.parent, delete=False) as file:
+            file.write(text)
+        os.chmod(file.name, 0o644)
+        os.replace(file.name, path)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def warnings_of(values: Derived) -> list[str]:
+    """Return what is questionable about a satellite."""
+    found = []
+    ratio = values.coil_torque / values.disturbance
+    if ratio < _WEAK:
+        found.append(
+            f"the coils' torque is {ratio:.2g} times the worst torque of air and sunlight, so pointing may "
+            "fail: use stronger coils or a higher orbit"
+        )
+    if values.momentum_time > values.period:
+        hours = values.momentum_time / 3600.0
+        found.append(f"detumbling takes more than {hours:.1f} h: use stronger coils, or a smaller --release")
+    return found
+
+
+def _text(satellite: Satellite, values: Derived, path: Path) -> str:
+    moments = ", ".join(f"{moment:.3g}" for moment in values.inertia)
+    orbit, config = satellite.orbit, shlex.quote(str(path))
+    ratio = values.coil_torque / values.disturbance
+    lines = [
+        ("written", str(path)),
+        ("inertia", f"{moments} kg m^2, of a homogeneous cuboid"),
+        (
+            "orbit",
+            f"{1e-3 * orbit.altitude:g} km, {orbit.inclination_deg:.2f} deg, {values.period / 60.0:.1f} min",
+        ),
+        (
+            "coils",
+            f"{values.dipole:.3g} A m^2; {values.coil_torque:.2g} N m, {ratio:.3g} times the worst torque of "
+            "air and sunlight",
+        ),
+        ("detumbling", f"from {satellite.release_deg:g} deg/s within about {values.slow_within:g} s"),
+        *(("warning", text) for text in warnings_of(values)),
+        ("next", f"{PROGRAM} check {config}"),
+        ("", f"{PROGRAM} run {config} --out runs/{satellite.name}"),
+        ("", f"{PROGRAM} report runs/{satellite.name}"),
+    ]
+    return "".join(f"{name + ':' if name else '':12}{text}\n" for name, text in lines)

@@ -1,0 +1,261 @@
+"""The questions of `flight new-satellite`, the values of their answers, and checks of these values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ground.satellite_description import Coil, largest_dipole, sun_synchronous_inclination
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.errors import UsageError
+from sim_hal.worlds.orbit import julian_date
+
+Vector = tuple[float, float, float]
+Values = Mapping[str, Any]
+"""Values of the answered questions by the name of the option."""
+
+COIL_EXAMPLE = "axis=xyz,dipole=0.2,current=0.1,resistance=40"
+_FORMS = {
+    "1u": (0.1, 0.1, 0.1135),
+    "2u": (0.227, 0.1, 0.1),
+    "3u": (0.3405, 0.1, 0.1),
+    "6u": (0.366, 0.2263, 0.1),
+    "12u": (0.366, 0.2263, 0.2263),
+}
+"""Sizes of CubeSats, m [CubeSat Design Specification]; all but the 1U have their longest side along x."""
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_DENSITIES = (20.0, 20_000.0)
+"""Range of the mean density, kg/m^3: from an empty box of thin sheet to solid tungsten."""
+_LOWEST_PERIGEE = 180.0
+"""Lowest perigee, km above the equatorial radius, at which a satellite stays in orbit for some days."""
+_HIGHEST_VOLTAGE = 36.0
+"""Largest voltage across a coil, V."""
+_COIL_RANGES = {
+    "dipole": (1e-3, 100.0, "A m^2"),
+    "turns": (1.0, 1e5, ""),
+    "area": (1e-6, 10.0, "m^2"),
+    "current": (1e-3, 1.0, "A"),
+    "resistance": (0.1, 10_000.0, "ohm"),
+}
+"""Minimum, maximum and unit of each number that describes a coil."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A value of the description, which is an option of the command and a question on a terminal.
+
+    Attributes:
+        name: name of the option without dashes.
+        text: the question, with the unit.
+        read: function that returns the value of a text; it raises ValueError with the permitted values.
+        default: text of the default value; None for a value that must be given.
+    """
+
+    name: str
+    text: str
+    read: Callable[[str], Any]
+    default: str | None = None
+
+
+def number(low: float, high: float, unit: str) -> Callable[[str], float]:
+    """Return a function that reads a number within a range, and raises ValueError with the range."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise ValueError(f"give a number from {low:g} to {high:g} {unit}".rstrip())
+        return value
+
+    return read
+
+
+def coil_number(key: str, text: str) -> float:
+    """Return a number that describes a coil. Raises ValueError with the range."""
+    try:
+        return number(*_COIL_RANGES[key])(text)
+    except ValueError as error:
+        raise ValueError(f"{key}={text}: {error}") from None
+
+
+def read_coils(text: str) -> list[Coil]:
+    """Return the equal coils that a text such as `axis=xy,dipole=0.2,current=0.1,resistance=40` describes.
+
+    Raises ValueError with the problem and the cure.
+    """
+    given: dict[str, str] = {}
+    for part in text.split(","):
+        key, equals, value = (word.strip() for word in part.partition("="))
+        if not equals or key in given or key not in {"axis", *_COIL_RANGES}:
+            problem = "is given twice" if key in given else "is unknown"
+            raise ValueError(f"{part.strip()!r} {problem}: give coils such as {COIL_EXAMPLE}")
+        given[key] = value
+    for key in ("axis", "current", "resistance"):
+        if key not in given:
+            raise ValueError(f"`{key}` is missing: give coils such as {COIL_EXAMPLE}")
+    current, resistance = (
+        coil_number("current", given["current"]),
+        coil_number("resistance", given["resistance"]),
+    )
+    kinds = {key for key in ("dipole", "turns", "area") if key in given}
+    if kinds == {"dipole"}:
+        per_ampere = coil_number("dipole", given["dipole"]) / current
+    elif kinds == {"turns", "area"}:
+        per_ampere = coil_number("turns", given["turns"]) * coil_number("area", given["area"])
+    else:
+        raise ValueError("give either `dipole` (A m^2 at the current limit), or `turns` and `area` (m^2)")
+    return [Coil(axis, per_ampere, resistance, current) for axis in _axes(given["axis"])]
+
+
+def _axes(text: str) -> list[Vector]:
+    """Return the unit vectors of axes: letters such as `xyz`, or three components such as `0/0.6/0.8`."""
+    if text and set(text) <= set(_AXES) and len(set(text)) == len(text):
+        return [_AXES[letter] for letter in text]
+    try:
+        x, y, z = (float(part) for part in text.split("/"))
+    except ValueError:
+        x = y = z = math.nan
+    length = math.hypot(x, y, z)
+    if not 0.0 < length < math.inf:
+        raise ValueError(f"axis={text}: give body axes such as x or xyz, or components such as 0/0.6/0.8")
+    return [(x / length, y / length, z / length)]
+
+
+def _read_name(text: str) -> str:
+    if not (text.isascii() and text.isidentifier() and len(text) <= 64):
+        raise ValueError("give letters, digits and underscores, beginning with a letter")
+    return text
+
+
+def _read_size(text: str) -> Vector:
+    """Return the size of a box such as 0.3x0.1x0.1, or of the CubeSat of a name such as 3u."""
+    if text.lower() in _FORMS:
+        return _FORMS[text.lower()]
+    parts = text.lower().split("x")
+    if len(parts) != 3:
+        raise ValueError(f"give three sides in m, such as 0.3x0.1x0.1, or one of {', '.join(_FORMS)}")
+    side = number(0.02, 3.0, "m for each side")
+    return side(parts[0]), side(parts[1]), side(parts[2])
+
+
+def _read_inclination(text: str) -> float | None:
+    """Return an inclination in deg, or None for a Sun-synchronous orbit."""
+    return None if text.lower() == "sso" else number(0.0, 180.0, "deg, or sso")(text)
+
+
+def _read_utc(text: str) -> str:
+    whole = text if text.endswith("Z") else f"{text}Z"
+    try:
+        julian_date(whole)
+    except ValueError:
+        raise ValueError("give a time such as 2026-03-20T12:00:00") from None
+    return whole
+
+
+def _read_camera(text: str) -> float | None:
+    """Return the field of view of the star camera in deg, or None without a star camera."""
+    return None if text.lower() == "none" else number(6.0, 40.0, "deg, or none")(text)
+
+
+def _read_yes(text: str) -> bool:
+    if text.lower() not in {"yes", "no"}:
+        raise ValueError("give yes or no")
+    return text.lower() == "yes"
+
+
+QUESTIONS = (
+    Question("name", "name of the satellite", _read_name, "my_satellite"),
+    Question("mass", "mass, kg", number(0.1, 500.0, "kg")),
+    Question(
+        "size",
+        "sides along body x, y and z, m, such as 0.3x0.1x0.1; or 1u, 2u, 3u, 6u, 12u, longest along x",
+        _read_size,
+    ),
+    Question(
+        "altitude",
+        "altitude of the orbit (semi-major axis minus 6378 km), km",
+        number(200.0, 2000.0, "km"),
+        "500",
+    ),
+    Question("eccentricity", "eccentricity of the orbit", number(0.0, 0.1, ""), "0.001"),
+    Question("inclination", "inclination, deg, or sso for Sun-synchronous", _read_inclination, "sso"),
+    Question(
+        "local-time", "mean local time of the ascending node at the begin, h", number(0.0, 24.0, "h"), "10.5"
+    ),
+    Question("utc", "begin of the flight, UTC", _read_utc, "2026-03-20T12:00:00"),
+    Question(
+        "coil",
+        "equal coils by axis, dipole (A m^2) at the current limit (A), and resistance (ohm), such as "
+        f"{COIL_EXAMPLE}; an air coil also by turns and area (m^2) instead of the dipole",
+        read_coils,
+    ),
+    Question("star-camera", "field of view of the star camera, deg, or none", _read_camera, "20"),
+    Question("horizon-cameras", "six cameras for Sun and horizon, yes or no", _read_yes, "yes"),
+    Question("release", "rate at the release, deg/s", number(0.1, 30.0, "deg/s"), "10"),
+)
+COIL_QUESTIONS = (
+    (
+        "dipole",
+        "magnetic dipole of each of three equal coils at the current limit, A m^2 (other coils: --coil)",
+    ),
+    ("current", "current limit of each coil, A"),
+    ("resistance", "resistance of each coil, ohm"),
+)
+"""Keys and questions of three equal coils on the body axes."""
+
+
+def check_values(name: str, values: Values) -> None:
+    """Check the value of the question `name` against the values that are known so far.
+
+    Raises UsageError with the contradiction and the cure.
+    """
+    problem = ""
+    if name in {"mass", "size"} and {"mass", "size"} <= set(values):
+        problem = _density_problem(values["mass"], values["size"])
+    if name in {"altitude", "eccentricity"} and {"altitude", "eccentricity"} <= set(values):
+        problem = _perigee_problem(values["altitude"], values["eccentricity"])
+    if name == "inclination" and values[name] is None:
+        altitude = values["altitude"]
+        if sun_synchronous_inclination(1e3 * altitude, values["eccentricity"]) is None:
+            problem = f"no orbit at {altitude:g} km is Sun-synchronous: give an inclination"
+    if name == "coil":
+        problem = _coil_problem(values["coil"])
+    if problem:
+        raise UsageError(problem)
+
+
+def _density_problem(mass: float, size: Vector) -> str:
+    volume = size[0] * size[1] * size[2]
+    low, high = _DENSITIES
+    if low <= mass / volume <= high:
+        return ""
+    bounds = f"{low * volume:.2g} to {high * volume:.3g} kg"
+    return f"{mass:g} kg in this size is {mass / volume:,.3g} kg/m^3: a size in m like this needs {bounds}"
+
+
+def _perigee_problem(altitude: float, eccentricity: float) -> str:
+    """Return why an orbit of an altitude (km) and eccentricity is too low, with the cure."""
+    axis = 1e-3 * EARTH_RADIUS + altitude
+    perigee = axis * (1.0 - eccentricity) - 1e-3 * EARTH_RADIUS
+    if perigee >= _LOWEST_PERIGEE:
+        return ""
+    most = math.floor(1e4 * (altitude - _LOWEST_PERIGEE) / axis) / 1e4
+    return (
+        f"the perigee is at {perigee:.0f} km, below {_LOWEST_PERIGEE:g} km: "
+        f"at {altitude:g} km give an eccentricity up to {most:g}"
+    )
+
+
+def _coil_problem(coils: list[Coil]) -> str:
+    voltage = max(coil.resistance * coil.current_limit for coil in coils)
+    if voltage > _HIGHEST_VOLTAGE:
+        return (
+            f"{voltage:.3g} V at the current limit, above {_HIGHEST_VOLTAGE:g} V: give a lower current limit"
+        )
+    if largest_dipole(tuple(coils)) == 0.0:
+        return "these coils control one axis only: give coils on other axes too, such as axis=xyz"
+    return ""

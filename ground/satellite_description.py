@@ -1,0 +1,362 @@
+"""Configuration file of a satellite that is described by mass, size, orbit, coils and cameras.
+
+The file extends the configuration `orbit` (a 1U CubeSat) and states the values that differ. Values that
+follow from the description are computed: the inertia is that of a homogeneous cuboid, and weights and limits
+are scaled between those of the configurations `orbit` and `orbit_3u`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
+from knightcube.astro.earth.mean_elements import FittedElements
+from sim_hal.settings import OrbitSection
+from sim_hal.worlds.orbit import elements, log_density, sun_position
+
+Vector = tuple[float, float, float]
+
+TILT_DEG = 22.0
+"""Angle of the star camera from the normal of the orbit towards the zenith, deg."""
+_YEAR_RATE = 2.0 * math.pi / (365.2422 * 86_400.0)
+"""Mean rate of the Sun's right ascension, rad/s."""
+_EQUATOR_FIELD = 2.98e-5
+"""Field of the Earth's dipole at the equator at one Earth radius, T [IGRF-13]."""
+_OFFSET, _DRAG_COEFFICIENT, _SUN_PRESSURE = 0.02, 2.2, 4.56e-6
+"""Mass offset (m) that the CubeSat Design Specification allows, drag coefficient, light pressure (Pa)."""
+_KNIGHTCUBE_INERTIA = 1.047e-3
+"""Mean moment of inertia of the configuration `orbit`, kg m^2."""
+
+
+@dataclass(frozen=True, slots=True)
+class Coil:
+    """A coil or rod: unit vector of its axis, dipole per current (m^2), resistance (ohm) and limit (A)."""
+
+    axis: Vector
+    dipole_per_ampere: float
+    resistance: float
+    current_limit: float
+
+    @property
+    def dipole(self) -> float:
+        """Dipole at the current limit, A m^2."""
+        return self.dipole_per_ampere * self.current_limit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Satellite:
+    """The description of a satellite.
+
+    Attributes:
+        name: name of the configuration.
+        mass: kg.
+        size: lengths of the sides along the body axes, m.
+        orbit: orbit at `utc`.
+        utc: begin of the flight, UTC, ISO 8601.
+        coils: coils and rods.
+        supply_voltage: voltage across a coil that is fully on, V.
+        field_of_view_deg: field of view of the star camera, deg, or None without a star camera.
+        wide_cameras: whether the six horizon cameras are fitted.
+        release_deg: rate at the release, deg/s.
+    """
+
+    name: str
+    mass: float
+    size: Vector
+    orbit: OrbitSection
+    utc: str
+    coils: tuple[Coil, ...]
+    supply_voltage: float
+    field_of_view_deg: float | None
+    wide_cameras: bool
+    release_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Derived:
+    """Values that follow from the description of a satellite.
+
+    Attributes:
+        inertia: moments of inertia about the body axes, kg m^2.
+        dipole: dipole of the coils in a typical direction, A m^2.
+        field: root mean square of the magnetic field along the orbit, T.
+        coil_torque: torque of this dipole in this field, N m.
+        disturbance: torque of air and sunlight on the largest face at the worst mass offset, N m.
+        momentum_time: time (s) in which this coil torque removes the rate at the release.
+        period: orbital period, s.
+        slow_within: estimated limit of the time of detumbling, s.
+        duration: duration of the flight, s.
+        detumble_horizon: planning horizon of detumbling, s.
+        torque_noise: process noise of the detumbler, rad/s per sqrt(s).
+        slew: duration of a slew, s.
+        pointing_dipole: dipole whose cost equals that of an attitude error of 1 deg, A m^2.
+        roll: roll error of the same cost, rad.
+        torque_start: expected size of the disturbance torques, N m.
+        sun_side: whether the Sun is on the side of body +y while +z points to nadir and +x along the flight.
+        beta_deg: angle of the Sun from the plane of the orbit, deg.
+    """
+
+    inertia: Vector
+    dipole: float
+    field: float
+    coil_torque: float
+    disturbance: float
+    momentum_time: float
+    period: float
+    slow_within: float
+    duration: float
+    detumble_horizon: float
+    torque_noise: float
+    slew: float
+    pointing_dipole: float
+    roll: float
+    torque_start: float
+    sun_side: bool
+    beta_deg: float
+
+
+def cuboid_inertia(mass: float, size: Vector) -> Vector:
+    """Return the moments of inertia (3,), kg m^2, of a homogeneous cuboid about its axes of symmetry."""
+    x, y, z = (side * side for side in size)
+    return mass / 12.0 * (y + z), mass / 12.0 * (z + x), mass / 12.0 * (x + y)
+
+
+def sun_synchronous_inclination(altitude: float, eccentricity: float) -> float | None:
+    """Return the inclination (deg) at which J2 turns the node with the mean Sun, or None if there is none.
+
+    The argument `altitude` is the semi-major axis minus the Earth's radius, m (Vallado, eq. 11-13).
+    """
+    axis = EARTH_RADIUS + altitude
+    motion = math.sqrt(GRAVITATIONAL_PARAMETER / axis**3)
+    parameter = axis * (1.0 - eccentricity**2)
+    cosine = -_YEAR_RATE / (1.5 * J2 * motion * (EARTH_RADIUS / parameter) ** 2)
+    return math.degrees(math.acos(cosine)) if cosine >= -1.0 else None
+
+
+def largest_dipole(coils: tuple[Coil, ...]) -> float:
+    """Return the dipole of coils in a typical direction, A m^2, or 0 if all coils have parallel axes.
+
+    It is the geometric mean of the singular values of the matrix of the dipoles at the current limits; for
+    three equal coils on three axes it is the dipole of one coil.
+    """
+    dipoles = np.array([[component * coil.dipole for component in coil.axis] for coil in coils])
+    values = np.linalg.svd(dipoles, compute_uv=False)
+    kept = values[values > 0.05 * values[0]]
+    return float(np.exp(np.mean(np.log(kept)))) if len(kept) >= 2 else 0.0
+
+
+def derived(satellite: Satellite, julian_date: float) -> Derived:
+    """Return the values that follow from the description; the flight begins at `julian_date`, UTC."""
+    orbit, size = satellite.orbit, satellite.size
+    inertia = cuboid_inertia(satellite.mass, size)
+    axis = EARTH_RADIUS + orbit.altitude
+    period = 2.0 * math.pi * math.sqrt(axis**3 / GRAVITATIONAL_PARAMETER)
+    towards_pole = math.sin(math.radians(orbit.inclination_deg))
+    field = _EQUATOR_FIELD * (EARTH_RADIUS / axis) ** 3 * math.sqrt(1.0 + 1.5 * towards_pole**2)
+    dipole = largest_dipole(satellite.coils)
+    torque = dipole * field
+    area = max(size[0] * size[1], size[1] * size[2], size[2] * size[0])
+    disturbance = area * _worst_pressure(orbit.altitude) * _OFFSET
+    momentum_time = max(inertia) * math.radians(satellite.release_deg) / torque
+    slow_within = _rounded_up(0.3 * period + 1.3 * momentum_time, 100.0)
+    start = elements(orbit, julian_date)
+    normal, sun = np.cross(*start.state()), sun_position(julian_date)
+    beta = math.asin(float(normal @ sun) / float(np.linalg.norm(normal) * np.linalg.norm(sun)))
+    return Derived(
+        inertia=inertia,
+        dipole=dipole,
+        field=field,
+        coil_torque=torque,
+        disturbance=disturbance,
+        momentum_time=momentum_time,
+        period=period,
+        slow_within=slow_within,
+        duration=_rounded_up(slow_within + 1.1 * period, 100.0),
+        detumble_horizon=1500.0 if momentum_time < 375.0 else 3000.0,
+        torque_noise=0.1 * torque * float(np.mean([1.0 / moment for moment in inertia])),
+        slew=min(max(_rounded_up(16.0 * math.sqrt(max(inertia) / torque), 10.0), 60.0), 1500.0),
+        pointing_dipole=min(3.0e-4 * math.sqrt(float(np.mean(inertia)) / _KNIGHTCUBE_INERTIA), 0.02 * dipole),
+        roll=0.524 if disturbance / max(inertia) > 3e-6 else 0.0524,
+        torque_start=1.0e-9 * area / 0.01 * _worst_pressure(orbit.altitude) / _worst_pressure(500e3),
+        sun_side=beta < 0.0,
+        beta_deg=math.degrees(beta),
+    )
+
+
+def _worst_pressure(altitude: float) -> float:
+    """Return the pressure of air and sunlight on a face, Pa, at an altitude in m."""
+    axis = EARTH_RADIUS + altitude
+    density = math.exp(float(log_density(np.array([[axis, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]]), 0.0)[0]))
+    return 0.5 * _DRAG_COEFFICIENT * density * GRAVITATIONAL_PARAMETER / axis + 2.0 * _SUN_PRESSURE
+
+
+def _rounded_up(value: float, step: float) -> float:
+    return step * math.ceil(value / step)
+
+
+def configuration_text(satellite: Satellite, values: Derived, made: FittedElements, command: str) -> str:
+    """Return the configuration file of a satellite; `command` is the command that writes the file."""
+    x, y, z = satellite.size
+    rms = float(np.sqrt(np.mean(made.residuals**2)))
+    orbit = satellite.orbit
+    wide = [] if satellite.wide_cameras else [("wide_cameras: []", "no cameras for Sun and horizon")]
+    knowledge = [] if satellite.field_of_view_deg else [("  knowledge_deg: null", "no star camera")]
+    place = ", ".join(
+        f"{key}: {_text(value)}"
+        for key, value in (
+            ("altitude", orbit.altitude),
+            ("inclination_deg", orbit.inclination_deg),
+            ("eccentricity", orbit.eccentricity),
+            ("local_time", orbit.local_time or 0.0),
+        )
+    )
+    size = ", ".join(_text(side) for side in satellite.size)
+    moments = ", ".join(f"{moment:.3e}" for moment in values.inertia)
+    return _laid_out(
+        f"# {satellite.name}: {satellite.mass:g} kg, {x:g} x {y:g} x {z:g} m. Written by:",
+        f"#   {command}",
+        "# Values are in SI units, unless their name contains another unit. Values marked [given] are those",
+        "# of the command, and values marked [computed] follow from them. All other values are those of the",
+        "# configuration `orbit`; `flight check FILE --merged NEW` writes all values into one file.",
+        "",
+        "extends: orbit",
+        f"name: {satellite.name}",
+        "",
+        ("craft:", "model that the flight application uses"),
+        (f"  inertia: [{moments}]", "kg m^2, body axes [computed: homogeneous cuboid]"),
+        *_coil_lines(satellite),
+        "",
+        *_camera_lines(satellite, values),
+        *wide,
+        (
+            "elements:",
+            f"two-line elements [computed: fitted to one day of the orbit below, {1e-3 * rms:.2g} km rms]",
+        ),
+        f"  - '{made.lines[0]}'",
+        f"  - '{made.lines[1]}'",
+        "",
+        "detumble:",
+        (f"  horizon: {values.detumble_horizon:g}", "s, planning horizon of detumbling [computed]"),
+        (
+            f"  torque_noise: {values.torque_noise:.1e}",
+            "rad/s per sqrt(s) [computed: a tenth of the coils' angular acceleration]",
+        ),
+        "",
+        "estimation:",
+        (
+            f"  torque_start: {values.torque_start:.1e}",
+            "N m, expected disturbance torque [computed: scaled by area and air density]",
+        ),
+        (f"  torque_walk: {2e-3 * values.torque_start:.1e}", "N m per sqrt(s) [computed]"),
+        "",
+        ("pointing:", "body +z points to the goal, and +x along the flight if the roll is given"),
+        (
+            f"  dipole: {values.pointing_dipole:.1e}",
+            "A m^2, dipole of the same cost as an attitude error of 1 deg [computed: scaled]",
+        ),
+        (
+            f"  roll: {values.roll:g}",
+            f"rad, roll error ({math.degrees(values.roll):.0f} deg) of the same cost [computed]",
+        ),
+        (
+            f"  slew: {values.slew:g}",
+            "s, duration of a slew [computed: 16 sqrt(moment / torque of the coils)]",
+        ),
+        *_cone_lines(satellite),
+        "",
+        "targets:",
+        ("  - {at: 0.0, point: nadir, roll_deg: 0.0}", "body +z down, +x along the flight"),
+        "",
+        ("requirements:", "requirements that `flight report` checks; null: not checked"),
+        (
+            f"  slow_within: {values.slow_within:g}",
+            f"s, longest time of detumbling [computed: an estimate for {satellite.release_deg:g} deg/s]",
+        ),
+        *knowledge,
+        ("  pointing_deg: null", "deg, rms error of the pointing axis: your requirement"),
+        "",
+        (f"duration: {values.duration:g}", "s, detumbling and more than one revolution [computed]"),
+        "",
+        ("simulation:", "the simulated satellite; other values equal those above"),
+        (f"  utc: '{satellite.utc}'", "begin of the flight [given]"),
+        "  free_body:",
+        (f"    craft: {{size: [{size}]}}", "m [given]"),
+        (f"    orbit: {{{place}}}", "m, deg, h [given]"),
+        (
+            f"    release: {{speed: {math.radians(satellite.release_deg):.4g}}}",
+            f"rad/s ({satellite.release_deg:g} deg/s), about a random axis [given]",
+        ),
+    )
+
+
+def _coil_lines(satellite: Satellite) -> list[str | tuple[str, str]]:
+    """Return the lines of the coils."""
+    first = satellite.coils[0]
+    resistances = ", ".join(_text(coil.resistance) for coil in satellite.coils)
+    return [
+        (
+            f"  dipole_per_ampere: {_text(first.dipole_per_ampere)}",
+            f"m^2 [given: {first.dipole:.3g} A m^2 at {first.current_limit:.3g} A]",
+        ),
+        "",
+        "coils:",
+        (f"  resistance: [{resistances}]", "ohm, resistance of each coil [given]"),
+        (
+            f"  supply_voltage: {_text(satellite.supply_voltage)}",
+            "V across a coil that is fully on, after all losses",
+        ),
+        (f"  current_limit: {_text(first.current_limit)}", "A [given]"),
+    ]
+
+
+def _camera_lines(satellite: Satellite, values: Derived) -> list[str | tuple[str, str]]:
+    """Return the lines of the star camera."""
+    if satellite.field_of_view_deg is None:
+        return [("camera: none", "no star camera"), ""]
+    half = math.radians(0.5 * (90.0 + TILT_DEG))
+    side, other, sine = ("-y", "+y", 1.0) if values.sun_side else ("+y", "-y", -1.0)
+    sun = f"the Sun is {abs(values.beta_deg):.0f} deg from the plane of the orbit, towards {other}"
+    return [
+        ("camera:", "star camera; its other values are those of a camera with 512 x 512 px"),
+        f"  # The boresight is body {side}, turned by {TILT_DEG:g} deg to -z, the zenith if +z points down.",
+        f"  # At the begin {sun} [computed].",
+        f"  mounting: [{sine * math.sin(half):.8f}, 0.0, 0.0, {math.cos(half):.8f}]",
+        (f"  field_of_view_deg: {_text(satellite.field_of_view_deg)}", "deg [given]"),
+        "",
+    ]
+
+
+def _cone_lines(satellite: Satellite) -> list[str | tuple[str, str]]:
+    """Return the exclusion cones of the star camera, outside the corner of its field of view."""
+    if satellite.field_of_view_deg is None:
+        return []
+    corner = math.degrees(
+        math.atan(math.sqrt(2.0) * math.tan(math.radians(0.5 * satellite.field_of_view_deg)))
+    )
+    sun, earth, moon = (max(angle, math.ceil(corner + 2.0)) for angle in (42.0, 19.0, 16.0))
+    return [
+        (
+            f"  cones: {{sun_deg: {sun:.1f}, earth_deg: {earth:.1f}, moon_deg: {moon:.1f}}}",
+            "exclusion cones of the star camera during slews [computed]",
+        )
+    ]
+
+
+def _text(value: float) -> str:
+    """Return a number as YAML text."""
+    return f"{value:.6g}" if "." in f"{value:.6g}" or "e" in f"{value:.6g}" else f"{value:.6g}.0"
+
+
+def _laid_out(*lines: str | tuple[str, str]) -> str:
+    """Return lines of text, where a pair is a value and its comment."""
+    texts = []
+    for line in lines:
+        if isinstance(line, str):
+            texts.append(line)
+        else:
+            value, comment = line
+            texts.append(f"{value:<27} # {comment}" if len(value) < 27 else f"{value}   # {comment}")
+    return "\n".join(texts) + "\n"
