@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flight.schema.devices import Camera, WideCamera
+from flight.schema.devices import Camera, UnitCalibration, WideCamera
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.drivers.ads1115 import StringWiring
@@ -216,16 +216,19 @@ def _unit(
     now_ns: int,
 ) -> Vn100Emulator:
     """Return the inertial unit, whose magnetometer has a bias and also measures the field of the coils."""
-    errors = description_errors(config, section)
+    errors, known = description_errors(config, section), config.inertial_unit.calibration
+    gyro_matrix, field_matrix = np.array(known.gyro_matrix), np.array(known.field_matrix)
+    gyro_matrix, offset = gyro_matrix @ errors.gyro, np.array(known.field_bias)
     coil_field, bias = np.array(section.coil_field), np.array(section.imu.field_bias) + errors.field_bias
     sense = world.motion
-    if coil_field.any() or bias.any() or errors is not NO_ERRORS:
+    if coil_field.any() or bias.any() or errors is not NO_ERRORS or known != UnitCalibration():
 
         def sense(time_ns: int) -> BodyMotion:
             # The unit averages its magnetometer over one control period, so the mean coil currents are used.
             motion = world.motion(time_ns)
             field = errors.field @ (motion.field_body + coil_field @ circuit.currents()) + bias
-            return replace(motion, field_body=field, rate=errors.gyro @ motion.rate)
+            field = field_matrix @ field + offset
+            return replace(motion, field_body=field, rate=gyro_matrix @ motion.rate)
 
     imu = section.imu
     profile = NoiseProfile() if imu.profile == "bounds" else PROFILES[imu.profile]

@@ -193,10 +193,13 @@ def coil_settings(config: Config) -> CoilSettings:
 def unit_settings(config: Config) -> Vn100Settings:
     """Return the settings of the inertial unit's driver, whose readings are in the testbed frame."""
     unit = config.inertial_unit
-    mounting = np.array(unit.mounting)
+    mounting, known = np.array(unit.mounting), unit.calibration
     return Vn100Settings(
         attitude_map=attitude_map(mounting, NED_TO_TESTBED),
         mounting=attitude_matrix(mounting),
+        gyro_matrix=np.array(known.gyro_matrix),
+        field_matrix=np.array(known.field_matrix),
+        field_bias=np.array(known.field_bias),
         rate_hz=unit.rate_hz,
         output=unit.output,
         field_range=unit.field_range,

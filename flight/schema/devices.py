@@ -31,7 +31,7 @@ ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
 
 
 class UnitAccuracy(Section, frozen=True, kw_only=True):
-    """Largest errors of the inertial unit, within which the true errors are assumed uniform.
+    """Largest errors of the calibrated inertial unit, within which the true errors are assumed uniform.
 
     `gyro_scale` is the relative error of the scale factor of each gyro, `gyro_alignment` (rad) the
     misalignment of each gyro toward each other axis. `field_matrix` is the error of each element of the
@@ -42,6 +42,18 @@ class UnitAccuracy(Section, frozen=True, kw_only=True):
     gyro_alignment: Annotated[float, Meta(ge=0.0, le=0.1)] = 2e-3
     field_matrix: Annotated[float, Meta(ge=0.0, le=0.2)] = 0.01
     field_bias: NotNegative = 5e-7
+
+
+class UnitCalibration(Section, frozen=True, kw_only=True):
+    """The calibration of the inertial unit, whose errors the driver removes from each reading.
+
+    The unit measures `gyro_matrix` times the rate, and `field_matrix` times the magnetic field plus
+    `field_bias` (T). The rows of the matrices and the bias are in body axes.
+    """
+
+    gyro_matrix: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    field_matrix: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    field_bias: Vector = (0.0, 0.0, 0.0)
 
 
 class InertialUnitSection(Section, frozen=True, kw_only=True):
@@ -60,6 +72,7 @@ class InertialUnitSection(Section, frozen=True, kw_only=True):
     max_age: Positive = 0.1
     angle_noise: Positive = 2.02e-3
     rate_noise: Positive = 1.01e-4
+    calibration: UnitCalibration = UnitCalibration()
     accuracy: UnitAccuracy = UnitAccuracy()
 
 

@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 
 from flight.schema.devices import Camera, SolarStringsSection
 from flight.schema.document import ConfigError, Document, convert, read_document, read_text
 from flight.schema.orbit import ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
-from flight.schema.values import Quaternion, check_aim
+from flight.schema.values import Quaternion, Vector, check_aim
 from knightcube.astro.inertia import inertia_problem
 from knightcube.errors import UsageError
 
@@ -38,6 +39,9 @@ PIXEL_BITS = {
 }
 """Permitted numbers of bits per pixel of each pixel format."""
 LOOPBACK = IPv4Network("127.0.0.0/8")
+_LARGEST_CORRECTION = 0.3
+"""Largest difference of an element of a calibration matrix from the identity matrix. Every matrix within this
+bound has an inverse."""
 _PREFIX = 24
 """Default prefix length of the network whose hosts may send frames to the link."""
 
@@ -72,6 +76,8 @@ def check_consistency(config: Config, document: Document) -> None:
         _check_camera(config.camera, refuse)
         _check_length("camera.mounting", config.camera.mounting, refuse)
     _check_length("inertial_unit.mounting", config.inertial_unit.mounting, refuse)
+    for name in ("gyro_matrix", "field_matrix"):
+        _check_matrix(f"inertial_unit.calibration.{name}", getattr(unit.calibration, name), refuse)
     for index, camera in enumerate(config.wide_cameras):
         _check_length(f"wide_cameras[{index}].mounting", camera.mounting, refuse)
         first = config.wide_cameras[0]
@@ -167,6 +173,13 @@ def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
     norm = math.sqrt(sum(c * c for c in quaternion))
     if abs(norm - 1.0) > 1e-6:
         refuse(dotted, f"has length {norm:.6g}: a quaternion must have length 1")
+
+
+def _check_matrix(dotted: str, matrix: tuple[Vector, Vector, Vector], refuse: Refuse) -> None:
+    largest = float(np.abs(np.array(matrix) - np.eye(3)).max())
+    if largest > _LARGEST_CORRECTION:
+        problem = f"differs from the identity matrix by {largest:.3g}: a calibrated unit differs by at most"
+        refuse(dotted, f"{problem} {_LARGEST_CORRECTION:g} in each element")
 
 
 def _check_commands(commands: Commands, on_testbed: bool, refuse: Refuse) -> None:

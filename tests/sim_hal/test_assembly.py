@@ -7,6 +7,8 @@ import pytest
 
 from flight.schema import reader
 from flight.schema import reader as configuration
+from flight.schema.devices import UnitCalibration
+from flight.schema.sections import Config
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal.clock import SimClock
@@ -20,12 +22,12 @@ BIAS = (2e-6, -1e-6, 3e-6)
 
 
 def measured(
-    imu: ImuNoise, seconds: float, world: str = "free_body"
+    imu: ImuNoise, seconds: float, world: str = "free_body", config: Config | None = None
 ) -> tuple[list[Vn100Sample], list[BodyMotion]]:
     """Return what the unit sends at 40 Hz, and the true motion at each time."""
     body = FreeBodySection(release=TipOff(speed=0.02))
     section = reader.replace(demo_world(), world=world, free_body=body, imu=imu)
-    lock = build_lockstep(demo_config(10.0, camera=False), section, None, SimClock())
+    lock = build_lockstep(config or demo_config(10.0, camera=False), section, None, SimClock())
     seen: list[Vn100Sample] = []
     true: list[BodyMotion] = []
 
@@ -64,6 +66,16 @@ def test_its_attitude_has_no_meaning_in_orbit_and_a_meaning_on_the_thread() -> N
 
 def test_the_magnetometer_has_its_bias() -> None:
     seen, true = measured(ImuNoise(field_bias=BIAS), 1.0)
+    np.testing.assert_allclose(1e-4 * seen[-1].mag, true[-1].field_body + np.array(BIAS), atol=1e-12)
+
+
+def test_the_unit_has_the_errors_that_its_calibration_describes() -> None:
+    gyro = ((1.01, 0.002, 0.0), (0.0, 0.99, -0.003), (0.001, 0.0, 1.0))
+    config = demo_config(10.0, camera=False)
+    known = UnitCalibration(gyro_matrix=gyro, field_bias=BIAS)
+    unit = reader.replace(config.inertial_unit, calibration=known)
+    seen, true = measured(ImuNoise(), 1.0, config=reader.replace(config, inertial_unit=unit))
+    np.testing.assert_allclose(seen[-1].rate, np.array(gyro) @ true[-1].rate, rtol=1e-5)
     np.testing.assert_allclose(1e-4 * seen[-1].mag, true[-1].field_body + np.array(BIAS), atol=1e-12)
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -58,6 +58,10 @@ class Vn100Settings:
         attitude_map: (4, 4) matrix that maps the unit's quaternion (NED into sensor frame) to the project's
             quaternion (reference frame into body frame).
         mounting: (3, 3) rotation matrix from sensor axes into body axes.
+        gyro_matrix: (3, 3) matrix from the rate to the rate that the gyro measures, body axes.
+        field_matrix: (3, 3) matrix from the magnetic field to the field that the magnetometer measures,
+            without its bias, body axes.
+        field_bias: (3,) bias of the magnetometer, T, body axes.
         rate_hz: samples per second; a binary rate must divide 800, an ASCII rate must be listed for register
             7.
         output: output format, either binary packets or ASCII VNQMR lines without device time.
@@ -76,6 +80,9 @@ class Vn100Settings:
 
     attitude_map: FloatArray
     mounting: FloatArray
+    gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    field_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    field_bias: FloatArray = field(default_factory=lambda: np.zeros(3))
     rate_hz: int
     output: Literal["binary", "ascii"]
     unit_port: int = 1
@@ -412,6 +419,10 @@ class ReadingConverter:
         self.out_of_range = 0
         self.not_finite = 0
         self._settings = settings
+        matrices = (settings.gyro_matrix, settings.field_matrix)
+        gyro, magnetometer = (np.asarray(np.linalg.inv(matrix), dtype=float) for matrix in matrices)
+        self._rate_map, self._field_map = gyro @ settings.mounting, magnetometer @ settings.mounting
+        self._field_offset = magnetometer @ settings.field_bias
         self._byte_ns = byte_ns
         self._on_reset = on_reset
         self._places: dict[bytes, _Places | None] = {}
@@ -456,8 +467,8 @@ class ReadingConverter:
             arrival_ns=item.arrival_ns,
             device_time_ns=device_ns,
             quaternion=quaternion,
-            rate=settings.mounting @ values[4:7],
-            field=settings.mounting @ values[7:10] * TESLA_PER_GAUSS,
+            rate=self._rate_map @ values[4:7],
+            field=self._field_map @ values[7:10] * TESLA_PER_GAUSS - self._field_offset,
             acceleration=settings.mounting @ values[10:],
         )
 

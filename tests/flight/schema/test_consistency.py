@@ -93,6 +93,11 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
             "channel: 0, address: 0x40}",
             r"strings\[0\].address` is 0x40, the address of another chip",
         ),
+        (
+            "  baud_rate: 115200",
+            "  calibration: {gyro_matrix: [[1, 0.4, 0], [0, 1, 0], [0, 0, 1]]}\n  baud_rate: 115200",
+            r"calibration.gyro_matrix` differs from the identity matrix by 0.4",
+        ),
         ("{normal: [1.0,", "{normal: [1.1,", r"strings\[0\].normal` has length 1.1: give a unit vector"),
         (
             "[0.0, 0.0, 0.0, 1.0], columns",

@@ -80,6 +80,34 @@ def test_any_mounting_and_attitude_come_back_in_body_axes() -> None:
     assert reading.acceleration == pytest.approx(force, abs=4 * FLOAT32)
 
 
+def test_the_calibration_removes_the_errors_of_gyro_and_magnetometer() -> None:
+    rng = np.random.default_rng(9)
+    gyro, matrix = (np.eye(3) + 0.02 * rng.normal(size=(3, 3)) for _ in range(2))
+    field, rate, bias = (
+        np.array([3e-5, -1e-5, 2e-5]),
+        np.array([0.1, -0.2, 0.05]),
+        np.array([1e-6, 2e-6, -5e-7]),
+    )
+    mounting = from_rotation_vector(rng.normal(size=3))
+
+    def sense(time_ns: int) -> BodyMotion:
+        return BodyMotion(time_ns, mounting, gyro @ rate, matrix @ field + bias, np.array([0.0, 0.0, 9.8]))
+
+    settings = replace(
+        MISSION,
+        attitude_map=attitude_map(mounting, NED_TO_TESTBED),
+        mounting=attitude_matrix(mounting),
+        gyro_matrix=gyro,
+        field_matrix=matrix,
+        field_bias=bias,
+    )
+    bench = bench_line(sense, settings, replace(QUIET, mounting=mounting))
+    bench.driver.configure()
+    reading = bench.run(0.1)[-1]
+    assert reading.rate == pytest.approx(rate, abs=4 * FLOAT32)
+    assert reading.field == pytest.approx(field, abs=1e-10)
+
+
 def test_both_signs_of_the_quaternion_read_as_the_shorter_turn() -> None:
     def sense(time_ns: int) -> BodyMotion:
         return replace(about_thread(time_ns, 0.4, 0.0, 4.5e-4), quaternion=-about_axis_y(0.4))
