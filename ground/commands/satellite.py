@@ -47,9 +47,11 @@ from flight.link.process.directives import (
     ListFiles,
     Listing,
     Play,
+    ResumeFile,
     Scheduled,
     SendFile,
     Stop,
+    SuspendFile,
     UseFile,
 )
 from flight.link.process.filing import KINDS, LISTING
@@ -89,6 +91,11 @@ from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTar
 Object = dict[str, Any]
 _DIRECTIVES = ("play", "stop-playback", "new-key", "schedule", "unschedule", "list-schedule")
 _ORIGINS = {field.name: dict(field.states) for field in PARAMETERS.fields if field.name == "table"}
+_OF_TRANSFERS: dict[str, type[CancelFile | SuspendFile | ResumeFile]] = {
+    "cancel": CancelFile,
+    "suspend": SuspendFile,
+    "resume": ResumeFile,
+}
 _RATE = 20_000.0
 """Default rate of frames to the satellite (bytes/s)."""
 _SILENCE_S = 60.0
@@ -456,12 +463,17 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
         placed = words.add_parser(word, help=purpose)
         placed.add_argument("kind", choices=KINDS, help="purpose of the file")
         placed.add_argument("path", type=Path, metavar="FILE", help=text)
+        if word == "put":
+            placed.add_argument(
+                "--replace", action="store_true", help="delete a file of this name on board first"
+            )
     deleted = words.add_parser("delete", help="delete a file that was put on the satellite")
     deleted.add_argument("name", metavar="NAME", help="name in the list")
-    cancelled = words.add_parser("cancel", help="cancel a transfer on board")
-    text = "sender: 1 for the satellite, 2 for the ground"
-    cancelled.add_argument("source", type=int, metavar="ENTITY", help=text)
-    cancelled.add_argument("number", type=int, metavar="N", help="number in the packet transfer")
+    for word in _OF_TRANSFERS:
+        placed = words.add_parser(word, help=f"{word} a transfer on board")
+        text = "sender: 1 for the satellite, 2 for the ground"
+        placed.add_argument("source", type=int, metavar="ENTITY", help=text)
+        placed.add_argument("number", type=int, metavar="N", help="number in the packet transfer")
     parser.set_defaults(command=run_files)
 
 
@@ -513,14 +525,23 @@ class _FileWork:
                 paths = [self._get(SendFile(name), name) for name in options.names]
                 return {"files": [self._facts(path) for path in paths]}
             case "put":
-                return self._put(options.path, f"{options.kind}/{options.path.name}")
+                name = f"{options.kind}/{options.path.name}"
+                if options.replace:
+                    self._delete_existing(f"received/{name}")
+                return self._put(options.path, name)
             case "use":
                 name = f"received/{options.kind}/{options.path.name}"
                 return self._command(UseFile(name, sha256_of(options.path)))
             case "delete":
                 return self._command(DeleteFile(options.name))
-            case _:
-                return self._command(CancelFile(options.source, options.number))
+            case word:
+                return self._command(_OF_TRANSFERS[word](options.source, options.number))
+
+    def _delete_existing(self, name: str) -> None:
+        """Delete a file on board, if it exists."""
+        path = self._get(ListFiles(name), LISTING)
+        if any(file["name"] == name for file in json.loads(path.read_bytes())["files"]):
+            self._command(DeleteFile(name))
 
     def _facts(self, path: Path) -> Object:
         name, size = path.relative_to(self._session.received).as_posix(), path.stat().st_size

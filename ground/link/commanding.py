@@ -15,11 +15,12 @@ from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
 from flight.link.files.store import Store
 from flight.link.files.transfer import CRC32, GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
-from flight.link.files.units import DOWN, UP, PduError, UnitPacker, is_unit, unit_of
+from flight.link.files.units import DOWN, UP, Metadata, PduError, UnitPacker, is_unit, unit_of
 from flight.link.frames import LONGEST_FRAME, TELECOMMAND_HEADER, TELECOMMAND_MASK
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
-from flight.link.process.directives import Directive, NewKey
+from flight.link.process.directives import Directive, NewKey, SendFile
+from flight.link.process.filing import LISTING
 from flight.link.security import COMMAND_SPIS, NEXT, OVERHEAD_BYTES, Association, Sealer, Vault, new_key
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, LONGEST_PACKET, to_text
@@ -28,8 +29,7 @@ from knightcube.errors import FlightError, UsageError
 
 Show = Callable[[Report], object]
 _BLOCK = 64
-"""Number of frame counters reserved at once; a command by another process makes the remaining counters
-unusable."""
+"""Number of frame counters reserved at once, because each reservation takes two disk writes."""
 _REPEAT_NS = 5_000_000_000
 """Time (ns) after which an unanswered command is sent again."""
 _BURST_S = 0.05
@@ -202,20 +202,22 @@ class FileSession:
         self._rate = rate
         self._sealer = terminal.sealer(spi, _BLOCK)
         self._units = UnitPacker(UP)
-        self.entity = Entity(GROUND, store, lambda _: "", LONGEST_FILE, now_ns)
+        self._wanted = {LISTING}
         self.received = store.received
+        self.entity = Entity(GROUND, store, self._may_come, LONGEST_FILE, now_ns)
         self.received_ns = now_ns
         self._texts: dict[tuple[int, int], str] = {}
         self._asked: tuple[Directive, int] | None = None
-        self._counters: dict[int, bool] = {}  # counters of sent commands, and whether a report has arrived
+        self._counters: set[int] = set()
         self._reports: deque[Report] = deque()
         self._credit, self._credit_ns = 0.0, now_ns
 
     def ask(self, directive: Directive, now_ns: int) -> None:
         """Send a command, and repeat it until the satellite answers."""
         self._asked = (directive, now_ns + _REPEAT_NS)
-        counter = self._terminal.send_by(self._sealer, directives.pack(directive, utc_ns()))
-        self._counters[counter] = False
+        if isinstance(directive, SendFile):
+            self._wanted.add(directive.name)
+        self._counters.add(self._terminal.send_by(self._sealer, directives.pack(directive, utc_ns())))
 
     def put(self, path: Path, name: str, now_ns: int) -> Progress:
         """Start or continue the transfer of a file to the satellite. Raises FlightError."""
@@ -232,9 +234,8 @@ class FileSession:
                     continue
             elif packet[:2] == _VERIFICATION:
                 report = report_of(packet)
-                reported = self._counters.get(report.counter)
-                if reported is not None and not (reported and report.stage is Stage.REPEATED):
-                    self._counters[report.counter] = True
+                # After a repeated counter, the command is sent again with a higher one.
+                if report.counter in self._counters and report.stage is not Stage.REPEATED:
                     if report.stage is not Stage.ACCEPTED:
                         self._asked = None
                     self._reports.append(report)
@@ -254,6 +255,11 @@ class FileSession:
             self._terminal.send_by(self._sealer, packet)
             self._credit -= len(packet) + _FRAME_BYTES
         self.entity.keep(now_ns)
+
+    def _may_come(self, metadata: Metadata) -> str:
+        """Return why a file from the satellite is rejected, or an empty text if it is accepted."""
+        exists = (self.received / metadata.name).exists()
+        return f"{metadata.name} exists" if exists and metadata.name not in self._wanted else ""
 
     def reports(self) -> list[Report]:
         """Return the reports on the commands since the last call."""

@@ -1,7 +1,7 @@
 """State of file transfers on disk: open transfers, transaction numbers, ended transfers and received files.
 
 Each record is written to a temporary file, synced and renamed, so that a crash leaves the old or the new
-record.
+record. A record is a line of JSON, followed by its CRC-32 in hexadecimal digits.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -60,6 +61,7 @@ class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kind: Annotated[int, Meta(ge=0, le=15)]
     checksum: _Long | None = None
     origin: tuple[int, int, int, int] = (0, 0, 0, 0)
+    suspended: bool = False
 
 
 class Incoming(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -73,6 +75,7 @@ class Incoming(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     end: _Stretch | None = None
     ranges: tuple[_Stretch, ...] = ()
     finished: tuple[int, bool, int] | None = None
+    suspended: bool = False
 
 
 class Ending(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -159,7 +162,7 @@ class Store:
 
     def save(self, record: Outgoing | Incoming) -> None:
         """Store a record durably. Raises FileError if the disk cannot be written."""
-        write_whole(self._path(record), msgspec.json.encode(record))
+        _write(self._path(record), record)
 
     def remove(self, record: Outgoing | Incoming) -> None:
         """Remove a record and, for an incoming transfer, the received data."""
@@ -193,7 +196,7 @@ class Store:
         return self._folder / f"in-{record.source:05d}-{record.number:010d}.json"
 
     def _write_numbers(self, last: int, endings: tuple[Ending, ...]) -> None:
-        write_whole(self._folder / "numbers.json", msgspec.json.encode(_Numbers(last, endings)))
+        _write(self._folder / "numbers.json", _Numbers(last, endings))
         self.last, self.endings = last, endings
 
 
@@ -211,10 +214,16 @@ def write_whole(path: Path, data: bytes) -> None:
         raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
+def _write(path: Path, record: msgspec.Struct) -> None:
+    """Store a record with its CRC-32. Raises FileError if the disk cannot be written."""
+    line = msgspec.json.encode(record)
+    write_whole(path, line + b"\n%08x" % zlib.crc32(line))
+
+
 def _read(path: Path, shape: type[T]) -> T | None:
     """Return the record stored in a file, None if the file is missing or damaged."""
     try:
-        data = read_regular(path, _LONGEST_RECORD)
-        return None if data is None else msgspec.json.decode(data, type=shape)
+        line, _, crc = (read_regular(path, _LONGEST_RECORD) or b"").partition(b"\n")
+        return msgspec.json.decode(line, type=shape) if crc == b"%08x" % zlib.crc32(line) else None
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None

@@ -45,8 +45,9 @@ from flight.link.files.units import (
     unpack,
 )
 
-MODULAR, CRC32 = 0, 3
-TYPES = (MODULAR, CRC32)
+MODULAR, CRC32, NO_CHECKSUM = 0, 3, 15
+TYPES = (MODULAR, CRC32, NO_CHECKSUM)
+"""Supported checksum types (SANA registry of CFDP checksum identifiers)."""
 _PORTION = 1 << 20
 
 
@@ -55,7 +56,7 @@ class FileSum:
 
     def __init__(self, path: Path, kind: int, size: int) -> None:
         """Prepare the checksum of type `kind` of the first `size` bytes of the file."""
-        self._path, self._kind, self._left = path, kind, size
+        self._path, self._kind, self._left = path, kind, 0 if kind == NO_CHECKSUM else size
         self._at = self._value = 0
 
     def step(self) -> int | None:
@@ -108,6 +109,10 @@ class Ranges:
         """Number of bytes in the set."""
         return sum(self._ends) - sum(self._begins)
 
+    def cover(self, size: int) -> bool:
+        """Return whether the set contains all byte offsets below `size`."""
+        return size == 0 or (bool(self._begins) and self._begins[0] == 0 and self._ends[0] >= size)
+
     @property
     def end(self) -> int:
         """End of the last byte range, 0 for an empty set."""
@@ -134,11 +139,18 @@ class Ranges:
             del self._begins[0], self._ends[0]
         return begin, end
 
-    def gaps(self, size: int) -> list[tuple[int, int]]:
-        """Return the byte ranges between 0 and `size` that are missing from the set."""
-        edges = [0, *(edge for pair in self.pairs for edge in pair), size]
-        between = [(edges[i], min(edges[i + 1], size)) for i in range(0, len(edges), 2)]
-        return [(begin, end) for begin, end in between if begin < end]
+    def gaps(self, begin: int, size: int, most: int) -> list[tuple[int, int]]:
+        """Return the first `most` byte ranges between `begin` and `size` that are missing from the set."""
+        found: list[tuple[int, int]] = []
+        index = bisect_right(self._ends, begin)
+        while begin < size and len(found) < most:
+            known = index < len(self._begins)
+            end = min(self._begins[index], size) if known else size
+            if begin < end:
+                found.append((begin, end))
+            begin = self._ends[index] if known else size
+            index += 1
+        return found
 
 
 _SOON = 4
@@ -206,10 +218,12 @@ class Sender:
         self._save = save
         self._path = Path(record.path)
         self._wanted = Ranges([(0, record.size)] if fresh else [])
+        self._reached = 0 if fresh else record.size  # end of the data that may have been transmitted
         self._sum = FileSum(self._path, record.kind, record.size) if record.checksum is None else None
         self._metadata_due = self._end_due = True
         self._acknowledged = False
         self._stopped: Condition | None = None
+        self._sum_of_sent = 0  # checksum of the transmitted data of a cancelled transfer
         self._timer = Timer(ASK_NS, now_ns)
 
     @property
@@ -223,10 +237,16 @@ class Sender:
         self._acknowledged = False
 
     def cancel(self, condition: Condition = Condition.CANCELLED, why: str = "cancelled") -> None:
-        """Cancel the transfer and notify the receiver by an EOF."""
+        """Cancel the transfer and notify the receiver by an EOF with the checksum of the transmitted data."""
         self._stopped, self.said = condition, why
+        self._sum = FileSum(self._path, self.record.kind, self._reached)
         self._wanted = Ranges()
         self._metadata_due, self._end_due, self._acknowledged = False, True, False
+
+    def suspend(self, suspended: bool) -> None:
+        """Suspend or resume the transfer. Raises FileError if the disk cannot be written."""
+        self.record = msgspec.structs.replace(self.record, suspended=suspended)
+        self._save(self.record)
 
     def take(self, content: Content, now_ns: int) -> list[Content]:
         """Process a PDU from the receiver and return the immediate answers."""
@@ -253,6 +273,8 @@ class Sender:
     def next(self, now_ns: int) -> Content | None:
         """Return the content of the next PDU to send, None if no PDU is due."""
         self._go_on_summing()
+        if self.record.suspended and self._stopped is None:
+            return None
         if self._metadata_due:
             self._metadata_due = False
             name = self.record.name
@@ -261,12 +283,14 @@ class Sender:
             return self._piece(now_ns)
         if not self._end_due and self._timer.due(now_ns):
             self._end_due = True
-        if self._end_due and (self._stopped is not None or self.record.checksum is not None):
+        if self._end_due and self._sum is None:
             self._end_due = False
             self._timer.asked(now_ns)
-            if self._stopped is not None and self._timer.times > _EOF_TRIES:
-                self.condition = self._stopped
-            return Eof(self._stopped or 0, self.record.checksum or 0, self.record.size)
+            if self._stopped is not None:
+                if self._timer.times > _EOF_TRIES:
+                    self.condition = self._stopped
+                return Eof(self._stopped, self._sum_of_sent, self._reached)
+            return Eof(Condition.NO_ERROR, self.record.checksum or 0, self.record.size)
         return None
 
     def _piece(self, now_ns: int) -> Content | None:
@@ -282,19 +306,26 @@ class Sender:
         if len(data) < end - begin:
             self.cancel(Condition.FILESTORE_REJECTION, f"{self.record.name}: {reason}")
             return self.next(now_ns)
+        self._reached = max(self._reached, end)
         return FileData(begin, data)
 
     def _go_on_summing(self) -> None:
-        if self._sum is None or self._stopped is not None:
+        if self._sum is None:
             return
         try:
             value = self._sum.step()
-            if value is not None:
-                self._sum = None
-                self.record = msgspec.structs.replace(self.record, checksum=value)
-                self._save(self.record)
+            if value is None:
+                return
+            self._sum = None
+            if self._stopped is not None:
+                self._sum_of_sent = value
+                return
+            self.record = msgspec.structs.replace(self.record, checksum=value)
+            self._save(self.record)
         except (OSError, FileError) as error:
-            self.cancel(Condition.FILESTORE_REJECTION, str(error))
+            if self._stopped is None:
+                self.cancel(Condition.FILESTORE_REJECTION, str(error))
+            self._sum = None  # the transmitted data can no longer be read
 
 
 def answer_to(finished: Finished) -> Ack:
@@ -338,7 +369,7 @@ class Receiver:
         self._file = -1
         self._ranges = Ranges(record.ranges)
         self._dirty = True
-        self._naks: deque[Nak] = deque()
+        self._asked_to: int | None = None  # offset up to which gaps are requested in the current round
         self._sum: FileSum | None = None
         self._finish = Timer(FINISHED_NS, now_ns - FINISHED_NS)
         self._lack = Timer(LACK_NS, now_ns - (LACK_NS if record.name is not None else 0))
@@ -377,11 +408,19 @@ class Receiver:
         if self._whole():
             self._go_on_checking()
             return None
+        if self.record.suspended:
+            return None
         timer = self._lack if self.record.end is not None else self._silence
-        if not self._naks and timer.due(now_ns):
+        if self._asked_to is None and timer.due(now_ns):
             timer.asked(now_ns)
-            self._naks.extend(self._requests())
-        return self._naks.popleft() if self._naks else None
+            self._asked_to = 0
+        return None if self._asked_to is None else self._next_request(self._asked_to)
+
+    def suspend(self, suspended: bool) -> None:
+        """Suspend or resume the requests for missing data. Raises FileError if the disk cannot be written."""
+        self.record = msgspec.structs.replace(self.record, suspended=suspended)
+        self._dirty = True
+        self.keep()
 
     def keep(self) -> None:
         """Sync the received data to disk and then store the record of received ranges. Raises FileError."""
@@ -413,6 +452,8 @@ class Receiver:
         problem = problem_of_name(metadata.name) or self._accept(metadata)
         if not problem and metadata.checksum_type not in TYPES:
             problem = f"checksums of type {metadata.checksum_type} are not known"
+            self.stop(Condition.UNSUPPORTED_CHECKSUM, problem)
+            return
         if not problem and metadata.size > min(self._most, self._store.room()):
             problem = f"{metadata.size} bytes are too many"
         if problem:
@@ -452,15 +493,16 @@ class Receiver:
 
     def _whole(self) -> bool:
         end = self.record.end
-        return self.record.name is not None and end is not None and not self._ranges.gaps(end[1])
+        return self.record.name is not None and end is not None and self._ranges.cover(end[1])
 
-    def _requests(self) -> list[Nak]:
+    def _next_request(self, begin: int) -> Nak | None:
+        """Return the request for the next gaps from offset `begin`, None at the end of the file."""
         size = self.record.end[1] if self.record.end is not None else self.record.size
-        gaps = self._ranges.gaps(size)
-        if self.record.name is None:
+        gaps = self._ranges.gaps(begin, size, MOST_REQUESTS - 1)
+        self._asked_to = gaps[-1][1] if gaps and gaps[-1][1] < size else None
+        if self.record.name is None and begin == 0:
             gaps.insert(0, (0, 0))
-        parts = [tuple(gaps[i : i + MOST_REQUESTS]) for i in range(0, len(gaps), MOST_REQUESTS)]
-        return [Nak(part[0][0], part[-1][1], part) for part in parts]
+        return Nak(gaps[0][0], gaps[-1][1], tuple(gaps)) if gaps else None
 
     def _go_on_checking(self) -> None:
         assert self.record.end is not None
@@ -471,7 +513,6 @@ class Receiver:
             self.stop(Condition.SIZE_ERROR, why)
             return
         if self._sum is None:
-            self._naks.clear()
             with suppress(OSError):
                 self._store.part(self.record).touch(0o600)
             self._sum = FileSum(self._store.part(self.record), self.record.kind, size)
@@ -487,7 +528,6 @@ class Receiver:
 
     def _conclude(self, condition: int, *, complete: bool, kept: FileStatus, why: str) -> None:
         self.said = why
-        self._naks.clear()
         self._dirty = True
         self.record = msgspec.structs.replace(self.record, finished=(condition, complete, kept))
         if complete:
@@ -517,6 +557,7 @@ MOST_OPEN = 8
 LONGEST_FILE = (1 << 32) - 1
 _KEEP_NS = 1_000_000_000
 _MOST_REPLIES = 64
+_SUSPENDED = "suspended"
 
 
 class Origin(NamedTuple):
@@ -543,7 +584,7 @@ class Progress:
     """Progress of a file transfer.
 
     The attribute `condition` is None while the transfer is open, and `said` is the text about the transfer's
-    end.
+    end, or states that the transfer is suspended.
     """
 
     outgoing: bool
@@ -590,8 +631,8 @@ class Entity:
     ) -> Progress:
         """Begin or continue to send a file with a checksum of type `kind`.
 
-        If a transfer of this file is already open, metadata and EOF are sent again, so that the receiver
-        requests the missing ranges. Raises FileError if the file cannot be sent.
+        If a transfer of this file is already open, it is resumed, and metadata and EOF are sent again, so
+        that the receiver requests the missing ranges. Raises FileError if the file cannot be sent.
         """
         try:
             facts = path.stat()
@@ -606,7 +647,7 @@ class Entity:
         if same is not None and (
             facts.st_mtime_ns == same.record.modified_ns or facts.st_size > same.record.size
         ):
-            same.record = msgspec.structs.replace(same.record, origin=origin)
+            same.record = msgspec.structs.replace(same.record, origin=origin, suspended=False)
             self._store.save(same.record)
             same.again()
             return _of_sender(same)
@@ -630,6 +671,15 @@ class Entity:
             self._in[source, number].stop(Condition.CANCELLED, "cancelled")
         else:
             raise FileError(f"no transfer {number} of entity {source} is open")
+
+    def suspend(self, source: int, number: int, suspended: bool) -> None:
+        """Suspend or resume a transfer. Raises FileError if there is no such transfer."""
+        side: Sender | Receiver | None = self._in.get((source, number))
+        if source == self.number:
+            side = self._out.get(number)
+        if side is None:
+            raise FileError(f"no transfer {number} of entity {source} is open")
+        side.suspend(suspended)
 
     def take(self, unit: bytes, now_ns: int) -> None:
         """Process a received PDU and ignore PDUs for other entities.
@@ -761,7 +811,7 @@ def _of_sender(sender: Sender) -> Progress:
         record.size,
         sender.sent,
         sender.condition,
-        sender.said,
+        sender.said or (_SUSPENDED if record.suspended else ""),
         Origin(*record.origin),
     )
 
@@ -770,6 +820,5 @@ def _of_receiver(receiver: Receiver) -> Progress:
     record = receiver.record
     condition = None if record.finished is None else record.finished[0]
     name = record.name or ""
-    return Progress(
-        False, record.source, record.number, name, record.size, receiver.came, condition, receiver.said
-    )
+    said = receiver.said or (_SUSPENDED if record.suspended else "")
+    return Progress(False, record.source, record.number, name, record.size, receiver.came, condition, said)

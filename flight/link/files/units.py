@@ -2,9 +2,9 @@
 
 A protocol data unit (PDU) consists of a header and either file data or a directive. The header has version 1,
 entity numbers of 2 bytes and transaction numbers of 4 bytes; the decoder also accepts other lengths. The PDUs
-contain no CRC, because the frame that carries a PDU is authenticated. The large-file option is not used. Each
-PDU is sent in a space packet of variable length, with the same headers as the other packets and a 16-bit CRC.
-The tables of packet definitions do not list the packets that carry PDUs.
+are sent without CRC, because the frame that carries a PDU is authenticated; received PDUs may have a CRC. The
+large-file option is not used. Each PDU is sent in a space packet of variable length, with the same headers as
+the other packets and a 16-bit CRC. The tables of packet definitions do not list the packets that carry PDUs.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ class Condition(IntEnum):
     FILESTORE_REJECTION = 4
     CHECKSUM_FAILURE = 5
     SIZE_ERROR = 6
+    UNSUPPORTED_CHECKSUM = 11
     CANCELLED = 15
 
 
@@ -157,8 +158,8 @@ def unpack(data: bytes) -> tuple[Transaction, Content]:
     """
     if len(data) < _FIXED_BYTES or data[0] & 0b111 << 5 != _PDU_VERSION:
         raise PduError("the bytes are not a CFDP unit of version 1")
-    if data[0] & (_UNACKNOWLEDGED | _CRC | _LARGE):
-        raise PduError("units of class 1, with a CRC or of large files are not supported")
+    if data[0] & (_UNACKNOWLEDGED | _LARGE):
+        raise PduError("units of class 1 or of large files are not supported")
     entity, number = (data[3] >> 4 & 7) + 1, (data[3] & 7) + 1
     begin = _FIXED_BYTES + 2 * entity + number
     end = begin + int.from_bytes(data[1:3], "big")
@@ -171,6 +172,10 @@ def unpack(data: bytes) -> tuple[Transaction, Content]:
     )
     if max(transaction.source, transaction.destination) >= 1 << 16 or transaction.number > HIGHEST_NUMBER:
         raise PduError("the entity exceeds 2 bytes or the transaction number 4 bytes")
+    if data[0] & _CRC:
+        if crc16(data[:end]) != 0:
+            raise PduError("the CRC of the unit is wrong")
+        end -= CRC_BYTES
     body = data[begin:end]
     try:
         if data[0] & _FILE_DATA:

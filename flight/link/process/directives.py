@@ -45,6 +45,13 @@ CANCEL_FILE = telecommand(
     Field("source", "u2", "-", "sending entity, as in the packet transfer"),
     Field("number", "u4", "-", "number of the transfer at the sending entity"),
 )
+SUSPEND_FILE = telecommand(
+    "suspend-file",
+    0x229,
+    "Suspend a transfer until it is resumed, also over restarts",
+    *CANCEL_FILE.fields,
+)
+RESUME_FILE = telecommand("resume-file", 0x22A, "Resume a suspended transfer", *CANCEL_FILE.fields)
 USE_FILE = telecommand(
     "use-file",
     0x226,
@@ -116,6 +123,28 @@ class CancelFile:
 
     def __str__(self) -> str:
         return f"cancel transfer {self.number} of entity {self.source}"
+
+
+@dataclass(frozen=True, slots=True)
+class SuspendFile:
+    """Directive to suspend a file transfer, identified by sending entity and transaction number."""
+
+    source: int
+    number: int
+
+    def __str__(self) -> str:
+        return f"suspend transfer {self.number} of entity {self.source}"
+
+
+@dataclass(frozen=True, slots=True)
+class ResumeFile:
+    """Directive to resume a file transfer, identified by sending entity and transaction number."""
+
+    source: int
+    number: int
+
+    def __str__(self) -> str:
+        return f"resume transfer {self.number} of entity {self.source}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +236,7 @@ class Listing:
         return "list scheduled commands"
 
 
-FileDirective = ListFiles | SendFile | CancelFile | UseFile | DeleteFile
+FileDirective = ListFiles | SendFile | CancelFile | SuspendFile | ResumeFile | UseFile | DeleteFile
 Directive = Play | Stop | NewKey | Scheduled | Deletion | Listing | FileDirective
 
 _PACKETS: dict[type[Any], Packet] = {
@@ -220,6 +249,8 @@ _PACKETS: dict[type[Any], Packet] = {
     ListFiles: LIST_FILES,
     SendFile: SEND_FILE,
     CancelFile: CANCEL_FILE,
+    SuspendFile: SUSPEND_FILE,
+    ResumeFile: RESUME_FILE,
     UseFile: USE_FILE,
     DeleteFile: DELETE_FILE,
 }

@@ -37,9 +37,12 @@ from flight.link.process.directives import (
     DeleteFile,
     FileDirective,
     ListFiles,
+    ResumeFile,
     SendFile,
+    SuspendFile,
     UseFile,
 )
+from flight.link.regular_files import make_lasting
 from knightcube.errors import UsageError
 
 KINDS = ("configuration", "elements", "catalogue", "release")
@@ -139,6 +142,10 @@ class Filing:
                     return self._send(self._path(name), name, entity, done, utc_ns, now_ns)
                 case CancelFile(source, number):
                     self._entity.cancel(source, number)
+                case SuspendFile(source, number):
+                    self._entity.suspend(source, number, suspended=True)
+                case ResumeFile(source, number):
+                    self._entity.suspend(source, number, suspended=False)
                 case DeleteFile(name):
                     self._received(name).unlink()
                 case UseFile(name, wanted):
@@ -187,6 +194,8 @@ class Filing:
         kind, _, rest = metadata.name.partition("/")
         if kind not in KINDS or not rest or "/" in rest:
             return f"{metadata.name}: use a name KIND/NAME with KIND one of {', '.join(KINDS)}"
+        if (self._store.received / metadata.name).exists():
+            return f"{metadata.name} exists on board: delete it first, or put it with --replace"
         taken = sum(path.stat().st_size for path in self._store.received.rglob("*") if path.is_file())
         if taken + metadata.size > MOST_RECEIVED:
             return f"{taken} of {MOST_RECEIVED} bytes are in use: delete files that are not needed"
@@ -208,25 +217,29 @@ class Filing:
         return path
 
     def _choosing(self, path: Path, name: str, wanted: bytes) -> Iterator[str | None]:
-        """Check the SHA-256 of a received file in steps and select the file.
+        """Copy a received file in steps, check the SHA-256 of the copied bytes and select the copy.
 
-        Yields None after each step, and at the end the problem or an empty text.
+        The received file may change meanwhile, but the selected file is the one that was checked. Yields None
+        after each step, and at the end the problem or an empty text.
         """
         digest = hashlib.sha256()
         kind, _, own = name.removeprefix("received/").partition("/")
-        with path.open("rb") as file:
-            while data := file.read(_PORTION):
-                digest.update(data)
-                yield None
-        if digest.digest() != wanted:
-            yield f"{name}: its SHA-256 is {digest.hexdigest()}"
-            return
         folder = self._folder / "chosen" / kind
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         beside = folder.with_name(f"{kind}~")
-        beside.unlink(missing_ok=True)
-        os.link(path, beside)
+        with path.open("rb") as file, beside.open("wb") as copy:
+            while data := file.read(_PORTION):
+                digest.update(data)
+                copy.write(data)
+                yield None
+            copy.flush()
+            os.fsync(copy.fileno())
+        if digest.digest() != wanted:
+            beside.unlink()
+            yield f"{name}: its SHA-256 is {digest.hexdigest()}"
+            return
         os.replace(beside, folder / own)
+        make_lasting(folder)
         for other in folder.iterdir():
             if other.name != own:
                 other.unlink()

@@ -108,6 +108,8 @@ DIRECTIVES: tuple[tuple[str, int, str, bool], ...] = (
     ("list-files", 0x223, f"{_ENTITY} under:S96", False),
     ("send-file", 0x224, f"{_ENTITY} {_NAME}", False),
     ("cancel-file", 0x225, "source:u2 number:u4", False),
+    ("suspend-file", 0x229, "source:u2 number:u4", False),
+    ("resume-file", 0x22A, "source:u2 number:u4", False),
     ("use-file", 0x226, f"{_NAME} sum:32u1", True),
     ("delete-file", 0x227, _NAME, True),
     ("play", 0x2A0, "run:u4 begin:f8 end:f8", False),

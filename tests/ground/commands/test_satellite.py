@@ -17,7 +17,19 @@ from flight.link.files.store import Store
 from flight.link.modes import Mode
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Request, Stage
-from flight.link.process.directives import CancelFile, Deletion, Listing, Play, Scheduled, Stop
+from flight.link.process.directives import (
+    CancelFile,
+    DeleteFile,
+    Deletion,
+    Directive,
+    ListFiles,
+    Listing,
+    Play,
+    ResumeFile,
+    Scheduled,
+    Stop,
+    SuspendFile,
+)
 from flight.link.process.filing import LISTING
 from flight.link.telemetry.definitions import (
     COMMAND,
@@ -387,9 +399,24 @@ def test_files_are_got_put_and_listed(tmp_path: Path) -> None:
     assert listed["free"] == 9
     assert "9 bytes" in listed["text"]
     put = Session(tmp_path, ([], [ending("index/a", 4)]), ([], [ending("index/a")]))
-    options = SimpleNamespace(what="put", kind="index", path=tmp_path / "a")
+    options = SimpleNamespace(what="put", kind="index", path=tmp_path / "a", replace=False)
     facts = work(put).obey(cast(Any, options))
     assert (facts["name"], facts["bytes"], put.turns) == ("received/index/a", 3, [])
+
+
+@pytest.mark.usefixtures("quiet")
+@pytest.mark.parametrize("on_board", [True, False])
+def test_a_file_on_board_is_deleted_before_it_is_replaced(tmp_path: Path, on_board: bool) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    files = [{"name": name} for name in ("received/index/ab", "received/index/a")[: 1 + on_board]]
+    (tmp_path / LISTING).write_text(json.dumps({"free": 9, "files": files}))
+    deleted = [([report(Stage.COMPLETED)], [])] if on_board else []
+    session = Session(tmp_path, ([], [ending(LISTING)]), *deleted, ([], [ending("index/a")]))
+    options = SimpleNamespace(what="put", kind="index", path=tmp_path / "a", replace=True)
+    work(session).obey(cast(Any, options))
+    name = "received/index/a"
+    assert session.asked == [ListFiles(name), *[DeleteFile(name)][: int(on_board)]]
+    assert session.turns == []
 
 
 @pytest.mark.usefixtures("quiet")
@@ -408,11 +435,17 @@ def test_a_failed_transfer_is_an_error_with_its_reason(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("quiet")
-def test_commands_on_files_end_when_they_are_completed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("word", "directive"),
+    [("cancel", CancelFile(1, 7)), ("suspend", SuspendFile(1, 7)), ("resume", ResumeFile(1, 7))],
+)
+def test_commands_on_files_end_when_they_are_completed(
+    tmp_path: Path, word: str, directive: Directive
+) -> None:
     session = Session(tmp_path, ([report(Stage.STARTED)], []), ([report(Stage.COMPLETED)], []))
-    options = cast(Any, SimpleNamespace(what="cancel", source=1, number=7))
+    options = cast(Any, SimpleNamespace(what=word, source=1, number=7))
     found = work(session).obey(options)
-    assert session.asked == [CancelFile(1, 7)]
+    assert session.asked == [directive]
     assert found["text"].startswith("completed: ")
     with pytest.raises(FlightError, match="text"):
         work(Session(tmp_path, ([report(Stage.REFUSED)], []))).obey(options)

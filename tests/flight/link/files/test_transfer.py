@@ -10,8 +10,18 @@ import numpy as np
 import pytest
 
 from flight.link.files.store import FileError, Store, problem_of_name
-from flight.link.files.transfer import CRC32, GROUND, MODULAR, MOST_OPEN, SATELLITE, Ranges
-from flight.link.files.units import Eof, FileData, Finished, Metadata, Transaction, pack, unpack
+from flight.link.files.transfer import CRC32, GROUND, MODULAR, MOST_OPEN, NO_CHECKSUM, SATELLITE, Ranges, add
+from flight.link.files.units import (
+    MOST_REQUESTS,
+    Eof,
+    FileData,
+    Finished,
+    Metadata,
+    Nak,
+    Transaction,
+    pack,
+    unpack,
+)
 from tests.flight.link.files.lossy import MOST, Pair
 
 SIZE = 200_001
@@ -24,7 +34,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", [MODULAR, CRC32])
+@pytest.mark.parametrize("kind", [MODULAR, CRC32, NO_CHECKSUM])
 @pytest.mark.parametrize("source", [SATELLITE, GROUND])
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.3])
 def test_a_file_comes_whole_and_is_closed_at_both_ends(
@@ -146,7 +156,7 @@ def test_names_that_could_leave_the_folder_are_refused(tmp_path: Path, file: Pat
     ("unit", "condition"),
     [
         (Metadata(MOST + 1, "a", "a", CRC32), 4),
-        (Metadata(10, "a", "a", 9), 4),
+        (Metadata(10, "a", "a", 9), 11),
         (FileData(8, b"abc"), 6),
         (Eof(0, 0, 11), 6),
         (Eof(15, 0, 0), 15),
@@ -208,6 +218,77 @@ def test_a_file_that_shrinks_or_is_cancelled_ends_at_both_ends(tmp_path: Path, f
         pair.ends[SATELLITE].cancel(1, 1)
 
 
+@pytest.mark.parametrize("source", [SATELLITE, GROUND])
+def test_the_eof_of_a_cancelled_transfer_states_what_was_transmitted(
+    tmp_path: Path, file: Path, source: int
+) -> None:
+    pair = Pair(tmp_path, 0.0)
+    one = pair.send(source, file, "a")
+    end = pair.ends[source]
+    sent = [unpack(unit)[1] for unit in (end.unit(0) for _ in range(40)) if unit is not None]
+    data = b"".join(content.data for content in sent if isinstance(content, FileData))
+    end.cancel(source, one.number)
+    unit = end.unit(0)
+    assert unit is not None
+    assert unpack(unit)[1] == Eof(15, add(CRC32, 0, data), len(data))
+
+
+@pytest.mark.parametrize("suspended", [SATELLITE, GROUND])
+def test_a_suspended_transfer_rests_over_a_restart_and_goes_on_when_it_is_resumed(
+    tmp_path: Path, file: Path, suspended: int
+) -> None:
+    pair = Pair(tmp_path, 0.2, seed=3)
+    number = pair.send(SATELLITE, file, "down").number
+    pair.turn(units=20)
+    pair.ends[suspended].suspend(SATELLITE, number, suspended=True)
+    pair.kill(suspended)
+    for _ in range(100):
+        pair.turn(units=20)
+    before = pair.carried
+    for _ in range(100):
+        pair.turn(units=20)
+    assert pair.ended[SATELLITE] == []
+    (shown,) = pair.ends[suspended].transfers()
+    assert (shown.condition, shown.said) == (None, "suspended")
+    assert pair.carried - before <= 1, "only the other end may ask, ever more seldom"
+    pair.ends[suspended].suspend(SATELLITE, number, suspended=False)
+    pair.until_closed()
+    assert pair.received(GROUND, "down") == file.read_bytes()
+    with pytest.raises(FileError, match="no transfer"):
+        pair.ends[SATELLITE].suspend(SATELLITE, number, suspended=True)
+
+
+def test_a_damaged_record_is_ignored(tmp_path: Path, file: Path) -> None:
+    pair = Pair(tmp_path, 0.0)
+    pair.send(SATELLITE, file, "down")
+    (path,) = (tmp_path / str(SATELLITE) / "transfers").glob("out-*.json")
+    data = path.read_bytes()
+    assert len(pair.store(SATELLITE).outgoing()) == 1
+    for position in range(len(data)):
+        path.write_bytes(data[:position] + bytes([data[position] ^ 1]) + data[position + 1 :])
+        assert pair.store(SATELLITE).outgoing() == []
+
+
+def test_many_gaps_are_requested_in_order_and_a_bounded_number_at_a_time(tmp_path: Path) -> None:
+    pair, transaction = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE)
+    end, size, pieces = pair.ends[SATELLITE], 1 << 20, 3000
+    end.take(pack(transaction, Metadata(size, "a", "a", CRC32)), 0)
+    for piece in range(pieces):
+        end.take(pack(transaction, FileData(2 * piece, b"x")), 0)
+    end.take(pack(transaction, Eof(0, 1, size)), 0)
+    naks = [unpack(unit)[1] for unit in iter(lambda: end.unit(0), None)]
+    gaps = [gap for nak in naks if isinstance(nak, Nak) for gap in nak.gaps]
+    assert gaps[:-1] == [(2 * piece + 1, 2 * piece + 2) for piece in range(pieces - 1)]
+    assert max(len(nak.gaps) for nak in naks if isinstance(nak, Nak)) < MOST_REQUESTS
+
+
+def _sliced(missing: set[int]) -> list[tuple[int, int]]:
+    """Return the first gap below 25, and the last gap, cut at 7."""
+    edges = [n for n in range(26) if (n in missing) != (n - 1 in missing)]
+    gaps = list(zip(edges[::2], edges[1::2], strict=True))
+    return gaps[:1] + [(max(begin, 7), end) for begin, end in gaps if end > 7][-1:]
+
+
 def test_the_same_file_asked_for_again_goes_on_and_a_ninth_is_refused(tmp_path: Path, file: Path) -> None:
     pair = Pair(tmp_path, 0.0)
     first = pair.send(SATELLITE, file, "a")
@@ -226,8 +307,10 @@ def test_ranges_against_a_set_of_bytes() -> None:
             ranges.add(begin, begin + length)
             known |= set(range(begin, begin + length))
             assert ranges.total == len(known)
-            missing = {n for pair in ranges.gaps(25) for n in range(*pair)}
+            missing = {n for pair in ranges.gaps(0, 25, 99) for n in range(*pair)}
             assert missing == set(range(25)) - known
+            assert ranges.gaps(0, 25, 1) + ranges.gaps(7, 25, 99)[-1:] == _sliced(missing)
+            assert ranges.cover(length) == (set(range(length)) <= known)
         taken = set[int]()
         while ranges:
             taken |= set(range(*ranges.take(3)))

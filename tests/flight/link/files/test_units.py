@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from spacepackets.cfdp import (  # type: ignore[import-untyped]  # it ships no py.typed
     ChecksumType,
     ConditionCode,
+    CrcFlag,
     DirectiveType,
     EntityIdTlv,
     PduConfig,
@@ -149,8 +150,18 @@ def test_damaged_units_are_refused_and_nothing_else_happens(noise: bytes, case: 
         assert isinstance(content, Content)
 
 
+def test_a_crc_is_checked_and_left_out_of_the_content() -> None:
+    theirs = config()
+    theirs.crc_flag = CrcFlag.WITH_CRC
+    data = bytes(FileDataPdu(theirs, FileDataParams(b"abc", 900)).pack())
+    assert unpack(data) == (TRANSACTION, FileData(900, b"abc"))
+    for position in range(4, len(data)):
+        with pytest.raises(PduError, match="CRC"):
+            unpack(data[:position] + bytes([data[position] ^ 1]) + data[position + 1 :])
+
+
 @pytest.mark.parametrize("kind", [0x24, 0x22, 0x21, 0x00, 0x40])
-def test_units_of_class_1_with_a_crc_of_large_files_and_other_versions_are_refused(kind: int) -> None:
+def test_units_of_class_1_of_large_files_and_other_versions_are_refused(kind: int) -> None:
     with pytest.raises(PduError):
         unpack(bytes((kind,)) + pack(TRANSACTION, Eof(0, 0, 0))[1:])
 

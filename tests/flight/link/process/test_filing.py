@@ -13,7 +13,15 @@ import pytest
 from flight.link.commands import CommandPacker, Ping
 from flight.link.files.units import UP, UnitPacker
 from flight.link.process import directives, filing
-from flight.link.process.directives import CancelFile, DeleteFile, ListFiles, SendFile, UseFile
+from flight.link.process.directives import (
+    CancelFile,
+    DeleteFile,
+    ListFiles,
+    ResumeFile,
+    SendFile,
+    SuspendFile,
+    UseFile,
+)
 from flight.link.process.downlink import FILES, LIVE
 from flight.link.process.filing import LISTING
 from flight.link.telemetry.definitions import TRANSFER
@@ -92,6 +100,53 @@ def test_the_last_chosen_of_a_kind_stands_alone(link: FiledEnds) -> None:
     assert [path.name for path in (folder / "received" / "elements").iterdir()] != ["b.tle"]
 
 
+def test_a_file_that_changes_while_it_is_checked_is_chosen_as_it_was_checked(
+    link: FiledEnds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(filing, "_PORTION", 1)
+    folder = link.place / "keys" / "files"
+    path = folder / "received" / "elements" / "a.tle"
+    path.parent.mkdir()
+    path.write_bytes(b"checked")
+    link.ask(UseFile("received/elements/a.tle", hashlib.sha256(b"checked").digest()))
+    link.turn(0.06)
+    other = path.with_name("b.tle")
+    other.write_bytes(b"another")
+    other.replace(path)
+    link.turn(2.0)
+    assert [report.stage.name for report in link.session.reports()][-1] == "COMPLETED"
+    assert (folder / "chosen" / "elements" / "a.tle").read_bytes() == b"checked"
+
+
+def test_a_file_on_board_is_replaced_only_after_it_was_deleted(link: FiledEnds) -> None:
+    for data, condition in ((b"first", 0), (b"second", 4)):
+        link.session.put(config(link, data), "configuration/a", link.clock.now_ns())
+        link.until_closed()
+        assert link.ended[-1].condition == condition
+    assert "exists on board" in link.session.reason_of(link.ended[-1])
+    came = link.place / "keys" / "files" / "received" / "configuration" / "a"
+    assert came.read_bytes() == b"first"
+    assert link.command(DeleteFile("received/configuration/a")) == "completed"
+    link.session.put(config(link, b"second"), "configuration/a", link.clock.now_ns())
+    link.until_closed()
+    assert came.read_bytes() == b"second"
+
+
+def test_a_file_that_was_not_asked_for_replaces_no_file_on_the_ground(link: FiledEnds) -> None:
+    link.record(*timing_packets(50))
+    name = "log/run-000001/flight-0001.ccsds"
+    kept = link.session.received / name
+    kept.parent.mkdir(parents=True)
+    kept.write_bytes(b"kept")
+    command = directives.pack(SendFile(name), 1)
+    link.terminal.send(command)
+    link.turn(3.0)
+    assert kept.read_bytes() == b"kept"
+    link.ask(SendFile(name))
+    link.until_closed()
+    assert kept.read_bytes() != b"kept"
+
+
 @pytest.mark.parametrize(
     "name", ["log/../../keys/satellite/1.a", "keys/1.a", "/etc/passwd", "log/link", "log", "received/none"]
 )
@@ -124,6 +179,8 @@ def test_wrong_units_are_refused_in_words_and_unknown_transfers_reported(link: F
     link.turn()
     assert link.stages(counter) == ["refused"]
     assert "no transfer 7" in link.command(CancelFile(1, 7))
+    assert "no transfer 7" in link.command(SuspendFile(1, 7))
+    assert "no transfer 7" in link.command(ResumeFile(1, 7))
 
 
 def test_verification_and_live_telemetry_come_before_a_file(tmp_path: Path) -> None:
@@ -149,6 +206,8 @@ def test_directives_survive_their_bytes() -> None:
         ListFiles("log/"),
         SendFile("log/a", 3),
         CancelFile(2, 7),
+        SuspendFile(2, 7),
+        ResumeFile(2, 7),
         UseFile("received/a/b", bytes(range(32))),
         DeleteFile("received/a/b"),
     ):
