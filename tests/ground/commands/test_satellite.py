@@ -14,6 +14,7 @@ import pytest
 
 from flight.link.commands import ChangeMode, Ping, Point, Slew, unpack
 from flight.link.files.store import Store
+from flight.link.files.transfer import Progress
 from flight.link.modes import Mode
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Request, Stage
@@ -410,8 +411,9 @@ def test_a_file_on_board_is_deleted_before_it_is_replaced(tmp_path: Path, on_boa
     (tmp_path / "a").write_bytes(b"abc")
     files = [{"name": name} for name in ("received/index/ab", "received/index/a")[: 1 + on_board]]
     (tmp_path / LISTING).write_text(json.dumps({"free": 9, "files": files}))
-    deleted = [([report(Stage.COMPLETED)], [])] if on_board else []
-    session = Session(tmp_path, ([], [ending(LISTING)]), *deleted, ([], [ending("index/a")]))
+    answer = ([report(Stage.COMPLETED)], list[Progress]())
+    answers = [answer] if on_board else []
+    session = Session(tmp_path, ([], [ending(LISTING)]), *answers, ([], [ending("index/a")]))
     options = SimpleNamespace(what="put", kind="index", path=tmp_path / "a", replace=True)
     work(session).obey(cast(Any, options))
     name = "received/index/a"
