@@ -354,6 +354,14 @@ class BodyEstimation(Protocol):
         """Return the learned parameters, from which the next boot starts."""
         return learned_of(estimate)
 
+    def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
+        """Accept that the coil monitor multiplied the described dipoles of the coils by `change` (3,).
+
+        `deviations` (3,) are the relative standard deviations of the corrected dipoles. The default does
+        nothing, for a filter that estimates no coil apart from the others.
+        """
+        del change, deviations
+
     def knowledge(self) -> Knowledge:
         """Return how well the attitude is known now."""
         return Knowledge.FINE

@@ -58,6 +58,7 @@ import numpy as np
 from flight.loop.coil_response import (
     ELECTRICAL,
     LARGEST_GAIN,
+    LEAST_GAIN,
     MEAN,
     NEWEST,
     Bounds,
@@ -511,10 +512,12 @@ class CoilCorrection:
     Attributes:
         factors: dipole (3,) of each coil relative to the described dipole at the same current: 1 for a
             healthy coil, -1 for a reversed coil.
+        deviations: relative standard deviations (3,) of the estimated gains; zero for coils as described.
     """
 
     def __init__(self) -> None:
         self.factors: FloatArray = np.ones(3)
+        self.deviations: FloatArray = np.zeros(3)
         self._changes: list[list[int]] = [[], [], []]  # times (ns) of the changes of sign
         self._unreviewed: set[int] = set()
 
@@ -548,14 +551,29 @@ class CoilCorrection:
             self._unreviewed.discard(axis)
         return True
 
-    def weigh(self, axis: int, gain: float) -> bool:
-        """Change the gain of a coil by a factor, to at most 1, and return whether it changed."""
+    def weigh(self, axis: int, gain: float, sigma: float = 0.0) -> bool:
+        """Multiply the gain of a coil by `gain` +- `sigma`, to at most 1, and return whether it changed."""
         size = abs(float(self.factors[axis]))
         factor = min(gain, 1.0 / size)
         if factor == 1.0:
             return False
         self._multiply(axis, factor)
+        self.deviations = self.deviations.copy()
+        self.deviations[axis] = sigma / gain
         return True
+
+    def restore(self, factors: FloatArray, deviations: FloatArray) -> str:
+        """Start from the factors (3,) of an earlier boot; return why they were rejected, or "".
+
+        Args:
+            factors: signs and gains of the coils.
+            deviations: relative standard deviations of the gains.
+        """
+        sizes = np.abs(factors)
+        if factors.shape != (3,) or not ((sizes >= LEAST_GAIN) & (sizes <= 1.0)).all():
+            return f"{factors.tolist()}: not three factors from {LEAST_GAIN:g} to 1 or with the opposite sign"
+        self.factors, self.deviations = factors.copy(), deviations.copy()
+        return ""
 
     def confirm(self, axis: int) -> None:
         """End the review of a coil, because the motion of the slow body shows its torque."""
@@ -737,7 +755,8 @@ class CoilMonitor:
                     return
             for axis in (*response.axes(Finding.WEAK), *response.axes(Finding.STRONG)):
                 seen = response.text(axis)
-                if axis not in known and self.correction.weigh(axis, float(response.gain[axis])):
+                gain, sigma = float(response.gain[axis]), float(response.sigma[axis])
+                if axis not in known and self.correction.weigh(axis, gain, sigma):
                     self._apply(axis, seen, now_ns)
                     return
         if response is self._slow:
@@ -756,9 +775,22 @@ class CoilMonitor:
         """Report a change of the correction, and judge the motion again without the earlier evidence."""
         self._tell(axis, seen)
         self._weak = ""
+        self._adopt_correction()
+        for response in self._responses:
+            response.interrupted(now_ns)
+
+    def _adopt_correction(self) -> None:
         for response in self._responses:
             response.largest = LARGEST_GAIN / np.abs(self.correction.factors)
-            response.interrupted(now_ns)
+
+    def restore(self, factors: FloatArray, deviations: FloatArray) -> str:
+        """Start from the correction of an earlier boot (`CoilCorrection.restore`), and report it."""
+        problem = self.correction.restore(factors, deviations)
+        if not problem:
+            self._adopt_correction()
+            for axis in np.flatnonzero(self.correction.factors != 1.0).tolist():
+                self._tell(axis, "as before the restart")
+        return problem
 
     def _tell(self, axis: int, seen: str) -> None:
         self._news.append(f"coil {AXES[axis]}: {seen}; {self.correction.text(axis)}")

@@ -375,7 +375,7 @@ _WEAK_GAIN, _SIGMAS = 0.7, 2.5
 """Upper limit of a weak coil's gain, and number of standard deviations that must lie below the limit."""
 _STRONG_GAIN = 1.25
 """Lower limit of the gain of a coil that is stronger than assumed."""
-_LEAST_GAIN, _EXACT = 0.1, 0.1
+LEAST_GAIN, _EXACT = 0.1, 0.1
 """Smallest gain of a weak coil that is worth using, and largest standard deviation of a gain to be used."""
 _CLEARLY, _CERTAINLY, _WORSE = 9.0, 20.0, 25.0
 """Differences of weighted sums of squares. A fault of one coil must explain the motion better than a fault of
@@ -627,7 +627,7 @@ class CoilResponse:
             Finding.REVERSED: wrong,
             Finding.FEEBLE: wrong or (sure and weak),
             Finding.SOUND: sure and gain > settings.lowest_sound,
-            Finding.WEAK: exact and gain + 3.0 * sigma < _WEAK_GAIN and gain - 3.0 * sigma > _LEAST_GAIN,
+            Finding.WEAK: exact and gain + 3.0 * sigma < _WEAK_GAIN and gain - 3.0 * sigma > LEAST_GAIN,
             Finding.STRONG: exact and gain - 3.0 * sigma > _STRONG_GAIN,
         }
         for finding, holds in findings.items():

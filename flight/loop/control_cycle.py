@@ -112,6 +112,7 @@ class ControlCycle:
         # The coil driver's thread may have sent the last command late.
         coils = tasks.drive.state()
         validity = self._knowledge.look(coils, now_ns, suspected=tasks.drive.is_suspect)
+        tasks.navigation.correct_coils(tasks.drive.correction)
         tasks.navigation.commanded(coils, tasks.drive.effective(coils), validity)
         readings = tasks.navigation.update(now_ns)
         if not coils.error:

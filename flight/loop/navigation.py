@@ -15,7 +15,7 @@ from flight.link import events
 from flight.link.telemetry.definitions import IMU
 from flight.loop import facts
 from flight.loop.body import BodyEstimation
-from flight.loop.coil_monitor import CurrentValidity
+from flight.loop.coil_monitor import CoilCorrection, CurrentValidity
 from flight.loop.facts import Services
 from hal.interfaces.devices import (
     CoilState,
@@ -63,6 +63,7 @@ class Navigation:
         self, unit: InertialUnit, estimation: BodyEstimation, settings: NavigationSettings, services: Services
     ) -> None:
         self._unit = unit
+        self._estimation = estimation
         self._filter = estimation.filter
         self._feed = estimation.feed
         self._settings = settings
@@ -75,6 +76,7 @@ class Navigation:
         self._agreed_ns = 0
         self._link = unit.link()
         self._bytes_since_ns = 0
+        self._coil_factors = estimation.coil_monitor.correction.factors
         self.speed = 0.0
         """Body rate (rad/s) of the newest reading, including the gyro bias."""
 
@@ -88,6 +90,12 @@ class Navigation:
     def link(self) -> ImuLink:
         """Return the counters of the inertial unit's serial line."""
         return self._link
+
+    def correct_coils(self, correction: CoilCorrection) -> None:
+        """Pass a change of the coils' signs and gains to the estimation."""
+        if correction.factors is not self._coil_factors:
+            change, self._coil_factors = correction.factors / self._coil_factors, correction.factors
+            self._estimation.coils_corrected(change, correction.deviations)
 
     def commanded(self, in_force: CoilState, currents: FloatArray, known: CurrentValidity) -> None:
         """Pass the effective coil currents (3,), A, and whether they are known, to the filter."""

@@ -20,7 +20,7 @@ import numpy as np
 from flight.link import events
 from flight.loop import facts
 from flight.loop.body import CoilCommand, FlightBody, Steered, SteeringState, WindowedLaw
-from flight.loop.coil_monitor import CoilMonitor
+from flight.loop.coil_monitor import CoilCorrection, CoilMonitor
 from flight.loop.facts import Services
 from flight.schema.sections import Modes
 from hal.interfaces.devices import NO_AXES, Axes, CoilState, ImuReading, PowerMonitor, TorqueCoils
@@ -80,6 +80,11 @@ class CoilDrive:
     def effective(self, in_force: CoilState) -> FloatArray:
         """Return the effective currents (3,), A, of the command that the PWM chip holds."""
         return self._watch.correction.effective(in_force.current)
+
+    @property
+    def correction(self) -> CoilCorrection:
+        """Signs and gains of the coils, as estimated by the coil monitor."""
+        return self._watch.correction
 
     def off(self) -> None:
         """Switch all coils off at the end of the flight."""

@@ -4,14 +4,30 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from flight.link.telemetry.packets import to_text
+from flight.schema.reader import replace
 from ground.telemetry import Run
+from knightcube.astro.arrays import FloatArray
 from tests.support.flights import fly
-from tests.support.unlike_body import coil_judgement, configured, with_other_body, without_cameras
+from tests.support.unlike_body import (
+    coil_judgement,
+    configured,
+    with_fault,
+    with_other_body,
+    without_cameras,
+)
 
 TWO_PERCENT_OFF = (0.0066, 0.0340, 0.0326)
 """kg m^2; the configured 3U has 0.0066, 0.0333, 0.0333."""
+
+
+def _coils_and_sigma(flown: Run) -> tuple[FloatArray, FloatArray]:
+    """Return the estimated gains (3,) of the coils at the end, and their standard deviations (3,)."""
+    last = flown["description"][-1]
+    return np.diag(last["coils"].reshape(3, 3)), np.diag(last["coils_sigma"].reshape(3, 3))
 
 
 def _flown(folder: Path, duration: float, fault: str) -> Run:
@@ -29,10 +45,14 @@ def test_moments_two_percent_off_isolate_no_healthy_coil(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("axis", "yz")
 def test_a_coil_reversed_in_the_tumble_is_soon_flown_with_its_sign_changed(tmp_path: Path, axis: str) -> None:
-    found = coil_judgement(_flown(tmp_path, 60.0, f"coil-{axis}: reversed"), axis)
+    flown = _flown(tmp_path, 60.0, f"coil-{axis}: reversed")
+    found = coil_judgement(flown, axis)
     assert found["corrected_s"] is not None
     assert found["corrected_s"] < 30.0
     assert found["flown_with"] == -1.0
+    gains, sigmas = _coils_and_sigma(flown)
+    assert (np.abs(gains - 1.0) < 0.25).all(), "the filter does not learn the corrected sign again"
+    assert (sigmas > 0.01).all()
     assert found["isolated_s"] is None
     assert found["healthy_isolated"] == found["healthy_corrected"] == []
 
@@ -43,3 +63,20 @@ def test_an_open_coil_is_isolated_in_the_tumble_by_the_supply_current(tmp_path: 
     assert found["isolated_s"] is not None
     assert found["isolated_s"] < 10.0
     assert found["healthy_isolated"] == []
+
+
+def test_a_sign_found_before_a_restart_is_used_from_the_start(tmp_path: Path) -> None:
+    """The stored matrix of the coils refers to corrected dipoles, so that the correction is stored too."""
+    config, world = configured("orbit_3u")
+    state = replace(config.state, folder=str(tmp_path / "state"), period=1.0)
+    config = replace(without_cameras(config, 20.0), state=state)
+    section = with_fault(world, 1, "coil-y: reversed")
+    first = fly(config, tmp_path / "first", section=section)
+    assert coil_judgement(first, "y")["flown_with"] == -1.0
+    again = fly(config, tmp_path / "again", section=section)
+    told = [to_text(event["text"]) for event in again["event"] if to_text(event["name"]) == "coil-corrected"]
+    assert told == ["coil y: as before the restart; flown with -1.00 of its described dipole"]
+    assert coil_judgement(again, "y")["corrected_s"] < 0.1
+    gains, sigmas = _coils_and_sigma(again)
+    assert (np.abs(gains - 1.0) < 0.4).all()
+    assert (sigmas > 0.02).all()

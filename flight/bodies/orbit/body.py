@@ -15,7 +15,14 @@ import numpy as np
 from flight.bodies.orbit.coarse_attitude import CoarseSunFeed, horizon_camera_feed
 from flight.bodies.orbit.control import FieldDetumblingLaw, PointingTracker, SunAcquisitionLaw, expected_field
 from flight.bodies.orbit.environment import EstimatedEnvironment
-from flight.bodies.orbit.filter import OrbitFeed, OrbitFilter, OrbitFilterSettings, learned_of, start_from
+from flight.bodies.orbit.filter import (
+    COIL_FACTORS,
+    OrbitFeed,
+    OrbitFilter,
+    OrbitFilterSettings,
+    learned_of,
+    start_from,
+)
 from flight.bodies.orbit.guidance import (
     ObjectAim,
     PlannedCraft,
@@ -184,6 +191,10 @@ class SatelliteEstimation(BodyEstimation):
         self.filter = self.orbit_filter
         self.feed = OrbitFeed(self.orbit_filter)
         self.coil_monitor = _coil_monitor(config)
+        if COIL_FACTORS in learned:
+            factors, spread = learned[COIL_FACTORS].arrays()
+            if problem := self.coil_monitor.restore(factors, np.sqrt(spread.diagonal())):
+                self.learned_problems.append(f"{COIL_FACTORS} {problem}")
         self._sun = _sun(config, self.orbit_filter, self.environment)
         self.sun_acquisition = _sun_acquisition(config, services)
         if config.wide_cameras:
@@ -201,8 +212,14 @@ class SatelliteEstimation(BodyEstimation):
         return self.orbit_filter.acceleration_psd(time_ns)
 
     def learned(self, estimate: Estimate) -> Mapping[str, Learned]:
-        """Return the filter's slow states, with the time to which they refer."""
-        return learned_of(self.orbit_filter.slow, _utc(self._services))
+        """Return the filter's slow states, with the time to which they refer, and the coils' factors."""
+        coils = self.coil_monitor.correction
+        factors = Learned.of(coils.factors, np.diag(coils.deviations**2))
+        return {**learned_of(self.orbit_filter.slow, _utc(self._services)), COIL_FACTORS: factors}
+
+    def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
+        """Pass a correction of the coils to the filter, which forgets their matrix."""
+        self.orbit_filter.correct_coils(change, deviations)
 
     def knowledge(self) -> Knowledge:
         """Return how well the attitude is known."""

@@ -10,10 +10,11 @@ filter returns to the beginning of the step with this time, and repeats all step
 The learned states are stored for the next boot in three parts, without their cross-covariance:
 `attitude-errors` holds the biases and matrices of gyro and magnetometer and the misalignment of the star
 camera, `attitude-torques` the residual dipole in shadow and in sunlight and the torques, and `body` the
-inertia and the matrix of the coils. Another entry, `learned-at`, is the time (UTC, s) for which the learned
-states were estimated. At the next boot, the covariance of each state grows by its random walk over the
-elapsed time, and by a fraction of its initial covariance, because switching a sensor off and on changes its
-bias.
+inertia and the matrix of the coils. The matrix of the coils refers to the dipoles that the coil monitor has
+corrected. Signs and gains of the coils are therefore stored too, in the entry `coil-factors`. Another entry,
+`learned-at`, is the time (UTC, s) for which the learned states were estimated. At the next boot, the
+covariance of each state grows by its random walk over the elapsed time, and by a fraction of its initial
+covariance, because switching a sensor off and on changes its bias.
 """
 
 from __future__ import annotations
@@ -292,6 +293,21 @@ class StepReplay:
         for k in range(first, len(steps)):
             steps[k].doubt = self._settings.dipole_limit
         return self.take_again(first)
+
+    def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
+        """Multiply the dipoles of the coils by `change` (3,), and process the steps again with new coils.
+
+        The steps in which a corrected coil was driven have unknown dipoles, because the coil may have changed
+        during these steps.
+        """
+        coils = np.flatnonzero(change != 1.0)
+        for step in self.steps:
+            if step.dipole[coils].any():
+                step.doubt = self._settings.dipole_limit
+            step.dipole, step.impulse = change * step.dipole, change * step.impulse
+        memories = [step.before for step in self.steps if step.before is not None]
+        self.free.renew_coils(coils.tolist(), deviations, memories)
+        self.take_again(0)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
         """Treat the dipoles since a time as unknown, if a rejected attitude passes as a result.
@@ -673,6 +689,16 @@ class OrbitFilter:
         """Treat the coil currents since a time as unknown, and process the steps since that time again."""
         self._replay.doubt_since(since_ns)
 
+    def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
+        """Forget the matrix of the coils whose described dipole was multiplied by `change` (3,).
+
+        `deviations` (3,) are the relative standard deviations of the corrected dipoles. The filter otherwise
+        would apply a correction twice: once in the currents, and once in the matrix learned before.
+        """
+        self._close()
+        self._replay.correct_coils(change, deviations)
+        self._dipoles.unknown_ns = max(self._dipoles.unknown_ns, self.measured_ns)
+
     def accept(self, reading: ImuReading) -> bool:
         """Accept a reading, and return whether there is an estimate that agrees with the gyro."""
         if self._open is None:
@@ -813,6 +839,7 @@ class OrbitFeed:
 
 
 ERRORS, SOURCES, BODY, LEARNED_AT = "attitude-errors", "attitude-torques", "body", "learned-at"
+COIL_FACTORS = "coil-factors"
 UNKNOWN_AGE = 86_400.0
 """Largest assumed age (s) of learned states, also assumed if the clock was set back."""
 

@@ -341,6 +341,10 @@ COMMAND = Packet(
 MAX_NODES = 40
 """Maximum number of path nodes in a plan packet."""
 
+_EFFECTIVE = (
+    "currents that the coils as described need for the dipole, before the correction of sign and gain"
+)
+_WRITTEN = "currents written to the PWM chip, after the correction of sign and gain, limited and quantised"
 _Q2 = Limits(fault=(-Q2_LIMIT, Q2_LIMIT))
 
 IMU = Packet(
@@ -377,8 +381,8 @@ CONTROL = Packet(
         Field("path_rate", "f8", "rad/s", "current rate of the path"),
         Field("path_acceleration", "f8", "rad/s^2", "current angular acceleration of the path"),
         counter("plan", "number of the plan in use, 0 for none"),
-        Field("current_command", "f8", "A", "requested currents of the coils", 3),
-        Field("current_written", "f8", "A", "currents written to the PWM chip, limited and quantised", 3),
+        Field("current_command", "f8", "A", _EFFECTIVE, 3),
+        Field("current_written", "f8", "A", _WRITTEN, 3),
         flag("saturated", "whether the current of a coil was limited"),
     ),
     version=2,
@@ -502,7 +506,8 @@ NAVIGATION = Packet(
 )
 
 _INERTIA = "inertia tensor xx yy zz yz zx xy, body axes"
-_COILS = "matrix from the commanded to the actual dipole, row by row"
+_COILS = "matrix from the dipole of current_command to the actual dipole, row by row"
+_TRUE_COILS = "matrix from the dipole of current_written to the actual dipole, row by row"
 _GYRO = "matrix from the rate to the rate that the gyro measures, row by row"
 _FIELD = "matrix from the magnetic field to the field that the magnetometer measures, row by row"
 _CAMERA = "rotation vector of the star camera from its configured mounting, body axes"
@@ -607,7 +612,7 @@ TRUE_DESCRIPTION = Packet(
     "True inertia, coils and sensors of the simulated satellite, which sim_hal writes",
     (
         Field("inertia", "f8", "kg m^2", _INERTIA, 6),
-        Field("coils", "f8", "-", _COILS, 9),
+        Field("coils", "f8", "-", _TRUE_COILS, 9),
         Field("gyro", "f8", "-", _GYRO, 9),
         Field("field", "f8", "-", _FIELD, 9),
         Field("camera", "f8", "rad", _CAMERA, 3),

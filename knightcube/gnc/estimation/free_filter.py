@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -431,6 +431,30 @@ class FreeFilter:
         self.quaternion, self.rate, self.acceleration = then.quaternion, then.rate, then.acceleration
         self._constants, self.covariance = then.constants.copy(), then.covariance.copy()
         self.field_error = then.field_error
+
+    def renew_coils(
+        self, coils: Sequence[int], deviations: FloatArray, memories: Sequence[FreeMemory] = ()
+    ) -> None:
+        """Reset the matrix of some coils to that of new coils, in the estimate and in its copies `memories`.
+
+        The dipoles of these coils were corrected, so that their learned matrix refers to other dipoles.
+        The columns of the matrix become zero, without correlations to other states. The standard deviation of
+        each element is that of the settings; on the diagonal it is at least `deviations` (3,).
+        """
+        self.changes += 1
+        prior = self.layout.prior
+        for constants, covariance in (
+            (self._constants, self.covariance),
+            *((memory.constants, memory.covariance) for memory in memories),
+        ):
+            for coil in coils:
+                column = np.arange(COILS.start + coil, COILS.stop, 3)
+                constants[column] = 0.0
+                covariance[column] = covariance[:, column] = 0.0
+                covariance[np.ix_(column, column)] = prior[np.ix_(column, column)]
+                own = column[coil]
+                if prior[own, own] > 0.0:
+                    covariance[own, own] = max(prior[own, own], deviations[coil] ** 2)
 
     @property
     def gyro_bias(self) -> FloatArray:

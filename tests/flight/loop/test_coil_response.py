@@ -258,6 +258,28 @@ def test_effective_currents_and_currents_on_the_wire_are_converted_by_sign_and_g
     assert not correction.weigh(0, 1.3), "a coil is never assumed stronger than described"
 
 
+def test_a_correction_of_an_earlier_boot_is_restored_and_reported() -> None:
+    watch = CoilMonitor(CoilMonitorSettings((0.148, 0.148, 0.148)))
+    assert watch.restore(np.array([1.0, -0.5, 1.0]), np.array([0.0, 0.2, 0.0])) == ""
+    assert watch.correction.factors.tolist() == [1.0, -0.5, 1.0]
+    assert watch.correction.deviations.tolist() == [0.0, 0.2, 0.0]
+    assert watch.news() == ["coil y: as before the restart; flown with -0.50 of its described dipole"]
+
+
+@pytest.mark.parametrize("factors", [[1.0, 1.0], [1.0, 0.0, 1.0], [1.0, -1.2, 1.0], [math.nan, 1.0, 1.0]])
+def test_an_impossible_correction_of_an_earlier_boot_is_rejected(factors: list[float]) -> None:
+    watch = CoilMonitor(CoilMonitorSettings((0.148, 0.148, 0.148)))
+    assert "not three factors" in watch.restore(np.array(factors), np.zeros(3))
+    assert watch.correction.factors.tolist() == [1.0, 1.0, 1.0]
+    assert watch.news() == []
+
+
+def test_the_gain_of_a_weak_coil_is_known_as_well_as_it_was_estimated() -> None:
+    correction = CoilCorrection()
+    assert correction.weigh(1, 0.4, 0.08)
+    assert correction.deviations.tolist() == pytest.approx([0.0, 0.2, 0.0])
+
+
 @pytest.mark.parametrize(("since_ns", "kept"), [(199_999_999, True), (200_000_000, False)])
 def test_samples_that_are_200_ms_apart_begin_a_new_fit(since_ns: int, kept: bool) -> None:
     settings = ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4, free=(False, True, False))

@@ -250,3 +250,60 @@ def test_a_magnetometer_that_repeats_its_value_or_is_false_is_doubted_and_left_o
     flown.magnet = np.zeros(3)
     flown.fly(3.0)
     assert flown.filter.field_doubt == ""
+
+
+def _coil_x(flown: Flown) -> tuple[float, float]:
+    """Return the estimated gain of coil x and its standard deviation."""
+    found = flown.filter.description()
+    return float(found["coils"][0]), float(found["coils_sigma"][0])
+
+
+def test_a_correction_of_a_coil_is_applied_in_the_currents_and_not_in_the_learned_matrix_as_well() -> None:
+    """The filter has learned a gain of 0.8 before the coil monitor multiplies the dipole by 0.8."""
+    flown = acquired(pulses=True)
+    flown.carries = 0.8
+    for _ in range(8):
+        flown.fly(5.0)
+        flown.see(52 * PERIOD_NS)
+    learned, _ = _coil_x(flown)
+    assert learned < 0.9
+    flown.filter.correct_coils(np.array([0.8, 1.0, 1.0]), np.array([0.2, 0.0, 0.0]))
+    gain, sigma = _coil_x(flown)
+    assert gain == pytest.approx(1.0, abs=0.15)
+    assert sigma > 0.05
+    flown.carries = 1.0  # the commanded currents are now those of the corrected coil
+    assert flown.see(60 * PERIOD_NS), "a measurement from before the correction"
+    for _ in range(6):
+        flown.fly(5.0)
+        flown.see(52 * PERIOD_NS)
+    gain, sigma = _coil_x(flown)
+    assert gain == pytest.approx(1.0, abs=min(4.0 * sigma, 0.1))
+    assert flown.error() < 4.0 * flown.filter.worst_sigma
+    assert flown.filter.restarts == 0
+
+
+def test_a_measurement_from_before_a_correction_does_not_bring_the_old_matrix_back() -> None:
+    flown = acquired(pulses=True)
+    flown.carries = 0.8
+    for _ in range(8):
+        flown.fly(5.0)
+        flown.see(52 * PERIOD_NS)
+    flown.rests = True
+    flown.fly(12.0)
+    flown.filter.correct_coils(np.array([0.8, 1.0, 1.0]), np.zeros(3))
+    assert _coil_x(flown)[0] == pytest.approx(1.0, abs=0.02)
+    assert flown.see(8 * SECOND_NS)
+    assert _coil_x(flown)[0] == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_dipole_of_a_corrected_coil_is_unknown_in_the_steps_before() -> None:
+    flown = acquired(pulses=True)
+    steps = flown.filter._steps
+    driven = [step.dipole[0] for step in steps]
+    flown.filter.correct_coils(np.array([1.0, -1.0, 1.0]), np.zeros(3))
+    assert not any(step.doubt for step in steps), "coil y was never driven"
+    flown.filter.correct_coils(np.array([-1.0, 1.0, 1.0]), np.zeros(3))
+    assert [step.doubt > 0.0 for step in steps] == [dipole != 0.0 for dipole in driven]
+    assert [step.dipole[0] for step in steps] == [-dipole for dipole in driven]
+    assert any(driven)
+    assert not all(driven)

@@ -167,3 +167,30 @@ def test_the_ratios_are_known_better_than_the_inertia_when_only_the_scale_is_unc
     assert made["inertia_sigma"].max() > 0.02 * 0.0333
     np.testing.assert_allclose(made["inertia_ratio_sigma"], 0.0, atol=1e-7)
     np.testing.assert_allclose(made["coils_ratio_sigma"], 0.0, atol=1e-7)
+
+
+def test_a_corrected_coil_is_a_new_coil_and_the_other_coils_keep_what_was_learned() -> None:
+    found = FreeFilter(INERTIA, FreeFilterSettings())
+    prior = found.layout.prior.copy()
+    found.covariance[:] = 0.25 * prior + 1e-9
+    found._constants[COILS] = np.arange(1.0, 10.0)
+    then = found.memory()
+    found.renew_coils([1], np.array([0.0, 0.3, 0.0]), [then])
+    column = np.arange(COILS.start + 1, COILS.stop, 3)
+    others = np.setdiff1d(np.arange(STATES), column)
+    for constants, covariance in ((found._constants, found.covariance), (then.constants, then.covariance)):
+        assert constants[COILS].tolist() == [1.0, 0.0, 3.0, 4.0, 0.0, 6.0, 7.0, 0.0, 9.0]
+        expected = prior[column, column]
+        expected[1] = 0.3**2
+        assert covariance[column, column] == pytest.approx(expected)
+        assert not covariance[np.ix_(column, others)].any()
+        assert not covariance[np.ix_(others, column)].any()
+        kept = (0.25 * prior + 1e-9)[np.ix_(others, others)]
+        assert covariance[np.ix_(others, others)] == pytest.approx(kept)
+    assert (found.coil_matrix[:, 1] == [0.0, 1.0, 0.0]).all()
+
+
+def test_a_coil_that_is_known_exactly_stays_known() -> None:
+    found = FreeFilter(INERTIA, EXACT)
+    found.renew_coils([0, 1, 2], np.full(3, 0.3))
+    assert not found.covariance[COILS, COILS].any()
