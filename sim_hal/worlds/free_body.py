@@ -417,7 +417,7 @@ class FreeBody:
         """
         errors, tip_off, weather = generators(seed)
         multiples = section.disturbances
-        self.craft = differing(built_craft(section, errors), description)
+        self.craft = built_craft(section, errors, description)
         self.utc_start = julian_date(utc)
         self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS - start_ns
         orbit = elements(section.orbit, self.utc_start)
@@ -598,17 +598,20 @@ def released(tip_off: TipOff, generator: np.random.Generator) -> tuple[FloatArra
     return attitude, (x, y, z)
 
 
-def built_craft(section: FreeBodySection, errors: np.random.Generator) -> TrueCraft:
-    """Return the true craft of a configuration, with its errors drawn from `errors`.
+def built_craft(
+    section: FreeBodySection, errors: np.random.Generator, description: DescriptionErrors
+) -> TrueCraft:
+    """Return the true craft of a configuration.
 
-    Raises ConfigError for a craft without inertia or dipole.
+    Its disturbances are drawn from the generator `errors`, and it differs from its description by
+    `description`. Raises ConfigError for a craft without inertia or dipole.
     """
     craft = CRAFTS[section.craft] if isinstance(section.craft, str) else section.craft
     inertia, dipole = craft.inertia, craft.dipole_per_ampere
     if inertia is None or dipole is None:
         raise ConfigError("simulation.free_body.craft", "needs `inertia` and `dipole_per_ampere`")
     known = CompleteCraft(inertia=inertia, size=craft.size, dipole_per_ampere=dipole)
-    return build(known, section.disturbances, errors)
+    return _differing(build(known, section.disturbances, errors), description)
 
 
 def completed(section: FreeBodySection, config: Config) -> FreeBodySection:
@@ -636,7 +639,7 @@ def completed(section: FreeBodySection, config: Config) -> FreeBodySection:
     return msgspec.structs.replace(section, craft=craft)
 
 
-def differing(craft: TrueCraft, errors: DescriptionErrors) -> TrueCraft:
+def _differing(craft: TrueCraft, errors: DescriptionErrors) -> TrueCraft:
     """Return the craft with the errors of its description."""
     x, y, z = (np.array(craft.inertia) * errors.moments).tolist()
     turn = quaternion.from_rotation_vector(errors.axes)

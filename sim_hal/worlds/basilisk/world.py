@@ -20,6 +20,7 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, UNIX_EPOCH
 from sim_hal.clock import NEVER
+from sim_hal.description_errors import NO_ERRORS, DescriptionErrors, description_errors
 from sim_hal.settings import FreeBodySection
 from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body import (
@@ -57,6 +58,7 @@ class BasiliskWorld:
         seed: int = 1,
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
+        description: DescriptionErrors = NO_ERRORS,
     ) -> None:
         """Create the world with a body that is held still until its release.
 
@@ -65,7 +67,7 @@ class BasiliskWorld:
         if section.disturbances.gravity_gradient not in {0.0, 1.0}:
             raise ConfigError("simulation.free_body.disturbances.gravity_gradient", "is 0 or 1 in Basilisk")
         errors, tip_off, _ = generators(seed)
-        self.craft = built_craft(section, errors)
+        self.craft = built_craft(section, errors, description)
         self._attitude, rate = released(section.release, tip_off)
         self._tip_off = np.array(rate)
         self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS
@@ -219,4 +221,5 @@ def make(inputs: WorldInputs) -> BasiliskWorld:
         raise ConfigError("simulation.free_body", "is missing: this world needs it")
     supply = coil_supply(inputs)
     body = completed(section.free_body, inputs.config)
-    return BasiliskWorld(body, currents, supply, section.seed, section.utc, inputs.start_ns)
+    description = description_errors(inputs.config, section)
+    return BasiliskWorld(body, currents, supply, section.seed, section.utc, inputs.start_ns, description)
