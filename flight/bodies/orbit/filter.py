@@ -56,6 +56,7 @@ from knightcube.gnc.estimation.free_filter import (
     FreeFilterSettings,
     FreeMemory,
     SlowStates,
+    density_walk,
     plausible,
 )
 from knightcube.gnc.estimation.measurements import (
@@ -849,6 +850,8 @@ def _places(*parts: slice) -> IntArray:
     return np.asarray(np.concatenate([np.arange(part.start, part.stop) for part in parts]) - GYRO.start)
 
 
+_TORQUES = slice(TORQUES.start - GYRO.start, TORQUES.stop - GYRO.start)
+"""Indices of the sizes of the torques within the slow states."""
 PARTS = {
     ERRORS: _places(GYRO, MAGNET, GYRO_MATRIX, FIELD_MATRIX, CAMERA),
     SOURCES: _places(DIPOLE, SUNLIT, TORQUES),
@@ -890,4 +893,5 @@ def start_from(
             continue
         prior.values[at] = values
         prior.covariance[np.ix_(at, at)] = covariance + grown[np.ix_(at, at)]
+    prior.covariance[_TORQUES, _TORQUES] += age * density_walk(prior.values[_TORQUES])
     return prior, problems

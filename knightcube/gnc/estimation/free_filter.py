@@ -37,7 +37,7 @@ import numpy as np
 
 from knightcube.astro import chi_square
 from knightcube.astro.arrays import BoolArray, FloatArray, cross_matrix, cross_product, tangent_basis
-from knightcube.astro.earth.disturbance import SIZES, Pressures, box_areas, shapes
+from knightcube.astro.earth.disturbance import AIR, SIZES, Pressures, box_areas, shapes
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.quaternion import (
     attitude_matrix,
@@ -290,6 +290,8 @@ MINIMUM_FIELD_ERROR = 1e-8
 CURRENTS = 1e-7
 """Error (T per axis) of the field model due to auroral currents, which must not cause the rejection of a
 measurement."""
+AIR_WALK = 6e-3
+"""Random walk of the air density, relative to the density, per sqrt(s): 15 % in ten minutes."""
 _EYE: FloatArray = np.eye(3)
 _BODY = slice(INERTIA.start, COILS.stop)
 _FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
@@ -665,6 +667,7 @@ class FreeFilter:
         covariance[ATTITUDE, RATE] += 0.5 * dt * density
         covariance[RATE, ATTITUDE] += 0.5 * dt * density
         covariance.reshape(-1)[:: STATES + 1] += dt * self.layout.walks
+        covariance[TORQUES, TORQUES] += dt * density_walk(self._constants[TORQUES])
         self._propagate_field_error(dt)
         self._propagate_horizon(dt)
 
@@ -712,6 +715,16 @@ def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
     rows[:6, :3] -= inertia[:, None] / trace**2
     rows[6:, :3] -= coils[:, None] / trace**2
     return rows
+
+
+def density_walk(sizes: FloatArray) -> FloatArray:
+    """Return the covariance (9, 9) by which the sizes (9,) of the torques change in a second with the air.
+
+    The random walk of the density is relative, so that it scales with the torque by air.
+    """
+    walk = np.zeros((SIZES, SIZES))
+    walk[AIR, AIR] = AIR_WALK**2 * np.outer(sizes[AIR], sizes[AIR])
+    return walk
 
 
 def plausible(values: FloatArray, variances: FloatArray) -> BoolArray:

@@ -2,7 +2,8 @@
 
 Every flight has an attitude, an axis of its turn and a place in the orbit of its own; the receiver has a fix
 after a second. The star camera is blind while the Sun is near its field or lit ground in it. Flights in the
-sunlight and in the shadow are counted apart.
+sunlight and in the shadow are counted apart. Errors and claims are those of the star camera's attitude; the
+attitude of the body has the error of the mounting, too.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, as_orbit
-from ground.report.orbit import COARSE, FINE, attitude_errors
+from ground.report.orbit import COARSE, FINE, camera_errors
 from ground.report.signals import seconds
 from ground.telemetry import Run
 from sim_hal.settings import Simulation
@@ -67,7 +68,7 @@ def _world(case: Case) -> Simulation:
 
 
 def _facts(flown: Run) -> Result:
-    packets, errors = flown["navigation"], attitude_errors(flown)
+    packets, errors = flown["navigation"], camera_errors(flown)
     level, times = packets["knowledge"].astype(int), seconds(packets)
     fine_s = float(times[level == FINE][0]) if (level == FINE).any() else math.inf
     judged = errors.times > fine_s + SETTLED

@@ -20,7 +20,7 @@ import numpy as np
 from flight.bodies.orbit.body import filter_settings
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
-from ground.report.orbit import attitude_errors, dipole_errors
+from ground.report.orbit import camera_errors, dipole_errors
 from ground.report.signals import seconds
 from ground.telemetry import Run
 from knightcube.astro import quaternion
@@ -110,8 +110,11 @@ def _at_nadir(state: OrbitState) -> TipOff:
 
 
 def _facts(flown: Run, settled: float, silent: float, lit: float, last: float) -> Result:
-    """Return rms errors, deg, NEES of an axis and largest errors, sigmas, by the parts of the flight."""
-    errors, packets, truth = attitude_errors(flown), flown["navigation"], flown["orbit_truth"]
+    """Return rms errors, deg, NEES of an axis and largest errors, sigmas, by the parts of the flight.
+
+    They are those of the star camera's attitude; the attitude of the body has the error of the mounting, too.
+    """
+    errors, packets, truth = camera_errors(flown), flown["navigation"], flown["orbit_truth"]
     end = float(seconds(truth)[-1])
     parts = {"stars": (settled, silent), "sunlit": (lit - last, lit), "eclipse": (end - last, end)}
     dark = truth["sunlit"][seconds(truth) > lit] < 0.5

@@ -21,7 +21,7 @@ CRAFT = {"knightcube": 0.0959, "cubesat_3u": 0.2}
 """A m^2, the limit of each coil."""
 WATTS = {"knightcube": 54.8, "cubesat_3u": 5.0}
 """W/(A m^2)^2, of the coils."""
-ORBITS = {"sso": (500e3, 97.4), "iss": (420e3, 51.6)}
+ORBITS = {"sso": (500e3, 97.4), "iss": (420e3, 51.6), "low": (300e3, 51.6)}
 """Altitude m, inclination deg."""
 UTC = "2026-11-23T00:00:00Z"
 FIELD_NOISE, HARD_IRON = 1e-7, 1.5e-7

@@ -2,7 +2,9 @@
 
 A 3U and the KnightCube. Cells `hold` start at nadir along the flight with nothing learned and fly two
 revolutions and more; the first one teaches the filter the residual dipole and the torques and is not judged.
-Cells `day` are the same over a day, a quarter of the runs. Cells `turn` start 30 to 180 deg off nadir, Sun
+Cells `day` are the same over a day, a quarter of the runs. Cells `heavy` are the same over half a day in the
+dense air of a solar maximum; of their star attitudes it is counted how many the filter rejected, and how
+many in a row. Cells `turn` start 30 to 180 deg off nadir, Sun
 or an inertial attitude, turning at 0.3 deg/s, and fly 100 min: `arrived` counts bodies whose pointing axis
 comes within ARRIVED deg and stays there for the rest, half a revolution at least; `lost` is farther than
 LOST deg off at the end. A turn about that axis is cheap (WEIGHTS of `orbit_pointing_flight`),
@@ -41,6 +43,10 @@ HOLDS = (
 DAYS = (("cubesat_3u", 1.0), ("knightcube", 0.3))
 """Craft and share."""
 DAY = 86_400.0
+HEAVY = (("iss", 7e-12), ("low", 4e-11))
+"""Orbit, and mean density of the air (kg/m^3) during half a day at a solar maximum."""
+HEAVY_SHARE = 0.3
+"""Share of flights in heavy air: the centre of pressure is 6 mm from the centre of mass."""
 TURNS = tuple((craft, share) for share in (0.1, 1.0) for craft in ("cubesat_3u", "knightcube"))
 """Craft and share."""
 
@@ -57,6 +63,11 @@ def cases(runs: int, seed: int) -> list[Case]:
         for craft, share in DAYS if 4 * run < max(runs, 4) else ():
             same = {"kind": "day", "craft": craft, "share": share, "target": "nadir"}
             found.append(Case(f"day/{craft}/{share}/{run}", (seed, run), same | {"seconds": DAY}))
+        for craft in WATTS:
+            for orbit, density in HEAVY:
+                same = {"kind": "heavy", "craft": craft, "share": HEAVY_SHARE, "target": "nadir"}
+                air = {"orbit": orbit, "density": density, "seconds": 0.5 * DAY}
+                found.append(Case(f"heavy/{craft}/{orbit}/{run}", (seed, run), same | air))
         for craft, share in TURNS:
             same = {"kind": "turn", "craft": craft, "share": share, "target": target}
             start = {"turn_deg": turn, "speed_deg": SPIN}
@@ -75,8 +86,17 @@ def run(case: Case) -> Result:
         if not turns and flight.notes and off_goal(np.array(flight.notes[-1:])[:, 1:4])[0] > LOST:
             break
     notes = np.array(flight.notes)
-    facts = {**wanted, "hours": float(notes[-1, 0] / 3600.0)}
+    facts = {**wanted, "hours": float(notes[-1, 0] / 3600.0), **_stars(flight.passed)}
     return facts | (_arrival(wanted, notes) if turns else _hold(notes, seconds))
+
+
+def _stars(passed: Sequence[bool]) -> Result:
+    """Return how many star attitudes came and were rejected, and the largest number rejected in a row."""
+    longest = row = 0
+    for one in passed:
+        row = 0 if one else row + 1
+        longest = max(longest, row)
+    return {"stars": len(passed), "rejected": len(passed) - sum(passed), "rejected_in_a_row": longest}
 
 
 def _hold(notes: FloatArray, seconds: float) -> Result:
@@ -129,12 +149,17 @@ def _rms(values: FloatArray) -> float | None:
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return pointing errors and arrivals by craft and share."""
-    facts: dict[str, Any] = {"hold": {}, "turn": {}}
+    facts: dict[str, Any] = {"hold": {}, "heavy": {}, "turn": {}}
     held = [("hold", *cell) for cell in HOLDS] + [("day", *cell, None) for cell in DAYS]
     for kind, craft, share, wanted in held:
         mine = _of(results, kind, craft, share)
         if judged := [r for r in mine if "rms" in r]:
             facts["hold"][f"{kind}/{craft}/{share}"] = {**_held(mine, judged, WATTS[craft]), "wanted": wanted}
+    for craft in WATTS:
+        for orbit, _ in HEAVY:
+            mine = [r for r in _of(results, "heavy", craft, HEAVY_SHARE) if r["orbit"] == orbit]
+            if mine:
+                facts["heavy"][f"heavy/{craft}/{orbit}"] = _in_heavy_air(mine)
     for craft, share in TURNS:
         if mine := _of(results, "turn", craft, share):
             facts["turn"][f"turn/{craft}/{share}"] = _turned(mine, WATTS[craft])
@@ -162,6 +187,22 @@ def _held(mine: Sequence[Result], judged: Sequence[Result], watts: float) -> dic
         "nees": float(np.mean([r["nees"] for r in judged])),
         "dipole": float(np.median([r["dipole_missing"][0] for r in judged if r["dipole_missing"][0]])),
         "milliwatts": 1e3 * watts * float(np.median([r["mean_square"] for r in judged])),
+    }
+
+
+def _in_heavy_air(mine: Sequence[Result]) -> dict[str, Any]:
+    """Return flights and losses, rejected star attitudes, deg known and NEES, and deg rms of nadir."""
+    judged = [r for r in mine if "rms" in r]
+    return {
+        "runs": len(mine),
+        "lost": sum(r["lost"] for r in mine),
+        "stars": sum(r["stars"] for r in mine),
+        "rejected": sum(r["rejected"] for r in mine),
+        "in_a_row": max(r["rejected_in_a_row"] for r in mine),
+        "known": float(np.median([r["knowledge_rms"] for r in judged])) if judged else None,
+        "nees": float(np.mean([r["nees"] for r in judged])) if judged else None,
+        "nadir": float(np.median([r["nadir_rms"] for r in judged])) if judged else None,
+        "nadir_worst_run": max((r["nadir_rms"] for r in judged), default=None),
     }
 
 

@@ -8,6 +8,7 @@ pause a tenth of each two seconds for the magnetometer; star attitudes come each
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import pressures
 from knightcube.astro.earth.ephemeris import Ephemeris
+from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import (
     attitude_matrix,
@@ -38,10 +40,12 @@ from knightcube.gnc.estimation.free_filter import (
 from knightcube.gnc.guidance.three_axes.attitude_law import law_of, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from sim_hal.settings import Disturbances, TipOff
+from sim_hal.worlds.orbit import log_density
 from tests.studies.campaigns.free_flight import (
     FIELD_NOISE,
     FIX_SIGMA,
     GYRO_NOISE,
+    ORBITS,
     SECOND,
     STILL,
     WATTS,
@@ -78,7 +82,7 @@ class PointingFlight:
 
     `notes`: every 10 s the time, the true turn (3,) rad against the law, what is known wrong of the attitude,
     rad, NEES of attitude and gyro bias, A m^2 that are not known of the residual dipole, the sunlight, and
-    the coils' power, A^2 m^4.
+    the coils' power, A^2 m^4. `passed`: whether each star attitude passed the gate of the filter.
     """
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
@@ -88,9 +92,10 @@ class PointingFlight:
         self._target = target if isinstance(target, PointingTarget) else TARGETS[target]
         orbit = wanted.get("orbit", "sso")
         self.notes: list[list[float]] = []
+        self.passed: list[bool] = []
         share = wanted["share"]
         noises = Disturbances(
-            drag=share,
+            drag=share * density_ratio(orbit, wanted.get("density")),
             solar_pressure=share,
             principal_turn_deg=3.0 * share,
             **(STILL if wanted.get("still") else {}),
@@ -260,13 +265,21 @@ class PointingFlight:
     def _see_stars(self, time: float) -> None:
         """Give the filter the attitude that was exposed a cycle ago; expose the next."""
         if self._stars is not None and time % STARS_EVERY < CYCLE:
-            self._filter.attitude(self._stars, STAR_SIGMA**2 * np.eye(3), CYCLE)
+            self.passed.append(self._filter.attitude(self._stars, STAR_SIGMA**2 * np.eye(3), CYCLE))
         self._stars = self.flight.attitude(STAR_SIGMA)
 
     def _gyro(self, rate: FloatArray, seconds: float) -> FloatArray:
         flight = self.flight
         noise = GYRO_NOISE / np.sqrt(seconds) * flight.generator.standard_normal(3)
         return np.asarray(rate + flight.gyro_bias + noise)
+
+
+def density_ratio(orbit: str, density: float | None) -> float:
+    """Return a mean density of the air, kg/m^3, relative to that of the simulated world; 1 for None."""
+    if density is None:
+        return 1.0
+    position = np.array([[EARTH_RADIUS + ORBITS[orbit][0], 0.0, 0.0]])
+    return density / math.exp(float(log_density(position, np.array([[0.0, 0.0, 1.0]]), 0.0)[0]))
 
 
 def _mean(before: FloatArray, acting: FloatArray, after: FloatArray) -> FloatArray:

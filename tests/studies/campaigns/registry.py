@@ -38,6 +38,7 @@ from tests.studies.campaigns.soak import SOAK
 from tests.studies.campaigns.start import START
 from tests.studies.campaigns.streaked import STREAKED
 from tests.studies.campaigns.streaks import STREAKS, STREAKS_THESIS
+from tests.studies.campaigns.unknown_body import UNKNOWN_BODY
 from tests.studies.campaigns.unlike_inertia import UNLIKE_INERTIA
 from tests.studies.campaigns.worlds import WORLD_COMPARISON
 
@@ -69,6 +70,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         INSTALLER_KILL,
         PROCESS_KILL,
         COIL_FAULTS,
+        UNKNOWN_BODY,
         UNLIKE_INERTIA,
         SOAK,
         START,

@@ -21,12 +21,11 @@ def test_the_loop_is_judged_with_stars_and_without_in_sunlight_and_shadow() -> N
     result = eclipse.run(Case("slice", (9, 1), {"kind": "loop", "craft": "cubesat_3u", **given}))
     assert result["shadow_s"] == pytest.approx(SECONDS - LIT, abs=2.0)
     assert result["dark_share"] > 0.85, "the shadow begins when it is said to"
-    # The mountings of the cameras differ from their description by up to 0.1 deg about each axis.
-    assert result["stars"]["rms_deg"] < 0.15
-    assert result["stars"]["claim_deg"] < 0.1
+    assert result["stars"]["rms_deg"] < 0.01
+    assert result["stars"]["claim_deg"] < 0.02
     for part in ("sunlit", "eclipse"):
         assert result["stars"]["claim_deg"] < result[part]["claim_deg"] < 0.3, "no star was used"
-        assert result[part]["rms_deg"] < 0.15
+        assert result[part]["rms_deg"] < 0.1
         assert result[part]["sigmas"] < 5.0
 
 

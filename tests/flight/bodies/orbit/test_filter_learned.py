@@ -21,9 +21,11 @@ from knightcube.gnc.estimation.free_filter import (
     GYRO,
     SLOW,
     SUNLIT,
+    TORQUES,
     FreeFilter,
     FreeFilterSettings,
     SlowStates,
+    density_walk,
 )
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])
@@ -50,7 +52,14 @@ def stored(slow: SlowStates) -> dict[str, Learned]:
 
 def grown(age: float) -> FloatArray:
     """Return the variances of states that were known to a tenth, after an age, s."""
-    return np.asarray((0.1 * START) ** 2 + WALK**2 * age + (CHANGED * START) ** 2)
+    return np.asarray((0.1 * START) ** 2 + WALK**2 * age + (CHANGED * START) ** 2 + thinned(age).diagonal())
+
+
+def thinned(age: float) -> FloatArray:
+    """Return the covariance by which the density of the air changes the states during an age, s."""
+    changed, at = np.zeros_like(PRIOR), slice(TORQUES.start - GYRO.start, TORQUES.stop - GYRO.start)
+    changed[at, at] = age * density_walk(0.5 * START[at])
+    return changed
 
 
 def test_states_come_back_with_a_covariance_grown_by_their_age() -> None:
@@ -60,7 +69,7 @@ def test_states_come_back_with_a_covariance_grown_by_their_age() -> None:
         assert np.array_equal(prior.values, known().values)
         assert np.allclose(np.diag(prior.covariance), grown(age), rtol=1e-12)
         at = PARTS[SOURCES]
-        off = prior.covariance[np.ix_(at, at)] - known().covariance[np.ix_(at, at)]
+        off = prior.covariance[np.ix_(at, at)] - (known().covariance + thinned(age))[np.ix_(at, at)]
         assert np.allclose(off, np.diag(np.diag(off)), atol=1e-20), "dipole and sunlit part stay correlated"
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.disturbance import Pressures
+from knightcube.astro.earth.disturbance import AIR, Pressures
 from knightcube.astro.quaternion import (
     IDENTITY,
     attitude_matrix,
@@ -19,11 +19,13 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.gnc.estimation.error_state import Role
 from knightcube.gnc.estimation.free_filter import (
+    AIR_WALK,
     ATTITUDE,
     GYRO,
     PLAUSIBLE,
     RATE,
     SLOW,
+    TORQUES,
     FilterEnvironment,
     FreeFilter,
     FreeFilterSettings,
@@ -209,3 +211,22 @@ def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
     fly(craft, found, 30, np.zeros(3), 0.0)
     assert found.refused == 0
     assert np.abs(found.gyro_bias - BIAS).max() < 3e-5
+
+
+def test_the_torque_by_air_changes_with_its_density_and_so_by_a_fraction_of_its_size() -> None:
+    """In heavy air a walk of a constant size is too small, and the filter refuses stars in the end."""
+    settings = FreeFilterSettings(errors=NO_ERRORS)
+    prior = settings.error_state(INERTIA).prior[SLOW, SLOW]
+    first, seconds = TORQUES.start - SLOW.start + AIR.start, 100
+    grown = []
+    for size in (0.0, 8e-8):
+        values = np.zeros(len(prior))
+        values[first + 1] = size
+        found = FreeFilter(INERTIA, settings, SlowStates(values, np.zeros_like(prior)))
+        found.start(IDENTITY, STAR**2 * np.eye(3), np.zeros(3))
+        for _ in range(seconds):
+            found.advance(1.0, np.zeros(3), AROUND)
+        at = slice(TORQUES.start + AIR.start, TORQUES.start + AIR.stop)
+        grown.append(np.sqrt(np.diag(found.covariance[at, at]) / seconds))
+    np.testing.assert_allclose(grown[0], settings.torque[1])
+    np.testing.assert_allclose(grown[1], np.hypot(settings.torque[1], [0.0, AIR_WALK * 8e-8, 0.0]))

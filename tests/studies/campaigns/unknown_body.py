@@ -1,0 +1,259 @@
+"""Campaign `unknown-body`: attitude knowledge of satellites that differ from their description, in the loop.
+
+Each flight of `config/orbit.yaml` or `config/orbit_3u.yaml` begins at another place of the orbit with a
+tumble, whose rate is lower than the configured one so that all phases fit into the flight. Body, coils and
+sensors differ from the configuration within the accuracies that the configuration states
+(`simulation.free_body.errors`). The attitude is judged in each phase: tumble, acquisition, slew, and pointing
+in sunlight and in eclipse. NEES is that of one axis, from samples 10 s apart, about the body axes and about
+those of the star camera. The share of the samples beyond 5 sigma and the longest excursion are counted in all
+attitude packets (10 Hz) while the attitude is fine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from flight.link import events
+from flight.link.modes import POINTING, Mode
+from flight.schema import reader as configuration
+from flight.schema.orbit import OrbitConfig
+from ground.report.orbit import (
+    FINE,
+    WITH_STARS_S,
+    AttitudeErrors,
+    attitude_errors,
+    camera_errors,
+    detumbling_periods,
+    stars_age,
+)
+from ground.report.signals import seconds
+from ground.report.star_camera import star_camera
+from ground.telemetry import Run
+from knightcube.astro.arrays import BoolArray, FloatArray
+from sim_hal.settings import Simulation
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
+from tests.support.flights import fly
+from tests.support.unlike_body import configured
+
+SPEED = math.radians(5.0)
+"""Angular rate (rad/s) at the release."""
+FLOWN = {"orbit": 1300.0, "orbit_3u": 2400.0}
+"""Durations (s) of the flights by configuration."""
+PHASES = ("tumble", "acquisition", "slew", "sunlit", "eclipse")
+EVERY = 10.0
+"""Time (s) between the samples of a NEES."""
+BEYOND = 5.0
+"""Error of an axis, in standard deviations, beyond which a sample counts as an excursion."""
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` flights of each configuration."""
+    return [Case(f"{name}/{k}", (seed, k), {"name": name}) for k in range(runs) for name in FLOWN]
+
+
+def run(case: Case) -> Result:
+    """Fly the case; its parameters `seconds` and `speed` (rad/s) may shorten it and slow the release."""
+    given = case.parameters
+    name = given["name"]
+    config, world = _flight(name, case.seed, given.get("seconds", FLOWN[name]), given.get("speed", SPEED))
+    with TemporaryDirectory(prefix="unknown-body-") as folder:
+        flown = fly(config, Path(folder), section=world)
+    return {"name": name, **facts(flown, config)}
+
+
+def _flight(
+    name: str, seed: tuple[int, ...], duration: float, speed: float
+) -> tuple[OrbitConfig, Simulation]:
+    """Return configuration and world of a flight to the first target.
+
+    The elements are omitted, because they fit one orbit.
+    """
+    config, world = configured(name)
+    config = configuration.replace(config, elements=None, duration=duration, targets=config.targets[:1])
+    place = float(np.random.default_rng(seed).uniform(0.0, 360.0))
+    assert world.free_body is not None
+    body = configuration.replace(
+        world.free_body,
+        orbit=configuration.replace(world.free_body.orbit, true_anomaly_deg=place),
+        release=configuration.replace(world.free_body.release, speed=speed),
+    )
+    receiver = configuration.replace(world.orbit_devices, gps_start=1.0)
+    number = seed[0] * 100_003 + seed[1]
+    return config, configuration.replace(world, seed=number, free_body=body, orbit_devices=receiver)
+
+
+def facts(flown: Run, config: OrbitConfig) -> Result:
+    """Return the figures of one flight."""
+    body, camera = attitude_errors(flown), camera_errors(flown)
+    packets, stars, rates = flown["navigation"], flown["stars"], flown["streak"]
+    # A measurement that comes before the first estimate is not refused by the filter.
+    begun = body.times[0] if len(body.times) else math.inf
+    measured = np.isfinite(stars["quaternion"][:, 0]) & (seconds(stars) > begun)
+    rated = np.isfinite(rates["rate"][:, 0]) & (seconds(rates) > begun)
+    thinned = _thinned(body.times)
+    sampled = AttitudeErrors(body.times[thinned], body.error[thinned], body.sigma[thinned])
+    availability = star_camera(flown, config) or {}
+    return {
+        "phases": {
+            phase: {
+                "body": _figures(sampled, inside),
+                "camera": _figures(camera, inside_camera),
+                "stars": _figures(camera, inside_camera & (stars_age(flown, camera.times) < WITH_STARS_S)),
+            }
+            for (phase, inside), inside_camera in zip(
+                in_phases(flown, sampled.times).items(), in_phases(flown, camera.times).values(), strict=True
+            )
+        },
+        "excursions": _excursions(flown, body),
+        "restarts": int(packets["restarts"][-1]),
+        "refused": int(packets["refused"][-1]),
+        "attitudes": [int(measured.sum()), int((measured & (stars["accepted"] == 0)).sum())],
+        "rates": [int(rated.sum()), int((rated & (rates["accepted"] == 0)).sum())],
+        "inertia": _inertia(flown),
+        "unobstructed": [availability.get("unobstructed", 0), availability.get("measured", 0)],
+        "longest_gap_s": availability.get("longest_gap_s", 0.0),
+    }
+
+
+def _thinned(times: FloatArray) -> BoolArray:
+    """Return which samples are the first ones of intervals of `EVERY` s."""
+    return np.diff(np.floor(times / EVERY), prepend=-1.0) > 0.0
+
+
+def in_phases(flown: Run, times: FloatArray) -> dict[str, BoolArray]:
+    """Return which of the `times` (n,) s are in each phase.
+
+    A slew lasts from the first pointing of a target until the planned path ends.
+    """
+    modes = np.array(flown["mode"]["mode"])
+    mode = modes[np.maximum(np.searchsorted(seconds(flown["mode"]), times, side="right") - 1, 0)]
+    around = flown["orbit_truth"]
+    lit = around["sunlit"][np.minimum(np.searchsorted(seconds(around), times), len(around) - 1)] > 0.5
+    points = np.isin(mode, [int(one) for one in POINTING])
+    slews = np.zeros(len(times), dtype=bool)
+    happened = flown["event"]
+    changes = happened[np.isin(happened["code"], (events.SLEW_BEGUN.code, events.SLEW_ENDED.code))]
+    if len(changes):
+        last = np.searchsorted(seconds(changes), times, side="right") - 1
+        slews = (last >= 0) & (changes["code"][np.maximum(last, 0)] == events.SLEW_BEGUN.code)
+    return {
+        "tumble": mode == int(Mode.DETUMBLE),
+        "acquisition": mode == int(Mode.ACQUIRE),
+        "slew": points & slews,
+        "sunlit": points & ~slews & lit,
+        "eclipse": points & ~slews & ~lit,
+    }
+
+
+def _figures(errors: AttitudeErrors, inside: BoolArray) -> list[float]:
+    """Return the number of samples, and the sums of the squared errors, rad^2, of claim, and normalised."""
+    error, sigma = errors.error[inside], errors.sigma[inside]
+    sums = (np.sum(error**2), np.sum(sigma**2), np.mean((error / sigma) ** 2, axis=1).sum())
+    return [float(len(error)), *map(float, sums)]
+
+
+def _excursions(flown: Run, body: AttitudeErrors) -> dict[str, float]:
+    """Return how many samples of an axis are fine and how many are beyond, and the longest excursion, s."""
+    packets = flown["navigation"]
+    at = np.maximum(np.searchsorted(seconds(packets), body.times, side="right") - 1, 0)
+    fine = packets["knowledge"][at] == FINE
+    beyond = (np.abs(body.error) > BEYOND * body.sigma) & fine[:, None]
+    longest = begun = 0.0
+    inside = False
+    for time, out in zip(body.times.tolist(), beyond.any(axis=1).tolist(), strict=True):
+        begun = time if out and not inside else begun
+        inside = out
+        longest = max(longest, time - begun) if out else longest
+    largest = np.abs(body.error[fine]) / body.sigma[fine]
+    return {
+        "samples": 3.0 * float(fine.sum()),
+        "beyond": float(beyond.sum()),
+        "longest_s": longest,
+        "sigmas": float(largest.max()) if len(largest) else 0.0,
+    }
+
+
+def _inertia(flown: Run) -> dict[str, float] | None:
+    """Return the largest error of J / trace(J) after detumbling, its claim, and the NEES of an element."""
+    packets, true = flown["description"], flown["true_description"]
+    periods = [stop for _, stop, slowed in detumbling_periods(flown, math.inf) if slowed]
+    later = packets[seconds(packets) >= periods[0]] if periods else packets[:0]
+    if not len(later) or not len(true):
+        return None
+    found, real = later[0]["inertia"].astype(float), true[0]["inertia"].astype(float)
+    sigma = later[0]["inertia_sigma"].astype(float)
+    ratios = found / found[:3].sum() - real / real[:3].sum()
+    return {
+        "error": float(np.abs(ratios).max()),
+        "claim": float(sigma.max() / found[:3].sum()),
+        "nees": float(np.mean(((found - real) / sigma) ** 2)),
+    }
+
+
+def summarise(results: Sequence[Result], folder: Path) -> Summary:
+    """Return a row for each configuration and phase, and a row for each configuration."""
+    del folder
+    phases: dict[str, Any] = {}
+    flights: dict[str, Any] = {}
+    for name in dict.fromkeys(result["name"] for result in results):
+        mine = [result for result in results if result["name"] == name]
+        for phase in PHASES:
+            phases[f"{name}/{phase}"] = _phase([result["phases"][phase] for result in mine])
+        flights[name] = _flights(mine)
+    return summary({"phases": phases, "flights": flights})
+
+
+def _phase(parts: Sequence[Result]) -> dict[str, float | None]:
+    """Return the figures of a phase over all flights; angles are deg rms of three axes."""
+    row: dict[str, float | None] = {}
+    for name in ("body", "camera", "stars"):
+        count, error, claim, nees = np.sum([part[name] for part in parts], axis=0).tolist()
+        row[f"{name}_n"] = count
+        row[f"{name}_deg"] = math.degrees(math.sqrt(error / count)) if count else None
+        row[f"{name}_claim"] = math.degrees(math.sqrt(claim / count)) if count else None
+        row[f"{name}_nees"] = nees / count if count else None
+    worst = [part["body"][3] / part["body"][0] for part in parts if part["body"][0] >= 3.0]
+    row["worst_nees"] = max(worst, default=None)
+    return row
+
+
+def _flights(mine: Sequence[Result]) -> dict[str, Any]:
+    """Return the figures of the flights of one configuration."""
+    out = [result["excursions"] for result in mine]
+    samples, beyond = (sum(one[key] for one in out) for key in ("samples", "beyond"))
+    inertia = [result["inertia"] for result in mine if result["inertia"] is not None]
+    attitudes, rates, unobstructed = (
+        np.sum([result[key] for result in mine], axis=0).tolist()
+        for key in ("attitudes", "rates", "unobstructed")
+    )
+    return {
+        "flights": len(mine),
+        "beyond": beyond / samples if samples else None,
+        "excursion_s": max(one["longest_s"] for one in out),
+        "sigmas": max(one["sigmas"] for one in out),
+        "restarts": sum(result["restarts"] for result in mine),
+        "refused": sum(result["refused"] for result in mine),
+        "attitudes": attitudes,
+        "rates": rates,
+        "inertia_n": len(inertia),
+        "inertia_error": max((one["error"] for one in inertia), default=None),
+        "inertia_nees": float(np.mean([one["nees"] for one in inertia])) if inertia else None,
+        "available": unobstructed[1] / unobstructed[0] if unobstructed[0] else None,
+        "gap_s": max(result["longest_gap_s"] for result in mine),
+    }
+
+
+UNKNOWN_BODY = Campaign(
+    "unknown-body",
+    "attitude knowledge from tumble to pointing of satellites that differ from their description",
+    cases,
+    run,
+    summarise,
+    20,
+)

@@ -1,0 +1,50 @@
+"""A slice of the campaign of the unknown body: a KnightCube from a slow tumble to the begin of its slew."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from tests.studies.campaigns import unknown_body
+from tests.studies.campaigns.campaign import Case
+
+
+def test_a_flight_is_judged_by_phase_in_the_axes_of_body_and_star_camera(tmp_path: Path) -> None:
+    given = {"name": "orbit", "seconds": 70.0, "speed": math.radians(1.0)}
+    result = unknown_body.run(Case("slice", (3, 1), given))
+    table = unknown_body.summarise([result], tmp_path)
+    slew = table.facts["phases"]["orbit/slew"]
+    assert slew["body_n"] >= 3
+    assert slew["stars_deg"] < 0.02
+    assert slew["body_claim"] > slew["camera_claim"], "the claim of the body contains that of the mounting"
+    assert slew["camera_nees"] < 3.0
+    flight = table.facts["flights"]["orbit"]
+    assert (flight["restarts"], flight["beyond"], flight["excursion_s"]) == (0, 0.0, 0.0)
+    assert flight["attitudes"][0] > 5
+    assert flight["attitudes"][1] == 0
+
+
+def test_samples_beyond_five_sigma_and_the_longest_excursion_are_counted(tmp_path: Path) -> None:
+    part = {name: [4.0, 4e-6, 2e-6, 8.0] for name in ("body", "camera", "stars")}
+    result = {
+        "name": "orbit",
+        "phases": dict.fromkeys(unknown_body.PHASES, part),
+        "excursions": {"samples": 1000.0, "beyond": 2.0, "longest_s": 0.1, "sigmas": 5.5},
+        "restarts": 1,
+        "refused": 3,
+        "attitudes": [100, 2],
+        "rates": [10, 1],
+        "inertia": {"error": 0.002, "claim": 0.003, "nees": 0.8},
+        "unobstructed": [50, 45],
+        "longest_gap_s": 30.0,
+    }
+    facts = unknown_body.summarise([result, result], tmp_path).facts
+    phase = facts["phases"]["orbit/tumble"]
+    assert phase["body_nees"] == pytest.approx(2.0)
+    assert phase["body_deg"] == pytest.approx(math.degrees(1e-3))
+    flight = facts["flights"]["orbit"]
+    assert flight["beyond"] == pytest.approx(0.002)
+    assert flight["attitudes"] == [200, 4]
+    assert flight["available"] == pytest.approx(0.9)
