@@ -187,12 +187,12 @@ def _inertia(flown: Run) -> dict[str, float] | None:
     if not len(later) or not len(true):
         return None
     found, real = later[0]["inertia"].astype(float), true[0]["inertia"].astype(float)
-    sigma = later[0]["inertia_sigma"].astype(float)
-    ratios = found / found[:3].sum() - real / real[:3].sum()
+    error = found / found[:3].sum() - real / real[:3].sum()
+    sigma = later[0]["inertia_ratio_sigma"].astype(float)
     return {
-        "error": float(np.abs(ratios).max()),
-        "claim": float(sigma.max() / found[:3].sum()),
-        "nees": float(np.mean(((found - real) / sigma) ** 2)),
+        "error": float(np.abs(error).max()),
+        "claim": float(sigma.max()),
+        "nees": float(np.mean((error / sigma) ** 2)),
     }
 
 
