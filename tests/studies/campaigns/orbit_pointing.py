@@ -156,7 +156,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
         if judged := [r for r in mine if "rms" in r]:
             facts["hold"][f"{kind}/{craft}/{share}"] = {**_held(mine, judged, WATTS[craft]), "wanted": wanted}
     for craft in WATTS:
-        for orbit, _ in HEAVY:
+        for orbit in dict(HEAVY):
             mine = [r for r in _of(results, "heavy", craft, HEAVY_SHARE) if r["orbit"] == orbit]
             if mine:
                 facts["heavy"][f"heavy/{craft}/{orbit}"] = _in_heavy_air(mine)
