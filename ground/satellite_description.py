@@ -200,7 +200,6 @@ def _rounded_up(value: float, step: float) -> float:
 def configuration_text(satellite: Satellite, values: Derived, made: FittedElements, command: str) -> str:
     """Return the configuration file of a satellite; `command` is the command that writes the file."""
     x, y, z = satellite.size
-    rms = float(np.sqrt(np.mean(made.residuals**2)))
     orbit = satellite.orbit
     wide = [] if satellite.wide_cameras else [("wide_cameras: []", "no cameras for Sun and horizon")]
     knowledge = [] if satellite.field_of_view_deg else [("  knowledge_deg: null", "no star camera")]
@@ -233,7 +232,7 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
         *wide,
         (
             "elements:",
-            f"two-line elements [computed: fitted to one day of the orbit below, {1e-3 * rms:.2g} km rms]",
+            f"two-line elements [computed: fitted to a day of the orbit below, {1e-3 * made.rms:.2g} km rms]",
         ),
         f"  - '{made.lines[0]}'",
         f"  - '{made.lines[1]}'",

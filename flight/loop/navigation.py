@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from flight.link import events
-from flight.link.telemetry.definitions import IMU
+from flight.link.telemetry.definitions import FIX, IMU
 from flight.loop import facts
 from flight.loop.body import BodyEstimation
 from flight.loop.coil_monitor import CoilCorrection, CurrentValidity
@@ -220,6 +220,8 @@ class Navigation:
 
 CLOCK_OFF_NS = SECOND_NS
 """Largest accepted difference (ns) between the wall clock and the GPS receiver's time."""
+FIX_PERIOD_NS = 10 * SECOND_NS
+"""Shortest time (ns) between two recorded fixes."""
 
 
 class Positioning:
@@ -243,7 +245,9 @@ class Positioning:
         self._facts = services.facts
         self._streams = services.streams
         self._clock = services.clock
+        self._recorder = services.recorder
         self._fixed_ns = 0
+        self._recorded_ns: int | None = None
 
     def begin(self, time_ns: int) -> None:
         """Measure the age of the newest fix from `time_ns` on."""
@@ -260,7 +264,9 @@ class Positioning:
             if not reading.valid:
                 continue
             self._streams.note("gps", reading.time_ns)
-            if self._accept(reading):
+            used = self._accept(reading)
+            self._record(reading, used, now_ns)
+            if used:
                 self._fixed_ns = reading.time_ns
                 # Before the first fix, the position was computed with the wall clock.
                 off_ns = clock.utc_ns() - (clock.now_ns() - reading.time_ns) - reading.utc_ns
@@ -272,6 +278,23 @@ class Positioning:
         text = error or f"no usable fix for {age_ns * 1e-9:.0f} s"
         lost_now = bool(error) or age_ns > self._max_age_ns
         self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes come again")
+
+    def _record(self, reading: GpsReading, used: bool, now_ns: int) -> None:
+        """Record a fix, unless the last recorded fix is too recent."""
+        if self._recorded_ns is not None and reading.time_ns - self._recorded_ns < FIX_PERIOD_NS:
+            return
+        self._recorded_ns = reading.time_ns
+        self._recorder.record(
+            FIX,
+            now_ns,
+            utc_ns=reading.utc_ns,
+            position=reading.position,
+            velocity=reading.velocity,
+            sigma=reading.sigma,
+            velocity_sigma=reading.velocity_sigma,
+            satellites=reading.satellites,
+            used=used,
+        )
 
 
 class SunSensing:

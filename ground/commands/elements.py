@@ -6,12 +6,14 @@ import argparse
 import csv
 import json
 import sys
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from flight.app.cli import PROGRAM
 from flight.schema import reader as configuration
 from flight.schema.document import config_path, read_text
 from flight.schema.orbit import as_orbit
@@ -19,15 +21,16 @@ from ground.commands.options import finite
 from ground.telemetry import read_run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.mean_elements import FittedElements, fit_elements
-from knightcube.astro.earth.orientation import celestial_to_terrestrial
-from knightcube.astro.earth.sun import DAY
+from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from knightcube.errors import UsageError
 from sim_hal.settings import OrbitSection, Simulation
 from sim_hal.worlds.orbit import elements, julian_date, propagate
 
 _SPAN, _STEP = 86_400.0, 600.0
 """Span and interval (s) of the positions to which the elements of an orbit are fitted."""
-_COLUMNS = ("utc", "x", "y", "z")
+_COLUMNS, _VELOCITY = ("utc", "x", "y", "z"), ("vx", "vy", "vz")
+"""Columns of a CSV file of fixes: the required ones, and those of the velocity."""
 _ORBIT = ("inclination", "eccentricity", "node", "local_time", "perigee", "anomaly", "epoch")
 
 
@@ -36,13 +39,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Make two-line elements for the section `elements` of a satellite's configuration: of an orbit that "
         "is given by its altitude, of the simulated orbit of a configuration, or by a fit to positions. "
-        "Prints the elements and the distances of the positions from them. The elements of an orbit are "
-        "fitted to one day of it with the oblateness J2, without drag."
+        "Prints the elements, the distances of the positions from them, and the standard deviation of the "
+        "error along the track that builds up in a day according to these distances. Positions far outside "
+        "are rejected. The elements of an orbit are fitted to one day of it with the oblateness J2, without "
+        "drag."
     )
     parser.epilog = (
-        "example: python -m flight elements --altitude 500 --inclination 97.4 --local-time 10.5 "
-        "--epoch 2026-03-20T12:00:00"
+        "examples:\n"
+        f"  {PROGRAM} elements --altitude 500 --inclination 97.4 --epoch 2026-03-20T12:00:00\n"
+        f"  {PROGRAM} elements --config my_satellite.yaml\n"
+        f"  {PROGRAM} elements --fixes runs/mine"
     )
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument(
         "--altitude", type=finite, metavar="KM", help="semi-major axis minus 6378 km, of an orbit"
@@ -54,8 +62,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--fixes",
         type=Path,
         metavar="FILE",
-        help="CSV file of GPS fixes with the columns utc (ISO 8601), x, y and z (m, ITRS), or the folder of "
-        "a simulated run, whose true positions are fitted",
+        help="CSV file of GPS fixes with the columns utc (ISO 8601), x, y, z (m, ITRS) and, if known, vx, "
+        "vy, vz (m/s relative to the ground, ITRS), or the folder of a run, whose logged fixes are fitted",
     )
     orbit = parser.add_argument_group("with --altitude")
     orbit.add_argument("--inclination", type=finite, metavar="DEG", help="required")
@@ -78,13 +86,15 @@ def run(options: argparse.Namespace) -> int:
         given = [name for name in _ORBIT if getattr(options, name) is not None]
         if given:
             raise UsageError(f"--{given[0].replace('_', '-')}: goes with --altitude")
+    velocities = None
     if options.fixes is not None:
-        dates, positions = read_positions(options.fixes)
+        fixes = read_fixes(options.fixes)
+        dates, positions, velocities = fixes.dates, fixes.positions, fixes.velocities
     elif options.config is not None:
         dates, positions = _positions(*_configured_orbit(options.config))
     else:
         dates, positions = _positions(*_given_orbit(options))
-    made = fit_elements(dates, positions)
+    made = fit_elements(dates, positions, velocities)
     sys.stdout.write(json.dumps(_facts(made, dates)) + "\n" if options.json else _text(made, dates))
     return 0
 
@@ -131,30 +141,60 @@ def _configured_orbit(path: Path) -> tuple[OrbitSection, float]:
     return section.free_body.orbit, julian_date(section.utc)
 
 
-def read_positions(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Return Julian dates (n,) and positions (n, 3), m, ICRS, of a CSV file or of a simulated run.
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixes:
+    """Fixes of a GPS receiver.
 
-    Raises UsageError.
+    Attributes:
+        dates: (n,) Julian dates UTC.
+        positions: (n, 3) geocentric positions, m, ICRS.
+        velocities: (n, 3) geocentric velocities, m/s, ICRS, or None if they were not measured.
     """
+
+    dates: FloatArray
+    positions: FloatArray
+    velocities: FloatArray | None
+
+
+def read_fixes(path: Path) -> Fixes:
+    """Return the fixes of a CSV file, or of the flight log in the folder of a run. Raises UsageError."""
     if path.is_dir():
-        rows = read_run(path)["orbit_truth"]
+        rows = read_run(path)["fix"]
         if not len(rows):
-            raise UsageError(f"{path}: has no true positions: give a CSV file with {', '.join(_COLUMNS)}")
-        return np.asarray(rows["utc"], dtype=float), np.asarray(rows["position"], dtype=float)
-    dates, positions = [], []
+            raise UsageError(f"{path}: the flight log has no GPS fixes: give a CSV file with {_wanted()}")
+        dates = UNIX_EPOCH + rows["utc_ns"] / (1e9 * DAY)
+        return _celestial(dates, np.hstack([rows["position"], rows["velocity"]]))
+    found = []
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
-            if missing := [name for name in _COLUMNS if name not in (reader.fieldnames or ())]:
-                raise UsageError(f"{path}: the column {missing[0]} is missing: give {', '.join(_COLUMNS)}")
+            names = reader.fieldnames or ()
+            if missing := [name for name in _COLUMNS if name not in names]:
+                raise UsageError(f"{path}: the column {missing[0]} is missing: give {_wanted()}")
+            columns = [*_COLUMNS[1:], *(_VELOCITY if set(_VELOCITY) <= set(names) else ())]
             for row in reader:
                 place = f"{path}:{reader.line_num}"
-                dates.append(_date(row["utc"] or "", place))
-                ground = np.array([_number(row[name], place) for name in ("x", "y", "z")])
-                positions.append(ground @ celestial_to_terrestrial(dates[-1]))
+                found.append(
+                    [_date(row["utc"] or "", place), *(_number(row[name], place) for name in columns)]
+                )
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{path}: cannot be read: {error}") from error
-    return np.array(dates), np.array(positions).reshape(-1, 3)
+    table = np.array(found).reshape(-1, 1 + len(columns))
+    return _celestial(table[:, 0], table[:, 1:])
+
+
+def _celestial(dates: FloatArray, states: FloatArray) -> Fixes:
+    """Return fixes of states (n, 3 or 6): position and velocity with respect to the ground, ITRS."""
+    turns = np.array([celestial_to_terrestrial(float(date)) for date in dates]).reshape(-1, 3, 3)
+    positions = np.einsum("nji,nj->ni", turns, states[:, :3])
+    if states.shape[1] == 3:
+        return Fixes(dates, positions, None)
+    ground = states[:, 3:] + np.cross([0.0, 0.0, ROTATION_RATE], states[:, :3])
+    return Fixes(dates, positions, np.einsum("nji,nj->ni", turns, ground))
+
+
+def _wanted() -> str:
+    return f"{', '.join(_COLUMNS)} and, if known, {', '.join(_VELOCITY)}"
 
 
 def _number(text: str | None, place: str) -> float:
@@ -177,18 +217,22 @@ def _facts(made: FittedElements, dates: FloatArray) -> dict[str, object]:
     return {
         "elements": list(made.lines),
         "positions": len(dates),
+        "rejected": int(np.count_nonzero(~made.used)),
         "span_s": float(dates[-1] - dates[0]) * DAY,
-        "rms_m": float(np.sqrt(np.mean(made.residuals**2))),
-        "largest_m": float(made.residuals.max()),
+        "rms_m": made.rms,
+        "largest_m": float(made.residuals[made.used].max()),
+        "growth_m_per_day": made.growth,
         "residuals_m": made.residuals.tolist(),
     }
 
 
 def _text(made: FittedElements, dates: FloatArray) -> str:
-    rms, largest = float(np.sqrt(np.mean(made.residuals**2))), float(made.residuals.max())
-    hours = float(dates[-1] - dates[0]) * 24.0
+    hours, rejected = float(dates[-1] - dates[0]) * 24.0, int(np.count_nonzero(~made.used))
+    largest = float(made.residuals[made.used].max())
+    without = f", {rejected} others rejected" if rejected else ""
     return (
-        f"elements:                     # [computed: fitted to {len(dates)} positions over {hours:.3g} h, "
-        f"{1e-3 * rms:.3g} km rms, {1e-3 * largest:.3g} km at most]\n"
+        f"elements:                     # [computed: fitted to {len(dates) - rejected} positions over "
+        f"{hours:.3g} h, {1e-3 * made.rms:.3g} km rms, {1e-3 * largest:.3g} km "
+        f"at most{without}; {1e-3 * made.growth:.2g} km per day along the track]\n"
         f"  - '{made.lines[0]}'\n  - '{made.lines[1]}'\n"
     )

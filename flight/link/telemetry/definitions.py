@@ -555,6 +555,22 @@ DESCRIPTION = Packet(
     ),
 )
 
+FIX = Packet(
+    "fix",
+    0x119,
+    "0.1 Hz",
+    "Fix of the GPS receiver of a satellite in orbit",
+    (
+        Field("utc_ns", "i8", "ns", "UTC of the fix since 1970"),
+        Field("position", "f8", "m", "geocentric position, ITRS", 3),
+        Field("velocity", "f8", "m/s", "velocity with respect to the ground, ITRS", 3),
+        Field("sigma", "f4", "m", "standard deviation of the position per axis"),
+        Field("velocity_sigma", "f4", "m/s", "standard deviation of the velocity per axis"),
+        Field("satellites", "u1", "-", "number of GPS satellites"),
+        flag("used", "whether the orbit was updated; no means that the fix contradicts the known orbit"),
+    ),
+)
+
 DIRECTIONS = Packet(
     "directions",
     0x117,
@@ -866,6 +882,7 @@ PACKETS: tuple[Packet, ...] = (
     SPIN,
     NAVIGATION,
     DESCRIPTION,
+    FIX,
     DIRECTIONS,
     TARGET,
     MODE,

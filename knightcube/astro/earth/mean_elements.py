@@ -1,22 +1,23 @@
-"""Two-line elements that fit measured positions, by least squares with SGP4.
+"""Two-line elements that fit measured positions and velocities, by least squares with SGP4.
 
 The fitted parameters are the mean motion, the eccentricity vector, the inclination, the node and the mean
 argument of latitude, which remain well defined for circular orbits. The drag term is zero. The fit
 begins with the first positions, and the span is extended step by step, so that no revolution is lost between
-distant positions.
+distant positions. Positions far outside the residuals of the others are rejected.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 from sgp4.api import WGS72, Satrec
 from sgp4.exporter import export_tle
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
 from knightcube.astro.earth.orientation import mean_equator_to_celestial
@@ -26,6 +27,20 @@ _SGP4_EPOCH = 2_433_281.5
 """Julian date from which SGP4 counts days."""
 _FIRST_SPAN, _GROWTH = 2_500.0, 3.0
 """Span (s) of the positions of the first fit, and the factor by which each further fit extends the span."""
+_VELOCITY_TIME = 100.0
+"""Ratio (s) of the standard deviations of positions and velocities that is assumed in the fit."""
+_FAR, _NEAREST, _ROUNDS = 6.0, 300.0, 4
+"""Multiple of the median residual and distance (m) beyond which positions are rejected; number of fits."""
+_FIRST_ECCENTRICITY, _DIFFERENCE = 1e-3, 1e-6
+"""Eccentricity of the first guess, and relative step of the numerical derivatives.
+
+SGP4 replaces eccentricities below 1e-6, so that the derivatives of a circular orbit would be wrong. The
+components of the eccentricity vector are increased by 1 in the parameters, so that their steps are 1e-6.
+"""
+_SOON = 10.0
+"""Time (s) after the first state at which a second position is extrapolated from its velocity."""
+_PARAMETER = 1e-9 * GRAVITATIONAL_PARAMETER
+"""Gravitational parameter, km^3/s^2."""
 _FAILED = 1e6
 """Residual (km) of elements that SGP4 cannot propagate."""
 _NUMBER = 99_999
@@ -38,49 +53,111 @@ class FittedElements:
     Attributes:
         lines: the two lines.
         residuals: (n,) distances of the positions from the elements, m.
+        used: (n,) whether each position was used in the fit.
+        growth: standard deviation of the error along the track that builds up in a day, m. It follows from
+            the scatter of the residuals, without drag and other errors of the model.
     """
 
     lines: tuple[str, str]
     residuals: FloatArray
+    used: BoolArray
+    growth: float
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals of the used positions, m."""
+        return float(np.sqrt(np.mean(self.residuals[self.used] ** 2)))
 
 
-def fit_elements(dates: FloatArray, positions: FloatArray) -> FittedElements:
+def fit_elements(
+    dates: FloatArray, positions: FloatArray, velocities: FloatArray | None = None
+) -> FittedElements:
     """Return two-line elements, whose epoch is the first date, for measured positions.
 
-    Raises UsageError if there are fewer than four positions, if they are not in order of time, or if no
-    elements fit.
+    Raises UsageError if there are fewer than four positions, or two with velocities, if they are not in order
+    of time, or if no elements fit.
 
     Args:
-        dates: (n,) Julian dates UTC, ascending, of which the first two are less than half a revolution apart.
+        dates: (n,) Julian dates UTC, ascending; without velocities, the first two are less than half a
+            revolution apart.
         positions: (n, 3) geocentric positions in ICRS axes, m.
+        velocities: (n, 3) geocentric velocities in ICRS axes, m/s.
     """
-    if len(dates) < 4:
-        raise UsageError(f"{len(dates)} positions: elements need at least four positions")
-    if not (np.all(np.isfinite(positions)) and np.all(np.diff(dates) > 0.0)):
+    least = 4 if velocities is None else 2
+    if len(dates) < least:
+        wanted = f"{least} positions" if velocities is None else f"{least} fixes with velocities"
+        raise UsageError(f"{len(dates)} positions: elements need at least {wanted}")
+    states = positions if velocities is None else np.hstack([positions, velocities])
+    if not (np.all(np.isfinite(states)) and np.all(np.diff(dates) > 0.0)):
         raise UsageError("the positions must be finite, and their times must ascend")
-    epoch = float(dates[0])
-    to_icrs = np.array([mean_equator_to_celestial(float(date)) for date in dates])
-    mean_equator = 1e-3 * np.einsum("nji,nj->ni", to_icrs, positions)  # km, in the axes of SGP4
-    minutes = (dates - epoch) * 1440.0
-    parameters, span = _first_guess(mean_equator), _FIRST_SPAN / 60.0
+    fit = _Fit(dates, states)
+    parameters, span = fit.first_guess(), _FIRST_SPAN / 60.0
+    used = np.ones(len(dates), dtype=bool)
+    while (count := max(least, int(np.searchsorted(fit.minutes, span, side="right")))) < len(dates):
+        parameters = fit.solve(parameters, used & (np.arange(len(dates)) < count)).x
+        span *= _GROWTH
+    for _ in range(_ROUNDS):
+        solution = fit.solve(parameters, used)
+        parameters = solution.x
+        lines = export_tle(_satellite(parameters, fit.epoch))
+        found = distances(lines, dates, positions)
+        limit = max(_FAR * float(np.median(found)), _NEAREST)
+        if np.array_equal(used, found <= limit) or np.count_nonzero(found <= limit) < least:
+            break
+        used = found <= limit
+    return FittedElements(lines, found, used, fit.growth(solution, positions))
 
-    while True:
-        count = max(4, int(np.searchsorted(minutes, span, side="right")))
 
-        def residuals(values: FloatArray, count: int = count) -> FloatArray:
-            made = _satellite(values, epoch)
-            codes, found, _ = made.sgp4_array(
-                np.full(count, made.jdsatepoch), made.jdsatepochF + minutes[:count] / 1440.0
+class _Fit:
+    """The least-squares problem of elements for states in ICRS axes: positions, m, and velocities, m/s."""
+
+    def __init__(self, dates: FloatArray, states: FloatArray) -> None:
+        """`states` has the shape (n, 3) of positions, or (n, 6) with velocities."""
+        self.epoch = float(dates[0])
+        self.minutes = (dates - self.epoch) * 1440.0
+        to_icrs = np.array([mean_equator_to_celestial(float(date)) for date in dates])
+        parts = [
+            1e-3 * np.einsum("nji,nj->ni", to_icrs, states[:, k : k + 3])
+            for k in range(0, states.shape[1], 3)
+        ]
+        self._measured = np.hstack(parts)  # km and km/s, in the axes of SGP4
+        self._scale = np.repeat([1.0, _VELOCITY_TIME], 3)[: states.shape[1]]
+
+    def first_guess(self) -> FloatArray:
+        """Return the parameters of a nearly circular orbit through the first state or two positions."""
+        first, second = self._measured[0], self._measured[1]
+        if len(first) == 6:
+            soon = first[:3] + _SOON * first[3:]
+            guess = _first_guess(np.array([first[:3], soon]))
+            energy = 0.5 * float(first[3:] @ first[3:]) - _PARAMETER / float(np.linalg.norm(first[:3]))
+            if energy < 0.0:
+                guess[0] = 60.0 * math.sqrt((-2.0 * energy) ** 3) / _PARAMETER
+            return guess
+        return _first_guess(np.array([first, second]))
+
+    def solve(self, parameters: FloatArray, used: BoolArray) -> Any:
+        """Return the solution of SciPy for the used states, beginning with `parameters`."""
+
+        def residuals(values: FloatArray) -> FloatArray:
+            made = _satellite(values, self.epoch)
+            minutes = self.minutes[used]
+            codes, found, speed = made.sgp4_array(
+                np.full(len(minutes), made.jdsatepoch), made.jdsatepochF + minutes / 1440.0
             )
-            off = np.where(codes[:, None] == 0, found - mean_equator[:count], _FAILED)
+            modelled = np.hstack([found, speed])[:, : len(self._scale)]
+            off = np.where(codes[:, None] == 0, (modelled - self._measured[used]) * self._scale, _FAILED)
             return np.asarray(np.where(np.isfinite(off), off, _FAILED).ravel())
 
-        parameters = least_squares(residuals, parameters, method="lm").x
-        if count >= len(dates):
-            break
-        span *= _GROWTH
-    first, second = export_tle(_satellite(parameters, epoch))
-    return FittedElements((first, second), distances((first, second), dates, positions))
+        return least_squares(residuals, parameters, method="lm", diff_step=_DIFFERENCE)
+
+    def growth(self, solution: Any, positions: FloatArray) -> float:
+        """Return the standard deviation of the error along the track that builds up in a day, m."""
+        freedom = max(len(solution.fun) - len(solution.x), 1)
+        covariance = (
+            np.linalg.pinv(solution.jac.T @ solution.jac) * float(solution.fun @ solution.fun) / freedom
+        )
+        radius = float(np.mean(np.linalg.norm(positions, axis=1)))
+        return radius * math.sqrt(max(float(covariance[0, 0]), 0.0)) * 1440.0
 
 
 def distances(lines: tuple[str, str], dates: FloatArray, positions: FloatArray) -> FloatArray:
@@ -97,7 +174,7 @@ def distances(lines: tuple[str, str], dates: FloatArray, positions: FloatArray) 
 
 
 def _first_guess(positions: FloatArray) -> FloatArray:
-    """Return the parameters of a circular orbit through the first of the positions (n, 3), km."""
+    """Return the parameters of a nearly circular orbit through the first of the positions (n, 3), km."""
     normal = np.cross(positions[0], positions[1])
     length = float(np.linalg.norm(normal))
     if length < 1e-6 * float(positions[0] @ positions[0]):
@@ -111,7 +188,7 @@ def _first_guess(positions: FloatArray) -> FloatArray:
     )
     radius = 1e3 * float(np.mean(np.linalg.norm(positions[:2], axis=1)))
     motion = 60.0 * math.sqrt(GRAVITATIONAL_PARAMETER / radius**3)
-    return np.array([motion, 0.0, 0.0, inclination, node, argument])
+    return np.array([motion, 1.0 + _FIRST_ECCENTRICITY, 1.0, inclination, node, argument])
 
 
 def _satellite(parameters: FloatArray, epoch: float) -> Satrec:
@@ -119,6 +196,7 @@ def _satellite(parameters: FloatArray, epoch: float) -> Satrec:
     motion, along, across, inclination, node, argument = parameters.tolist()
     if inclination < 0.0:  # the same plane, with the node on the other side
         inclination, node, argument = -inclination, node + math.pi, argument + math.pi
+    along, across = along - 1.0, across - 1.0
     eccentricity, perigee = min(math.hypot(along, across), 0.95), math.atan2(across, along)
     made = Satrec()
     made.sgp4init(

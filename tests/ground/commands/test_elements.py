@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.telemetry import read_run
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial
 from sim_hal.worlds.orbit import julian_date
@@ -32,7 +33,8 @@ def test_the_elements_of_an_orbit_are_those_of_the_shipped_configuration() -> No
     assert (facts["positions"], facts["span_s"]) == (145, pytest.approx(86_400.0))
 
 
-def test_elements_are_fitted_to_noisy_fixes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("velocity", [False, True])
+def test_elements_are_fitted_to_noisy_fixes(velocity: bool, tmp_path: Path) -> None:
     lines = json.loads(command("elements", *ORBIT, "--json").stdout)["elements"]
     known, rng, start = (
         TwoLineElements(*lines),
@@ -42,18 +44,42 @@ def test_elements_are_fitted_to_noisy_fixes(tmp_path: Path) -> None:
     path = tmp_path / "fixes.csv"
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["utc", "x", "y", "z", "satellites"])
+        writer.writerow(["utc", "x", "y", "z", "satellites", *(["vx", "vy", "vz"] if velocity else [])])
         for minute in range(0, 720, 5):
             utc = (start + timedelta(minutes=minute)).replace(tzinfo=None).isoformat()
             date = julian_date(f"{utc}Z")
-            ground = celestial_to_terrestrial(date) @ known.at(date).position
-            writer.writerow([utc, *(ground + 10.0 * rng.standard_normal(3)), 9])
+            state, to_ground = known.at(date), celestial_to_terrestrial(date)
+            ground = to_ground @ state.position
+            speed = to_ground @ state.velocity - np.cross([0.0, 0.0, 7.292115e-5], ground)
+            noisy = ground + 10.0 * rng.standard_normal(3)
+            writer.writerow([utc, *noisy, 9, *(speed + 0.1 * rng.standard_normal(3) if velocity else [])])
     facts = json.loads(command("elements", "--fixes", path, "--json").stdout)
+    assert facts["rejected"] == 0
+    assert facts["growth_m_per_day"] < 20.0
+    shown = command("elements", "--fixes", path).stdout
+    assert "fitted to 144 positions over 11.9 h, 0.0" in shown
+    assert " km per day along the track]" in shown
     assert facts["rms_m"] == pytest.approx(10.0 * 3**0.5, rel=0.3)
     found = TwoLineElements(*facts["elements"])
     for hours in (0.0, 12.0, 24.0):
         date = julian_date("2026-03-20T12:00:00Z") + hours / 24.0
         assert np.linalg.norm(found.at(date).position - known.at(date).position) < 200.0
+
+
+@pytest.mark.slow
+def test_elements_are_fitted_to_the_fixes_in_a_flight_log(tmp_path: Path) -> None:
+    """One fix of the receiver in ten seconds is logged."""
+    out, path = tmp_path / "run", tmp_path / "mine.yaml"
+    path.write_text("extends: orbit_3u\ncamera: none\nwide_cameras: []\n", encoding="utf-8")
+    assert command("run", path, "--duration", "70", "--out", out).returncode == 0
+    facts = json.loads(command("elements", "--fixes", out, "--json").stdout)
+    assert 4 <= facts["positions"] <= 7
+    assert facts["rejected"] == 0
+    assert facts["rms_m"] < 20.0, "the columns round angles to 12 m, the receiver errs by 4 m"
+    truth = read_run(out)["orbit_truth"][-1]
+    off = TwoLineElements(*facts["elements"]).at(float(truth["utc"])).position - truth["position"]
+    assert np.linalg.norm(off) < 50.0
+    assert facts["growth_m_per_day"] > 500.0, "a minute does not determine an orbit for a day"
 
 
 @pytest.mark.parametrize(
@@ -77,10 +103,10 @@ def test_wrong_use_is_reported_in_one_line(words: tuple[str, ...], complaint: st
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("utc,x,y\n", "the column z is missing: give utc, x, y, z"),
+        ("utc,x,y\n", "the column z is missing: give utc, x, y, z and, if known, vx, vy, vz"),
         ("utc,x,y,z\n2026-03-20T12:00:00,1,2,far\n", "fixes.csv:2: 'far' is not a number"),
         ("utc,x,y,z\nnoon,1,2,3\n", "fixes.csv:2: 'noon': give a time"),
-        ("utc,x,y,z\n", "0 positions: elements need at least four"),
+        ("utc,x,y,z\n", "0 positions: elements need at least 4"),
     ],
 )
 def test_a_wrong_file_is_reported_with_its_line(tmp_path: Path, text: str, complaint: str) -> None:
