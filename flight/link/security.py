@@ -1,8 +1,11 @@
 """Link security (CCSDS 355.0-B-2): stored keys and counters, encryption, authentication, replay protection.
 
 Frames in both directions are protected by AES-256-GCM. A protected frame contains the SPI (2 bytes), the IV
-(12 bytes), the ciphertext and the MAC (16 bytes). The IV, which is the nonce, is a counter that is never
-repeated under the same key. The MAC covers the virtual channel, the SPI and the data, as in Yamcs.
+(12 bytes), the ciphertext and the MAC (16 bytes). The IV is the nonce, which must never repeat under the same
+key. It consists of a salt of 32 random bits, which each sender draws at its start, and of a counter of 64
+bits. The counter increases from frame to frame, and the receiver ignores the salt. If a folder of keys is
+restored from a backup, counters are used again, but with another salt. The MAC covers the virtual channel,
+the SPI and the data, as in Yamcs.
 
 The key and counter of each SPI are stored in two files. Each file is a record of fixed size that ends with a
 CRC-32. Both files are overwritten in place, one after the other, so that a full disk does not prevent the
@@ -46,6 +49,7 @@ OVERHEAD_BYTES = SECURITY_HEADER_BYTES + MAC_BYTES
 KEY_BYTES = 32
 
 _NO_IV = bytes(IV_BYTES)
+_SALT_BITS, _COUNTER_BITS = 32, 64
 
 
 def _authenticated(header: bytes, mask: bytes, spi: bytes) -> bytes:
@@ -53,10 +57,10 @@ def _authenticated(header: bytes, mask: bytes, spi: bytes) -> bytes:
     return masked.to_bytes(len(header), "big") + spi + _NO_IV
 
 
-def protect(cipher: AESGCM, spi: int, counter: int, header: bytes, mask: bytes, data: bytes) -> bytes:
+def protect(cipher: AESGCM, spi: int, iv: int, header: bytes, mask: bytes, data: bytes) -> bytes:
     """Return header, security header, ciphertext and MAC. The MAC covers the header bits in `mask`."""
-    index, iv = spi.to_bytes(SPI_BYTES, "big"), counter.to_bytes(IV_BYTES, "big")
-    return header + index + iv + cipher.encrypt(iv, data, _authenticated(header, mask, index))
+    index, nonce = spi.to_bytes(SPI_BYTES, "big"), iv.to_bytes(IV_BYTES, "big")
+    return header + index + nonce + cipher.encrypt(nonce, data, _authenticated(header, mask, index))
 
 
 def spi_of(protected: bytes) -> int:
@@ -66,7 +70,7 @@ def spi_of(protected: bytes) -> int:
 
 def counter_of(protected: bytes) -> int:
     """Return the counter of a frame. The counter is authentic only if `unprotect` accepts the frame."""
-    return int.from_bytes(protected[SPI_BYTES:SECURITY_HEADER_BYTES], "big")
+    return int.from_bytes(protected[SPI_BYTES:SECURITY_HEADER_BYTES], "big") % (1 << _COUNTER_BITS)
 
 
 def unprotect(cipher: AESGCM, header: bytes, mask: bytes, protected: bytes) -> bytes | None:
@@ -407,6 +411,7 @@ class Sealer:
         self._mask = mask
         self._block = block
         self._shared = shared
+        self._salt = secrets.randbits(_SALT_BITS) << _COUNTER_BITS
         self._next = 0
         self._end = 0
         self._cipher: AESGCM | None = None
@@ -428,7 +433,8 @@ class Sealer:
         assert self._cipher is not None
         counter = self._next
         self._next += 1
-        return protect(self._cipher, self._spi, counter, header, self._mask, data), counter
+        iv = self._salt | counter
+        return protect(self._cipher, self._spi, iv, header, self._mask, data), counter
 
     def _is_overtaken(self) -> bool:
         """Return whether another process has changed the key or reserved counters after this block."""

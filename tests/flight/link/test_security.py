@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import random
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def test_the_frame_is_that_of_the_standard_byte_by_byte(ground: Vault) -> None:
     frame = maker.frame(b"second")
     assert len(frame) == 5 + 2 + 12 + len(b"second") + 16 + 2
     assert frame[5:7] == b"\0\1"
-    assert frame[7:19] == (1).to_bytes(12, "big")
+    assert frame[11:19] == (1).to_bytes(8, "big"), "the counter follows 4 random bytes"
     covered = bytes([0, 0, frame[2] & 0xFC, 0, 0]) + b"\0\1" + bytes(12)
     assert AESGCM(KEYS[1]).decrypt(frame[7:19], frame[19:-2], covered) == b"second"
 
@@ -208,6 +209,23 @@ def test_a_block_of_counters_ends_when_another_sender_has_reserved_counters(grou
     order = [blocks, blocks, single, blocks, single, single, blocks, blocks]
     counters = [sealer.seal(bytes(5), b"x")[1] for sealer in order]
     assert counters == sorted(set(counters)), "the receiver refuses a counter below the highest"
+
+
+def test_no_nonce_is_used_twice_if_the_folder_is_restored_from_a_backup(ground: Vault) -> None:
+    draw = random.Random(7)
+    backup = {path: path.read_bytes() for path in ground.folder.glob("spi-*")}
+    nonces, counters = [], []
+    for _ in range(20):
+        sealer = Sealer(ground, 1, bytes(5), draw.choice((1, 64)))
+        for _ in range(5):
+            frame, counter = sealer.seal(bytes(5), b"x")
+            nonces.append(frame[7:19])
+            counters.append(counter)
+        if draw.random() < 0.5:
+            for path, data in backup.items():
+                path.write_bytes(data)
+    assert len(set(counters)) < len(counters), "no counter was used twice: the test restores nothing"
+    assert len(set(nonces)) == len(nonces)
 
 
 def test_keys_are_for_their_owner_only_and_not_in_what_is_printed(sky: Vault, tmp_path: Path) -> None:

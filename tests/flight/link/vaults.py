@@ -38,14 +38,14 @@ def gate(at: Vault) -> Gate:
     return Gate(at, COMMAND_SPIS, parse, TELECOMMAND_MASK)
 
 
-def frame_with(at: Vault, counter: int, data: bytes, spi: int = 1) -> bytes:
-    """Return an authentic telecommand frame with any counter of 96 bits, which no sealer would reserve."""
+def frame_with(at: Vault, iv: int, data: bytes, spi: int = 1) -> bytes:
+    """Return an authentic telecommand frame with any IV of 96 bits, which no sealer would use."""
     entry = at.read(spi)
     assert entry is not None
     header = TelecommandHeader(SPACECRAFT, 0, 0)
     length = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + len(data) + CRC_BYTES
     mask = TELECOMMAND_MASK
-    return close_frame(protect(entry.cipher, spi, counter, header.pack(length), mask, data))
+    return close_frame(protect(entry.cipher, spi, iv, header.pack(length), mask, data))
 
 
 class Ground:
