@@ -1,9 +1,15 @@
-"""Command `flight identify`, which estimates the testbed body's constants from a short flight."""
+"""Command `flight identify`, which gives the constants of a body that a flight has shown.
+
+For the testbed, the command flies pulses of a coil and fits the constants of the plant. The filter of a
+satellite learns its description in every flight, so the command only reads the run of a satellite.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import os
 import sys
 import tempfile
 from dataclasses import asdict, dataclass
@@ -14,9 +20,11 @@ from flight.app.cli.run import progress_on, seed_number
 from flight.app.run import RunRequest
 from flight.schema import reader as configuration
 from flight.schema.document import config_path
+from flight.schema.orbit import OrbitConfig
 from flight.schema.testbed import TestbedConfig
 from ground.commands.options import positive, write_new
 from ground.identification.fit import NAMES, UNITS, PlantFit, fit
+from ground.identification.orbit import LearnedDescription, LearnedQuantity, fragment, learned_description
 from ground.identification.record import Record, read_record
 from ground.identification.scale import (
     DURATION,
@@ -40,6 +48,18 @@ _ABSOLUTE_UNITS = {
     "torque_constant": "N m/A",
     "stiffness": "N m/rad",
     "damping": "N m s/rad",
+}
+
+_TITLES = {
+    "inertia": "inertia",
+    "coils": "coil matrix",
+    "gyro": "gyro matrix",
+    "field": "magnetometer matrix",
+    "field_bias": "magnetometer bias",
+    "camera": "star camera rotation",
+    "gyro_bias": "gyro bias",
+    "dipole": "residual dipole",
+    "sunlit_dipole": "dipole in sunlight",
 }
 
 
@@ -66,7 +86,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "coil on x and free swings, on the testbed or simulated, or from the folder of an earlier flight. "
         "The motion determines the ratios to the inertia only. The scale comes from the configuration, "
         "whose section `identification` gives the errors of inertia, dipole and field, and from the "
-        "magnetometer; the result states the contribution of each. The coils are off at the end."
+        "magnetometer; the result states the contribution of each. The coils are off at the end. For a "
+        "satellite, give the folder of a run: its filter has learned inertia, coils, sensors and residual "
+        "dipole, which are compared with the configuration and written as a file that extends it."
     )
     parser.epilog = (
         "example: python -m flight identify config/testbed.yaml --out plant.yaml --picture fit.png"
@@ -77,7 +99,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="CONFIG",
         help="YAML file, installed name such as testbed, or the folder of a run",
     )
-    parser.add_argument("--out", type=Path, metavar="YAML", help="write the section `plant` to this file")
+    parser.add_argument("--out", type=Path, metavar="YAML", help="write the constants to this file")
     parser.add_argument(
         "--run", type=Path, metavar="DIR", help="folder of the flight (default runs/NAME-TIME)"
     )
@@ -104,6 +126,9 @@ def run(options: argparse.Namespace) -> int:
                 raise UsageError(
                     f"--{name}: {options.source} is the folder of a flight, give a configuration"
                 )
+        config = configuration.load(folder / "config.yaml")
+        if isinstance(config, OrbitConfig):
+            return _show_learned(options, folder, config)
     else:
         folder = _fly(options)
     made = _identify(folder)
@@ -123,8 +148,66 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+def _show_learned(options: argparse.Namespace, folder: Path, config: OrbitConfig) -> int:
+    """Print and write what a satellite has learned in a run."""
+    if options.picture is not None:
+        raise UsageError("--picture: draws the fit of a testbed flight only")
+    found = learned_description(read_run(folder), config)
+    place = options.out.parent if options.out is not None else Path()
+    text = fragment(found, folder, os.path.relpath(folder / "config.yaml", place))
+    if options.out is not None:
+        write_new(options.out, text)
+    if options.json:
+        facts = {
+            "folder": str(folder),
+            "time_s": found.time,
+            "quantities": {name: _quantity_facts(one) for name, one in found.quantities.items()},
+            "fragment": text,
+        }
+        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
+        return 0
+    sys.stdout.write(_table(found, folder))
+    sys.stdout.write(f"\nwritten: {options.out}\n" if options.out is not None else "\n" + text)
+    return 0
+
+
+def _quantity_facts(one: LearnedQuantity) -> dict[str, Any]:
+    changes = [None if math.isnan(change) else change for change in one.change.tolist()]
+    return {
+        "unit": one.unit,
+        "learned": one.learned,
+        "described": one.described.tolist(),
+        "value": one.value.tolist(),
+        "claim": one.claim.tolist(),
+        "described_sigma": one.prior.tolist(),
+        "change_sigmas": changes,
+    }
+
+
+def _table(found: LearnedDescription, folder: Path) -> str:
+    """Return the learned values as a table."""
+    lines = [
+        f"flight: {folder}, learned up to {found.time:.0f} s",
+        "",
+        f"{'quantity':31s}{'described':>13s}{'learned':>13s}{'claim':>10s}{'change':>14s}",
+    ]
+    for one in found.quantities.values():
+        values = zip(one.labels, one.described, one.value, one.claim, one.change, strict=True)
+        unit = f" {one.unit}" if one.unit else ""
+        for label, described, value, claim, change in values:
+            title = f"{_TITLES[one.name]} {label}{unit}"
+            numbers = f"{described:13.5g}{value:13.5g}{claim:10.2g}{change:+8.1f} sigma"
+            lines.append(f"{title:31s}{numbers}{'' if one.learned else ', not learned'}")
+    return "\n".join(lines) + "\n"
+
+
 def _fly(options: argparse.Namespace) -> Path:
     """Fly the excitation and return the folder of the run."""
+    if isinstance(configuration.load(options.source), OrbitConfig):
+        raise UsageError(
+            f"{options.source}: a satellite is identified from a run: fly it with `python -m flight run`, "
+            "and give the folder of the run"
+        )
     from flight.app.flight import fly  # noqa: PLC0415 - only a flight needs devices
     from flight.app.run import default_folder  # noqa: PLC0415
 

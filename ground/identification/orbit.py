@@ -1,0 +1,249 @@
+"""The description of a satellite that its attitude filter has learned in flight.
+
+Each flight packet `description` holds the estimated inertia, coils, sensors and residual dipole with their
+standard deviations. The last packet of a run is compared with the configuration of the run, and the learned
+values are written as sections of a configuration.
+
+The motion shows only the ratios of the inertia's elements to the trace, and the ratio of the coils' dipole to
+the trace. The learned inertia is therefore scaled to the configured trace, and the coils with it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flight.bodies.orbit.body import filter_settings
+from flight.schema.orbit import OrbitConfig
+from ground.telemetry import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.inertia import inertia_problem
+from knightcube.astro.quaternion import from_rotation_vector, multiply
+from knightcube.errors import InputError
+from knightcube.gnc.estimation import free_filter as states
+from knightcube.gnc.estimation.rigid_body import BodyErrors, inertia_covariance, tensor
+
+LEARNED = 0.5
+"""Largest ratio of the claims of a learned quantity to the standard deviations in the configuration, rms."""
+_UNIFORM = math.sqrt(3.0)
+"""Largest value of a uniformly distributed error with a standard deviation of one."""
+_FRACTIONS = np.geomspace(1.0, 1e-3, 13).tolist()
+"""Fractions of the configured accuracies of the inertia that are tried."""
+_ELEMENTS = ("xx", "yy", "zz", "yz", "zx", "xy")
+_AXES = ("x", "y", "z")
+_MATRIX = tuple(a + b for a in _AXES for b in _AXES)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearnedQuantity:
+    """A quantity of the description with n elements.
+
+    Attributes:
+        name: name of the quantity.
+        labels: names of the elements.
+        unit: unit of all values.
+        described: (n,) values in the configuration of the run.
+        value: (n,) values at the end of the run.
+        claim: (n,) standard deviations of `value`.
+        prior: (n,) standard deviations of `described`.
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    unit: str
+    described: FloatArray
+    value: FloatArray
+    claim: FloatArray
+    prior: FloatArray
+
+    @property
+    def learned(self) -> bool:
+        """Whether the flight has reduced the uncertainty."""
+        return float(np.sum(self.claim**2)) < LEARNED**2 * float(np.sum(self.prior**2))
+
+    @property
+    def change(self) -> FloatArray:
+        """Differences (n,) of learned and configured values, in units of the claim; NaN without a claim."""
+        known = np.where(self.claim > 0.0, self.claim, math.nan)
+        return np.asarray((self.value - self.described) / known)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearnedDescription:
+    """The learned quantities by name, and the mission time (s) of the packet that holds them."""
+
+    config: OrbitConfig
+    time: float
+    quantities: dict[str, LearnedQuantity]
+
+
+def learned_description(run: Run, config: OrbitConfig) -> LearnedDescription:
+    """Return what the satellite had learned at the end of a run.
+
+    Raises InputError for a run without an estimate, and for a run in which nothing was learned.
+    """
+    packets = run["description"]
+    if not len(packets):
+        raise InputError(str(run.folder), "holds no description packet: the attitude was never estimated")
+    last = packets[-1]
+    inertia = config.craft.inertia_matrix()
+    trace = float(np.trace(inertia))
+    settings = filter_settings(config)
+    prior = settings.error_state(inertia).prior
+    sigma = np.sqrt(prior.diagonal())
+
+    def of(name: str) -> FloatArray:
+        return np.asarray(last[name], dtype=float)
+
+    scale = trace / float(of("inertia")[:3].sum())
+    body, eye = slice(states.INERTIA.start, states.COILS.stop), np.eye(3).ravel()
+    elements = inertia[(0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)]
+    rows = states.per_trace(elements / trace, eye)
+    ratios = np.sqrt(np.maximum((rows @ prior[body, body] @ rows.T).diagonal(), 0.0))
+    none = np.zeros(3)
+    found = [
+        LearnedQuantity(
+            "inertia",
+            _ELEMENTS,
+            "kg m^2",
+            elements,
+            scale * of("inertia"),
+            trace * of("inertia_ratio_sigma"),
+            trace * ratios[:6],
+        ),
+        LearnedQuantity("coils", _MATRIX, "", eye, scale * of("coils"), of("coils_ratio_sigma"), ratios[6:]),
+    ]
+    found += [
+        LearnedQuantity(name, labels, unit, described, of(name), of(f"{name}_sigma"), sigma[at])
+        for name, labels, unit, described, at in (
+            ("gyro", _MATRIX, "", eye, states.GYRO_MATRIX),
+            ("field", _MATRIX, "", eye, states.FIELD_MATRIX),
+            ("field_bias", _AXES, "T", none, states.MAGNET),
+            ("camera", _AXES, "rad", none, states.CAMERA),
+            ("gyro_bias", _AXES, "rad/s", none, states.GYRO),
+            ("dipole", _AXES, "A m^2", none, states.DIPOLE),
+            ("sunlit_dipole", _AXES, "A m^2", none, states.SUNLIT),
+        )
+        if name != "camera" or config.camera is not None
+    ]
+    if not any(one.learned for one in found):
+        problem = "no quantity is known twice as well as the configuration states: fly longer"
+        raise InputError(str(run.folder), problem)
+    time = float(last["time_ns"]) * 1e-9
+    return LearnedDescription(config, time, {one.name: one for one in found})
+
+
+def fragment(found: LearnedDescription, folder: Path, extends: str) -> str:
+    """Return the learned values as a configuration that extends the file `extends`.
+
+    `folder` is the folder of the run. The file also contains the accuracies of the learned values. Quantities
+    that were not learned, and the residual dipole and the gyro bias, which have no key, are omitted.
+    Raises InputError if no body has the learned inertia.
+    """
+    sections = [_craft(found), _inertial_unit(found), _camera(found)]
+    lines = [
+        f"# Made by `python -m flight identify` from {str(folder)!a} at {found.time:.0f} s; +- is 1 sigma.",
+        f"extends: {json.dumps(extends)}",
+    ]
+    return "\n".join([*lines, *itertools.chain.from_iterable(sections)]) + "\n"
+
+
+def _craft(found: LearnedDescription) -> list[str]:
+    """Return the lines of the section `craft`."""
+    one = found.quantities["inertia"]
+    if not one.learned:
+        return []
+    if problem := inertia_problem(tensor(one.value)):
+        raise InputError("the learned inertia", problem)
+    moments, axes_deg = _inertia_accuracy(found)
+    return [
+        "craft:",
+        f"  inertia:   # kg m^2 +- {one.claim.max():.2g}, scaled to the configured trace",
+        *_rows(tensor(one.value), 4),
+        f"  accuracy: {{moments: {_above(moments)}, axes_deg: {_above(axes_deg)}}}",
+    ]
+
+
+def _inertia_accuracy(found: LearnedDescription) -> tuple[float, float]:
+    """Return the smallest accuracies `moments` and `axes_deg` that contain the claims of the inertia.
+
+    They do not exceed the accuracies of the configuration.
+    """
+    one, accuracy = found.quantities["inertia"], found.config.craft.accuracy
+    inertia = tensor(one.value)
+    trace = float(np.trace(inertia))
+    rows = states.per_trace(one.value / trace, np.zeros(9))[:6, :6]
+    best, least = (accuracy.moments, accuracy.axes_deg), math.inf
+    for moments, axes_deg in itertools.product(_FRACTIONS, _FRACTIONS):
+        tried = accuracy.moments * moments, accuracy.axes_deg * axes_deg
+        covariance = inertia_covariance(inertia, BodyErrors(moments=tried[0], axes=math.radians(tried[1])))
+        variances = (rows @ covariance @ rows.T).diagonal()
+        size = float(variances.sum())
+        if size < least and bool((trace**2 * variances >= one.claim**2).all()):
+            best, least = tried, size
+    return best
+
+
+def _inertial_unit(found: LearnedDescription) -> list[str]:
+    """Return the lines of the section `inertial_unit`."""
+    gyro, field, bias = (found.quantities[name] for name in ("gyro", "field", "field_bias"))
+    unit = found.config.inertial_unit
+    known, accuracy = unit.calibration, unit.accuracy
+    values, accuracies = [], []
+    if gyro.learned:
+        # The readings were corrected by the configured matrix, so the learned matrix is the remaining error.
+        values += [f"    gyro_matrix:   # +- {gyro.claim.max():.2g}"]
+        values += _rows(np.array(known.gyro_matrix) @ gyro.value.reshape(3, 3), 6)
+        diagonal = np.eye(3, dtype=bool).ravel()
+        scale, alignment = _UNIFORM * gyro.claim[diagonal].max(), _UNIFORM * gyro.claim[~diagonal].max()
+        accuracies += [
+            f"gyro_scale: {_above(min(scale, accuracy.gyro_scale))}",
+            f"gyro_alignment: {_above(min(alignment, accuracy.gyro_alignment))}",
+        ]
+    matrix = np.array(known.field_matrix)
+    if field.learned:
+        values += [f"    field_matrix:   # +- {field.claim.max():.2g}"]
+        values += _rows(matrix @ field.value.reshape(3, 3), 6)
+        accuracies += [f"field_matrix: {_above(min(_UNIFORM * field.claim.max(), accuracy.field_matrix))}"]
+    if bias.learned:
+        numbers = np.array(known.field_bias) + matrix @ bias.value
+        values += [f"    field_bias: {_row(numbers)}   # T +- {bias.claim.max():.2g}"]
+        accuracies += [f"field_bias: {_above(min(_UNIFORM * bias.claim.max(), accuracy.field_bias))}"]
+    if not values:
+        return []
+    return ["inertial_unit:", "  calibration:", *values, f"  accuracy: {{{', '.join(accuracies)}}}"]
+
+
+def _camera(found: LearnedDescription) -> list[str]:
+    """Return the lines of the section `camera`."""
+    one, camera = found.quantities.get("camera"), found.config.camera
+    if one is None or camera is None or not one.learned:
+        return []
+    mounting = multiply(np.array(camera.mounting), from_rotation_vector(one.value))
+    largest = min(math.degrees(_UNIFORM * one.claim.max()), camera.accuracy.mounting_deg)
+    return [
+        "camera:",
+        f"  mounting: {_row(mounting / np.linalg.norm(mounting), 10)}",
+        f"  accuracy: {{mounting_deg: {_above(largest)}}}",
+    ]
+
+
+def _row(numbers: FloatArray, digits: int = 7) -> str:
+    """Return numbers as a YAML list."""
+    return f"[{', '.join(f'{number:.{digits}g}' for number in numbers)}]"
+
+
+def _rows(matrix: FloatArray, indent: int) -> list[str]:
+    """Return the rows of a matrix as lines of a YAML list."""
+    return [f"{' ' * indent}- {_row(row)}" for row in matrix]
+
+
+def _above(number: float) -> str:
+    """Return a positive number, rounded up to three digits."""
+    digits = 2 - math.floor(math.log10(number)) if number > 0.0 else 0
+    return f"{math.ceil(number * 10.0**digits - 1e-9) / 10.0**digits:.6g}"
