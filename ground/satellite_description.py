@@ -225,6 +225,8 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
         f"name: {satellite.name}",
         "",
         ("craft:", "model that the flight application uses"),
+        (f"  mass: {_text(satellite.mass)}", "kg [given]"),
+        (f"  size: [{size}]", "m, edges along the body axes [given]"),
         (f"  inertia: [{moments}]", "kg m^2, body axes [computed: homogeneous cuboid]"),
         *_coil_lines(satellite),
         "",
@@ -282,7 +284,6 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
         ("simulation:", "the simulated satellite; other values equal those above"),
         (f"  utc: '{satellite.utc}'", "begin of the flight [given]"),
         "  free_body:",
-        (f"    craft: {{size: [{size}]}}", "m [given]"),
         (f"    orbit: {{{place}}}", "m, deg, h [given]"),
         (
             f"    release: {{speed: {math.radians(satellite.release_deg):.4g}}}",
@@ -294,15 +295,21 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
 def _coil_lines(satellite: Satellite) -> list[str | tuple[str, str]]:
     """Return the lines of the coils."""
     first = satellite.coils[0]
-    resistances = ", ".join(_text(coil.resistance) for coil in satellite.coils)
+    windings = []
+    for coil in satellite.coils:
+        axis = ", ".join(_text(component) for component in coil.axis)
+        own = (
+            ""
+            if coil.current_limit == first.current_limit
+            else f", current_limit: {_text(coil.current_limit)}"
+        )
+        strength = f"dipole_per_ampere: {_text(coil.dipole_per_ampere)}, resistance: {_text(coil.resistance)}"
+        windings.append(f"    - {{axis: [{axis}], {strength}{own}}}")
     return [
-        (
-            f"  dipole_per_ampere: {_text(first.dipole_per_ampere)}",
-            f"m^2 [given: {first.dipole:.3g} A m^2 at {first.current_limit:.3g} A]",
-        ),
         "",
         "coils:",
-        (f"  resistance: [{resistances}]", "ohm, resistance of each coil [given]"),
+        ("  windings:", f"m^2 and ohm [given: {first.dipole:.3g} A m^2 at {first.current_limit:.3g} A]"),
+        *windings,
         (
             f"  supply_voltage: {_text(satellite.supply_voltage)}",
             "V across a coil that is fully on, after all losses",

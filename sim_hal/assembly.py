@@ -179,7 +179,7 @@ def _true_description(config: Config, section: Simulation, world: World) -> dict
     inertia = to_principal.T @ np.diag(craft.inertia) @ to_principal
     return {
         "inertia": inertia[(0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)],
-        "coils": craft.coil_dipole / config.craft.dipole_per_ampere,
+        "coils": config.coils.map().per_dipole(craft.coil_dipole),
         "gyro": errors.gyro,
         "field": errors.field,
         "camera": errors.camera,
@@ -195,9 +195,9 @@ def assemble_coils(
     """Build the coil hardware; the function `now_ns` returns the simulation time."""
     coils, truth = config.coils, section.truth
     pwm = EmulatedPca9685(coils.address, now_ns)
-    wired = wirings(coils.channels, truth.resistance or coils.resistance, coils.signs)
+    wired = wirings(coils.channels, truth.resistance or coils.resistance, coils.signs, coils.limits)
     supply = truth.supply_voltage or coils.supply_voltage
-    settings = CoilSettings(wired, supply, coils.current_limit, coils.stale_after)
+    settings = CoilSettings(wired, supply, max(coils.limits), coils.stale_after)
     circuit = CoilCircuit(pwm, settings, generator, now_ns, section.current_noise, BUS_VOLTAGE)
     monitor, fitted = None, config.power_monitor
     if fitted is not None:

@@ -28,7 +28,8 @@ class DescriptionErrors:
     Attributes:
         moments: (3,) ratios of the true to the described principal moments of inertia.
         axes: (3,) rotation vector of the principal axes, rad, body axes.
-        coils: (3, 3) from the described to the true dipole.
+        coils: (3, 3 g) for g groups of three coils. Column k is the dipole of coil k, relative to its
+            described size, in the axes of `sim_hal.worlds.free_body.coil_frames`.
         gyro: (3, 3) from the true rate to the rate that the gyro measures, without its bias.
         field: (3, 3) from the true to the measured magnetic field, without the bias.
         field_bias: (3,) T.
@@ -72,11 +73,12 @@ def description_errors(config: Config, section: Simulation) -> DescriptionErrors
         moments = 1.0 + drawn(craft.moments, 3)
         if 2.0 * float((moments * inertia).max()) < float((moments * inertia).sum()):
             break
+    groups = math.ceil(len(config.coils.windings) / 3)
     camera = 0.0 if config.camera is None else math.radians(config.camera.accuracy.mounting_deg)
     return DescriptionErrors(
         moments=moments,
         axes=drawn(math.radians(craft.axes_deg), 3),
-        coils=matrix(craft.coil_gain, math.radians(craft.coil_axes_deg)),
+        coils=np.hstack([matrix(craft.coil_gain, math.radians(craft.coil_axes_deg)) for _ in range(groups)]),
         gyro=matrix(unit.gyro_scale, unit.gyro_alignment),
         field=matrix(unit.field_matrix, unit.field_matrix),
         field_bias=drawn(unit.field_bias, 3),

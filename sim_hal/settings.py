@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from flight.schema.devices import Winding
 from flight.schema.values import Inertia, NotNegative, Positive, Quaternion, Section
 
 Vector = tuple[float, float, float]
@@ -38,23 +39,18 @@ class OrbitSection(Section, frozen=True, kw_only=True):
 
 
 class CraftSection(Section, frozen=True, kw_only=True):
-    """A custom craft: a box of `size` (3,), m, with the origin of the body axes at its centre.
+    """True values of the craft that differ from its description in the flight configuration.
 
-    `inertia`, kg m^2, holds the moments of inertia (3,) about the body axes, or the inertia tensor (3, 3).
-    `dipole_per_ampere` (m^2) is the dipole per current of each coil. If one of them is omitted, it equals
+    The craft is a box of `size` (3,), m. The vector `centre_of_mass` (3,), m, leads from the centre of the
+    box to the centre of mass, in body axes. `inertia`, kg m^2, holds the moments of inertia (3,) about the
+    body axes, or the inertia tensor (3, 3). The list `windings` describes the coils. An omitted value equals
     that of the flight configuration.
     """
 
     inertia: Inertia | None = None
-    size: tuple[Positive, Positive, Positive]
-    dipole_per_ampere: Positive | None = None
-
-
-class CompleteCraft(CraftSection, frozen=True, kw_only=True):
-    """A custom craft with all of its values."""
-
-    inertia: Inertia
-    dipole_per_ampere: Positive
+    size: tuple[Positive, Positive, Positive] | None = None
+    centre_of_mass: Vector | None = None
+    windings: tuple[Winding, ...] | None = None
 
 
 class TipOff(Section, frozen=True, kw_only=True):
@@ -72,9 +68,10 @@ class TipOff(Section, frozen=True, kw_only=True):
 class Disturbances(Section, frozen=True, kw_only=True):
     """Disturbances as multiples of their worst cases, and the errors of the coils.
 
-    The worst case of `drag` and `solar_pressure` is a centre of pressure 2 cm from the centre of mass. The
-    worst case of `residual_dipole` is a constant part of 1e-3 A m^2, a part of 3e-4 A m^2 in sunlight and a
-    random walk of 5e-5 A m^2. The worst case of `ring_current` is a field of 20 nT that varies over hours.
+    The unit of `drag` and `solar_pressure` is the torque on a box whose true centre of mass is as far from
+    the described one as `craft.accuracy.centre_of_mass` permits, in a random direction. The worst case of
+    `residual_dipole` is a constant part of 1e-3 A m^2, a part of 3e-4 A m^2 in sunlight and a random walk of
+    5e-5 A m^2. The worst case of `ring_current` is a field of 20 nT that varies over hours.
     `day_bulge` scales the variation of the air density between day and night. `walks` scales the random walks
     of air density and residual dipole. The angle between body axes and principal axes is between a third of
     `principal_turn_deg` and the whole of it. `coil_scale` and `coil_tilt_deg` are the standard deviations of
@@ -94,13 +91,16 @@ class Disturbances(Section, frozen=True, kw_only=True):
 
 
 class FreeBodySection(Section, frozen=True, kw_only=True):
-    """The section `free_body`; `craft` is a key of `sim_hal.worlds.free_body.CRAFTS` or a `CraftSection`.
+    """The section `free_body`.
+
+    The craft is that of the flight configuration, with the differences in `craft`, or one of the two crafts
+    in `sim_hal.worlds.free_body.CRAFTS` if `craft` is a name.
 
     `errors` is the largest error of the description of body, coils and sensors in the flight configuration,
     as a multiple of the accuracies that the configuration states (`sim_hal.description_errors`).
     """
 
-    craft: Literal["knightcube", "cubesat_3u"] | CraftSection = "knightcube"
+    craft: Literal["knightcube", "cubesat_3u"] | CraftSection | None = None
     orbit: OrbitSection = OrbitSection()
     release: TipOff = TipOff()
     disturbances: Disturbances = Disturbances()

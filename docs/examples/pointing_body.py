@@ -273,7 +273,7 @@ class PointingControl(BodyControl):
     def __init__(self, config: TestbedConfig) -> None:
         direct = Direct()
         self.modes = frozenset(Mode) - ORBITAL
-        self.dipole_per_ampere = dipole_per_ampere(config)
+        self.dipoles = dipole_per_ampere(config) * np.eye(3)
         self.free_axis = np.array([0.0, 1.0, 0.0])
         self.paths = self.planner = direct
         self.targets = Attitudes(config, direct)

@@ -186,8 +186,8 @@ def check_settings(config: Config) -> None:
 def coil_settings(config: Config) -> CoilSettings:
     """Return the settings of the coil driver."""
     coils = config.coils
-    wired = wirings(coils.channels, coils.resistance, coils.signs)
-    return CoilSettings(wired, coils.supply_voltage, coils.current_limit, coils.stale_after)
+    wired = wirings(coils.channels, coils.resistance, coils.signs, coils.limits)
+    return CoilSettings(wired, coils.supply_voltage, max(coils.limits), coils.stale_after)
 
 
 def unit_settings(config: Config) -> Vn100Settings:

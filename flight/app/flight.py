@@ -464,8 +464,8 @@ def _tasks(
         times = horizon_camera_settings(config.wide_cameras)
         use = body.estimation.horizon_cameras
         horizon_cameras = HorizonCameraTask(devices.horizon_cameras, use, times, services)
-    limits = np.full(3, config.coils.current_limit)
-    coils = CoilDriveSettings(body.control.dipole_per_ampere, limits, body.control.free_axis)
+    limits = np.array(config.coils.limits)
+    coils = CoilDriveSettings(body.control.dipoles, limits, body.control.free_axis)
     drive = CoilDrive(devices.coils, devices.power, body.estimation.coil_monitor, coils, services)
     steering = Steering(body, drive, services)
     low_rate, low_for = config.detumble.low_rate, config.detumble.low_for

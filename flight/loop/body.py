@@ -394,7 +394,7 @@ class BodyControl(Protocol):
 
     Attributes:
         modes: modes that exist for this kind of body.
-        dipole_per_ampere: number of turns times the area of each coil, m^2.
+        dipoles: dipole moment of each coil per ampere (3, n), m^2, body axes, one column per coil.
         free_axis: unit vector (3,) of the only axis about which the body can rotate, or None for a free body.
         detumbling: control law for detumbling.
         sun_acquisition: control law that turns the body to the Sun in SAFE, or None if the body has no such
@@ -402,7 +402,7 @@ class BodyControl(Protocol):
     """
 
     modes: frozenset[Mode]
-    dipole_per_ampere: float
+    dipoles: FloatArray
     free_axis: FloatArray | None
     targets: BodyTargets
     planner: Planner

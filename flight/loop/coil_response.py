@@ -319,7 +319,8 @@ class ResponseSettings:
 
     Attributes:
         inertia: inertia matrix (3, 3), kg m^2.
-        dipole_per_ampere: number of turns times the area of each coil, m^2.
+        dipole_per_ampere: dipole moment per ampere, m^2, of three equal coils along the body axes, or one
+            column (3,) in body axes for each coil.
         rate_noise: standard deviation (rad/s) of a gyro sample about each axis.
         free: flags (3,) of the axes about which the body can rotate; on a thread only y.
         bin_samples: number of gyro samples in a bin.
@@ -339,7 +340,7 @@ class ResponseSettings:
     """
 
     inertia: FloatArray
-    dipole_per_ampere: float
+    dipole_per_ampere: float | FloatArray
     rate_noise: float
     free: tuple[bool, bool, bool] = (True, True, True)
     bin_samples: int = 8
@@ -395,7 +396,13 @@ class CoilResponse:
 
     def __init__(self, settings: ResponseSettings) -> None:
         self._settings = settings
-        self._per_field = settings.dipole_per_ampere * np.linalg.inv(settings.inertia).T
+        dipoles = np.eye(3) * settings.dipole_per_ampere
+        if np.ndim(settings.dipole_per_ampere) == 2:
+            dipoles = np.asarray(settings.dipole_per_ampere)
+        strongest = float(np.linalg.norm(dipoles, axis=0).max())
+        self._per_field = strongest * np.linalg.inv(settings.inertia).T
+        # Row a is the direction of coil a, times its strength relative to that of the strongest coil.
+        self._directions: FloatArray = dipoles.T / strongest
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)[:, None]
         count = len(self._free)
@@ -530,8 +537,8 @@ class CoilResponse:
         times, spans, rates, fields, currents = zip(*self._samples, strict=True)
         self._samples.clear()
         count = len(times)
-        # Row a holds the acceleration per ampere of coil a: J^-1 (n e_a x B).
-        per_ampere = cross_matrices(np.array(fields)) @ self._per_field
+        # Row a holds the acceleration per ampere of coil a with the dipole d_a per ampere: J^-1 (d_a x B).
+        per_ampere = self._directions @ cross_matrices(np.array(fields)) @ self._per_field
         steps = np.array(currents)[:, :, None] * per_ampere * np.array(spans)[:, None, None]
         steps[0] += self._asked
         integral = np.cumsum(steps, axis=0)

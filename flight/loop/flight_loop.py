@@ -221,7 +221,7 @@ class FlightLoop:
             duration=config.duration,
             coil_resistance=list(config.coils.resistance),
             supply_voltage=config.coils.supply_voltage,
-            current_limit=config.coils.current_limit,
+            current_limit=max(config.coils.limits),
         )
         tasks.modes.begin(epoch_ns, supervisors.keeper.record.unclean_recent if supervisors.keeper else 0)
         services.events.report(events.STARTED, epoch_ns, f"{config.name}, {config.duration:g} s")

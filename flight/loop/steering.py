@@ -36,12 +36,12 @@ class CoilDriveSettings:
     """Properties of the coils.
 
     Attributes:
-        dipole_per_ampere: number of turns times the area of each coil, m^2.
+        dipoles: dipole moment of each coil per ampere (3, n), m^2, body axes, one column per coil.
         limits: largest current (3,), A, of each coil.
         free_axis: unit vector (3,) of the only axis about which the body can rotate, or None for a free body.
     """
 
-    dipole_per_ampere: float
+    dipoles: FloatArray
     limits: FloatArray
     free_axis: FloatArray | None
 
@@ -178,11 +178,11 @@ class CoilDrive:
             if known is None:
                 currents = np.clip(np.where(usable, currents, 0.0), -limits, limits)
             else:
-                torque = np.cross(settings.dipole_per_ampere * currents, known)
+                torque = np.cross(settings.dipoles @ currents, known)
                 currents = allocate(
                     torque,
                     known,
-                    settings.dipole_per_ampere,
+                    settings.dipoles,
                     limits,
                     usable.astype(float),
                     settings.free_axis,

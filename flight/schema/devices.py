@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
+import numpy as np
 from msgspec import Meta
 
+from flight.schema.document import ConfigError
 from flight.schema.values import (
     Address,
     BaudRate,
@@ -23,6 +25,7 @@ from flight.schema.values import (
     Sign,
     Vector,
 )
+from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
 
@@ -76,21 +79,81 @@ class InertialUnitSection(Section, frozen=True, kw_only=True):
     accuracy: UnitAccuracy = UnitAccuracy()
 
 
+class Winding(Section, frozen=True, kw_only=True):
+    """One coil of a satellite, which is a torque rod or an air coil, with its H-bridge.
+
+    A positive current makes a dipole moment along `axis`, which may have any length. The dipole moment per
+    ampere is `dipole_per_ampere` (m^2), or `turns` times `area` (m^2) of an air coil. On the testbed, these
+    values stand in the section `plant`. The value `current_limit` (A) replaces that of the section `coils`.
+    The values `channels` are the PWM channels of the inputs A and B of the H-bridge; without them, the coils
+    use the channels 0 and 1, 2 and 3, and so on. The value `sign` is -1 for a coil whose leads are swapped.
+    """
+
+    axis: Vector
+    dipole_per_ampere: Positive | None = None
+    turns: Annotated[int, Meta(gt=0, le=100_000)] | None = None
+    area: Positive | None = None
+    resistance: Positive
+    current_limit: Annotated[float, Meta(gt=0.0, le=1.0)] | None = None
+    channels: tuple[Channel, Channel] | None = None
+    sign: Sign = 1
+
+    def strength(self) -> float:
+        """Return the dipole moment per ampere, m^2. Raises ConfigError if it is given twice or not at all."""
+        if (self.turns is None) != (self.area is None):
+            raise ConfigError("turns" if self.area is None else "area", "needs both `turns` and `area`")
+        given = self.dipole_per_ampere
+        if self.turns is not None and self.area is not None:
+            if given is not None:
+                raise ConfigError("dipole_per_ampere", "is given: leave `turns` and `area` out")
+            return self.turns * self.area
+        if given is None:
+            raise ConfigError("dipole_per_ampere", "is missing: give it, or `turns` and `area`")
+        return given
+
+
 class Coils(Section, frozen=True, kw_only=True):
-    """The PWM chip, the H-bridges and the coils; `bus` is the number or device file of the I2C bus."""
+    """The PWM chip, the H-bridges and the coils; `bus` is the number or device file of the I2C bus.
+
+    The list `windings` has one entry per coil.
+    """
 
     bus: Bus = 1
     address: Address = 0x40
-    channels: tuple[tuple[Channel, Channel], tuple[Channel, Channel], tuple[Channel, Channel]] = (
-        (0, 1),
-        (2, 3),
-        (4, 5),
-    )
-    signs: tuple[Sign, Sign, Sign] = (1, 1, 1)
-    resistance: tuple[Positive, Positive, Positive]
+    windings: Annotated[tuple[Winding, ...], Meta(min_length=1, max_length=8)]
     supply_voltage: Positive
     current_limit: Positive
     stale_after: Annotated[float, Meta(gt=0.0, le=0.4)] = 0.25
+
+    @property
+    def channels(self) -> tuple[tuple[int, int], ...]:
+        """PWM channels of the bridge inputs A and B of each coil."""
+        return tuple(coil.channels or (2 * k, 2 * k + 1) for k, coil in enumerate(self.windings))
+
+    @property
+    def signs(self) -> tuple[int, ...]:
+        """+1 for each coil, or -1 for a coil whose leads are swapped."""
+        return tuple(coil.sign for coil in self.windings)
+
+    @property
+    def resistance(self) -> tuple[float, ...]:
+        """Resistance of each coil, ohm."""
+        return tuple(coil.resistance for coil in self.windings)
+
+    @property
+    def limits(self) -> tuple[float, ...]:
+        """Largest current of each coil, A."""
+        return tuple(coil.current_limit or self.current_limit for coil in self.windings)
+
+    def map(self) -> CoilMap:
+        """Return the map from dipole moments to currents of a satellite's coils.
+
+        Raises ConfigError for a coil without dipole moment, and if the coils lie in a plane.
+        """
+        axes = np.array([coil.axis for coil in self.windings], dtype=float).T
+        strength = np.array([coil.strength() for coil in self.windings])
+        dipoles = axes / np.linalg.norm(axes, axis=0) * strength
+        return CoilMap(dipoles, np.array(self.limits), np.array(self.resistance))
 
 
 class PowerMonitorSection(Section, frozen=True, kw_only=True):

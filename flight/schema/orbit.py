@@ -6,6 +6,7 @@ import math
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from flight.schema.document import ConfigError
@@ -36,6 +37,9 @@ ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 class CraftAccuracy(Section, frozen=True, kw_only=True):
     """Largest errors of the description of the satellite; the true errors are assumed uniform within them.
 
+    `centre_of_mass` (m) is the distance of the true from the described centre of mass, whose default is the
+    largest offset that the CubeSat Design Specification permits.
+
     `moments` is the relative error of the principal moments of inertia, and `axes_deg` the rotation of the
     principal axes about each body axis. `coil_gain` is the relative error of the dipole of each coil, and
     `coil_axes_deg` the misalignment of its axis.
@@ -45,22 +49,35 @@ class CraftAccuracy(Section, frozen=True, kw_only=True):
     axes_deg: Annotated[float, Meta(ge=0.0, le=30.0)] = 5.0
     coil_gain: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.2
     coil_axes_deg: Annotated[float, Meta(ge=0.0, le=30.0)] = 3.0
+    centre_of_mass: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02
 
 
 class Craft(Section, frozen=True, kw_only=True):
     """The model of the satellite that the flight application uses.
 
-    Each satellite has the moments of inertia `inertia` about the body axes, kg m^2. The value
-    `dipole_per_ampere` is the number of turns times the area of each coil, m^2.
+    The satellite is a box with the edges `size` (m) along the body axes. The vector `centre_of_mass` (m)
+    leads from the centre of the box to the centre of mass. The value `inertia` holds the moments of inertia
+    about the body axes, or the rows of the inertia tensor, kg m^2. Without `inertia`, the moments are those
+    of a homogeneous box of `mass` (kg). The coils are described in the section `coils`.
     """
 
-    inertia: Inertia
-    dipole_per_ampere: Positive
+    size: tuple[Positive, Positive, Positive]
+    mass: Positive | None = None
+    centre_of_mass: Vector = (0.0, 0.0, 0.0)
+    inertia: Inertia | None = None
     accuracy: CraftAccuracy = CraftAccuracy()
 
     def inertia_matrix(self) -> FloatArray:
-        """Return the inertia tensor (3, 3) in body axes, kg m^2."""
-        return inertia_matrix(self.inertia)
+        """Return the inertia tensor (3, 3) in body axes, kg m^2.
+
+        Raises ValueError if moments and rows are mixed, or if neither inertia nor mass is known.
+        """
+        if self.inertia is not None:
+            return inertia_matrix(self.inertia)
+        if self.mass is None:
+            raise ValueError("neither `inertia` nor `mass` is given")
+        squares = np.square(self.size)
+        return np.diag(self.mass / 12.0 * (squares.sum() - squares))
 
 
 class FieldDetumble(Detumble, frozen=True, kw_only=True):

@@ -15,9 +15,9 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from flight.schema.devices import Camera, SolarStringsSection
+from flight.schema.devices import Camera, Coils, SolarStringsSection
 from flight.schema.document import ConfigError, Document, convert, read_document, read_text
-from flight.schema.orbit import ExclusionCones, OrbitConfig
+from flight.schema.orbit import Craft, ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
 from flight.schema.values import Quaternion, Vector, check_aim
@@ -42,6 +42,8 @@ LOOPBACK = IPv4Network("127.0.0.0/8")
 _LARGEST_CORRECTION = 0.3
 """Largest difference of an element of a calibration matrix from the identity matrix. Every matrix within this
 bound has an inverse."""
+_BEYOND = 1.01
+"""Largest ratio of the current limit of a coil to the current that its supply voltage drives."""
 _PREFIX = 24
 """Default prefix length of the network whose hosts may send frames to the link."""
 
@@ -52,6 +54,7 @@ def check_consistency(config: Config, document: Document) -> None:
     def refuse(dotted: str, problem: str) -> None:
         raise document.error(dotted, problem)
 
+    _check_coils(config, refuse)
     if isinstance(config, TestbedConfig):
         _check_testbed(config, refuse)
     if isinstance(config, OrbitConfig):
@@ -59,7 +62,6 @@ def check_consistency(config: Config, document: Document) -> None:
     _check_commands(config.commands, isinstance(config, TestbedConfig), refuse)
     if config.link is not None:
         _check_link(config.link, config.commands, refuse)
-    _check_coils(config, refuse)
     unit = config.inertial_unit
     # A reading waits for its control cycle, and the current computed from it flows until the next cycle.
     least = 1.0 / unit.rate_hz + 2.0 / CONTROL_RATE_HZ
@@ -92,6 +94,7 @@ def check_consistency(config: Config, document: Document) -> None:
 
 
 def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
+    _check_testbed_coils(config.coils, refuse)
     if config.guidance.replan_period >= config.guidance.horizon:
         refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
     times = [step.at for step in config.steps]
@@ -100,13 +103,51 @@ def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
         refuse("duration", f"is {config.duration!r}: must be later than the last target, at {times[-1]!r} s")
 
 
-def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
+def _check_testbed_coils(coils: Coils, refuse: Refuse) -> None:
+    for index, coil in enumerate(coils.windings):
+        place, own = f"coils.windings[{index}]", tuple(float(index == axis) for axis in range(3))
+        if coil.axis != own:
+            refuse(f"{place}.axis", f"is {list(coil.axis)}: must be {list(own)} on the testbed")
+        for name in ("dipole_per_ampere", "turns", "area", "current_limit"):
+            if getattr(coil, name) is not None:
+                refuse(f"{place}.{name}", "belongs to a satellite: the testbed's coils are equal")
+
+
+def _check_satellite_coils(coils: Coils, refuse: Refuse) -> None:
+    for index, coil in enumerate(coils.windings):
+        place = f"coils.windings[{index}]"
+        try:
+            coil.strength()
+        except ConfigError as error:
+            refuse(f"{place}.{error.where}", error.problem)
+        limit, reached = coils.limits[index], coils.supply_voltage / coil.resistance
+        if limit > _BEYOND * reached:
+            key = "coils.current_limit" if coil.current_limit is None else f"{place}.current_limit"
+            problem = f"is {limit:g}: the supply drives {reached:.3g} A through {coil.resistance:g} ohm"
+            refuse(key, problem)
     try:
-        problem = inertia_problem(config.craft.inertia_matrix())
+        coils.map()
+    except UsageError as error:
+        refuse("coils.windings", str(error))
+
+
+def _check_craft(craft: Craft, refuse: Refuse) -> None:
+    if craft.inertia is None and craft.mass is None:
+        refuse("craft", "needs `inertia` or `mass`")
+    try:
+        problem = inertia_problem(craft.inertia_matrix())
     except ValueError:
         problem = "mixes moments and rows: give three moments, or three rows of three values"
     if problem:
         refuse("craft.inertia", problem)
+    for offset, edge, axis in zip(craft.centre_of_mass, craft.size, "xyz", strict=True):
+        if abs(offset) >= 0.5 * edge:
+            refuse("craft.centre_of_mass", f"is {offset:g} m along {axis}: outside the box of {edge:g} m")
+
+
+def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
+    _check_satellite_coils(config.coils, refuse)
+    _check_craft(config.craft, refuse)
     times = [step.at for step in config.targets]
     _check_order("targets", times, refuse)
     for index, step in enumerate(config.targets):
@@ -144,9 +185,15 @@ def _check_order(section: str, times: list[float], refuse: Refuse) -> None:
 
 
 def _check_coils(config: Config, refuse: Refuse) -> None:
-    used = [c for pair in config.coils.channels for c in pair]
+    coils = config.coils
+    used = [c for pair in coils.channels for c in pair]
     if len(set(used)) != len(used):
-        refuse("coils.channels", f"{used} use a channel of the PWM chip twice")
+        refuse("coils.windings", f"use a channel of the PWM chip twice: {used}")
+    for index, coil in enumerate(coils.windings):
+        if not any(coil.axis):
+            refuse(f"coils.windings[{index}].axis", "is zero: give the direction of the coil's dipole moment")
+    if len(coils.windings) != 3:
+        refuse("coils.windings", f"has {len(coils.windings)} entries: this version flies three coils")
     if config.power_monitor is not None and config.power_monitor.address == config.coils.address:
         refuse(
             "power_monitor.address",

@@ -270,11 +270,11 @@ def _planned(
     }
     if cones and config.camera is None:
         raise UsageError(f"{options.orbit}: a cone needs a `camera`")
-    per_ampere, coils = config.craft.dipole_per_ampere, config.coils
+    coils = config.coils.map()
     return plan_slew(
         inertia=config.craft.inertia_matrix(),
-        dipole_limit=np.full(3, coils.current_limit * per_ampere),
-        heat=np.array(coils.resistance) / per_ampere**2,
+        dipole_limit=coils.limits,
+        heat=np.diag(coils.heat),
         elements=elements,
         time=at,
         start=_target("--from", options.start),

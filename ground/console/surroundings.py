@@ -37,7 +37,7 @@ class FlightSurroundings:
     Attributes:
         elements: two-line elements, or None on a testbed or without elements in the configuration.
         camera: mounting (4,) of the star camera, body into camera, and its field of view, rad.
-        coil_dipole: dipole of a coil at the coil's current limit, A m^2.
+        coil_dipole: largest dipole moment along a body axis, A m^2.
     """
 
     elements: TwoLineElements | None
@@ -53,8 +53,8 @@ class FlightSurroundings:
             return UNKNOWN
         lines, camera, dipole = getattr(config, "elements", None), getattr(config, "camera", None), None
         view = None if camera is None else (list(camera.mounting), math.radians(camera.field_of_view_deg))
-        if (craft := getattr(config, "craft", None)) is not None:
-            dipole = float(craft.dipole_per_ampere * config.coils.current_limit)
+        if getattr(config, "craft", None) is not None:
+            dipole = float(config.coils.map().limits.max())
         elif (plant := getattr(config, "plant", None)) is not None:
             dipole = float(plant.coil_turns * plant.coil_area * config.coils.current_limit)
         return cls(TwoLineElements(*lines) if lines else None, view, dipole)

@@ -411,7 +411,7 @@ def _finished(
     if constants.gain < 0.0:
         raise IdentificationError(
             f"the coil on x rotates the body in the opposite direction ({gain}): "
-            "check `coils.signs` and the direction of the field"
+            "check the `sign` of `coils.windings` and the direction of the field"
         )
     return made
 

@@ -46,16 +46,20 @@ class CoilWiring:
         channel_b: PWM channel of bridge input B.
         resistance: resistance of the coil, ohm.
         sign: +1, or -1 for a coil whose leads are swapped.
+        current_limit: maximum current of this coil, if smaller than that of all coils, A.
     """
 
     channel_a: int
     channel_b: int
     resistance: float
     sign: int = 1
+    current_limit: float = math.inf
 
     def __post_init__(self) -> None:
         if not 0.0 < self.resistance < math.inf:
             raise OutOfRange(DEVICE, "coil resistance", self.resistance, 0.0, math.inf, "ohm")
+        if not self.current_limit >= 1e-3:
+            raise OutOfRange(DEVICE, "coil current limit", self.current_limit, 1e-3, math.inf, "A")
         if self.sign not in {1, -1}:
             raise OutOfRange(DEVICE, "coil sign", self.sign, -1, 1, "(-1 or +1)")
 
@@ -69,17 +73,22 @@ Wirings = tuple[CoilWiring, CoilWiring, CoilWiring]
 
 
 def wirings(
-    channels: Sequence[tuple[int, int]], resistance: Sequence[float], signs: Sequence[int]
+    channels: Sequence[tuple[int, int]],
+    resistance: Sequence[float],
+    signs: Sequence[int],
+    limits: Sequence[float],
 ) -> Wirings:
-    """Return the wiring of the three coils. Raises OutOfRange for an invalid resistance or sign.
+    """Return the wiring of the three coils. Raises OutOfRange for an invalid resistance, sign or limit.
 
     Args:
         channels: PWM channels of the bridge inputs A and B for each coil.
         resistance: resistance of each coil, ohm.
         signs: +1 for each coil, or -1 for a coil whose leads are swapped.
+        limits: maximum current of each coil, A.
     """
     x, y, z = (
-        CoilWiring(a, b, ohm, sign) for (a, b), ohm, sign in zip(channels, resistance, signs, strict=True)
+        CoilWiring(a, b, ohm, sign, limit)
+        for (a, b), ohm, sign, limit in zip(channels, resistance, signs, limits, strict=True)
     )
     return x, y, z
 
@@ -89,7 +98,7 @@ class CoilSettings:
     """Settings of the coil driver.
 
     Attributes:
-        coils: wiring of the coils on the body axes x, y and z.
+        coils: wiring of the coils.
         supply_voltage: voltage across a coil at full duty, after the losses of the bridge, V.
         current_limit: maximum current of each coil, A.
         stale_after: maximum age of a command before the coils are set to zero, s; at most 0.4 s, so that the
@@ -420,7 +429,10 @@ class PwmTorqueCoils:
         self._clock = clock
         self._settings = settings
         self._steps = tuple(current_step(coil.resistance, settings.supply_voltage) for coil in settings.coils)
-        self._largest = tuple(largest_counts(step, settings.current_limit) for step in self._steps)
+        self._largest = tuple(
+            largest_counts(step, min(settings.current_limit, coil.current_limit))
+            for coil, step in zip(settings.coils, self._steps, strict=True)
+        )
         # mean current (A) of one count, with the sign of the coil
         self._signed = tuple(coil.sign * step for coil, step in zip(settings.coils, self._steps, strict=True))
         self._mailbox = CommandMailbox(clock, round(settings.stale_after * 1e9))

@@ -168,7 +168,7 @@ class CoilCircuit:
                 coil,
                 sum(1 << channel for channel in coil.channels),
                 coil.sign * truth.supply_voltage / coil.resistance / COUNTS,
-                min(truth.current_limit, truth.supply_voltage / coil.resistance),
+                min(truth.current_limit, coil.current_limit, truth.supply_voltage / coil.resistance),
             )
             for coil in truth.coils
         )

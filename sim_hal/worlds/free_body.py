@@ -41,7 +41,7 @@ from knightcube.astro.earth.sun import DAY
 from knightcube.astro.inertia import inertia_problem, principal_axes
 from sim_hal.clock import NEVER
 from sim_hal.description_errors import NO_ERRORS, DescriptionErrors, description_errors
-from sim_hal.settings import CompleteCraft, Disturbances, FreeBodySection, TipOff
+from sim_hal.settings import CraftSection, Disturbances, FreeBodySection, TipOff
 from sim_hal.worlds.orbit import Environment, air_flow, elements, julian_date
 from sim_hal.worlds.world import BodyMotion, Floats, OrbitEnvironment, OrbitTruth, WorldInputs, WorldTruth
 
@@ -170,19 +170,40 @@ def steps_within(span: float, rate: float, longest: float) -> int:
     return max(1, math.ceil(span / longest - 1e-9), math.ceil(span * rate / TURN_PER_STEP))
 
 
+PRESSURE_ARM = 0.02
+"""Largest distance (m) from the centre of mass to the centre of pressure that the CubeSat standard allows."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class CraftModel:
+    """A craft as it is described.
+
+    Attributes:
+        inertia: inertia tensor (3, 3) in body axes, kg m^2.
+        size: edges (3,) of the box along the body axes, m.
+        dipoles: dipole moment of each coil per ampere (3, n), m^2, body axes, one column per coil.
+        centre_of_mass: vector (3,) from the centre of the box to the centre of mass, m, body axes.
+        offset: distance of the true from the described centre of mass, m.
+    """
+
+    inertia: FloatArray
+    size: tuple[float, float, float]
+    dipoles: FloatArray
+    centre_of_mass: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset: float = PRESSURE_ARM
+
+
 CRAFTS = {
     # The inertia is from Sease 2013, Table 5.1 (exponent corrected); a coil has 80 turns of 0.0081 m^2.
-    "knightcube": CompleteCraft(
-        inertia=(1.10e-3, 1.05e-3, 0.99e-3), size=(0.1, 0.1, 0.1), dipole_per_ampere=0.648
+    "knightcube": CraftModel(
+        inertia=np.diag([1.10e-3, 1.05e-3, 0.99e-3]), size=(0.1, 0.1, 0.1), dipoles=0.648 * np.eye(3)
     ),
     # This craft is assumed to have 4 kg and coils of 57.8 ohm with 0.2 A m^2 at 58.8 mA, or 5 W/(A m^2)^2.
-    "cubesat_3u": CompleteCraft(
-        inertia=(0.0066, 0.0333, 0.0333), size=(0.3, 0.1, 0.1), dipole_per_ampere=3.4
+    "cubesat_3u": CraftModel(
+        inertia=np.diag([0.0066, 0.0333, 0.0333]), size=(0.3, 0.1, 0.1), dipoles=3.4 * np.eye(3)
     ),
 }
 
-PRESSURE_ARM = 0.02
-"""Largest distance (m) from the centre of mass to the centre of pressure that the CubeSat standard allows."""
 CONSTANT_DIPOLE, SUNLIT_DIPOLE, WALKING_DIPOLE = 1e-3, 3e-4, 5e-5
 """Largest constant and sunlit residual dipole, and standard deviation of its random walk (A m^2)."""
 _REFLECTED = (0.1, 0.6)
@@ -212,7 +233,8 @@ class TrueCraft:
         inertia: principal moments of inertia (3,), kg m^2.
         to_principal: quaternion (4,) from body axes to principal axes.
         faces: faces of the craft's box.
-        coil_dipole: matrix (3, 3), m^2, that maps coil currents to the dipole in body axes.
+        coil_dipole: matrix (3, n), m^2, that maps coil currents to the dipole in body axes.
+        coil_frames: rotations (n, 3, 3) from `coil_frames`, in whose axes the errors of the coils are drawn.
         constant_dipole: constant part (3,) of the residual dipole, A m^2, body axes.
         sunlit_dipole: part (3,) of the residual dipole that sunlight at one astronomical unit causes, A m^2,
             body axes.
@@ -223,34 +245,57 @@ class TrueCraft:
     to_principal: FloatArray
     faces: tuple[Face, ...]
     coil_dipole: FloatArray
+    coil_frames: FloatArray
     constant_dipole: FloatArray
     sunlit_dipole: FloatArray
     walking_dipole: float
 
 
-def build(section: CompleteCraft, disturbances: Disturbances, generator: np.random.Generator) -> TrueCraft:
+def coil_frames(dipoles: FloatArray) -> FloatArray:
+    """Return rotations (n, 3, 3) that turn the body axis x, y or z, in order of the coils, to each coil."""
+    frames = []
+    for index, dipole in enumerate(dipoles.T):
+        start, end = np.eye(3)[index % 3], dipole / np.linalg.norm(dipole)
+        if float(start @ end) == 1.0:
+            frames.append(np.eye(3))
+            continue
+        # Two rotations by 180 deg, about an axis across the start and about the bisector of it and the end.
+        middle = start + end
+        across = np.eye(3)[(index + 1) % 3]
+        if float(middle @ middle) < 1e-12:
+            frames.append(2.0 * np.outer(across, across) - np.eye(3))
+            continue
+        halves = 2.0 * np.outer(middle, middle) / float(middle @ middle) - np.eye(3)
+        frames.append(halves @ (2.0 * np.outer(start, start) - np.eye(3)))
+    return np.array(frames)
+
+
+def build(section: CraftModel, disturbances: Disturbances, generator: np.random.Generator) -> TrueCraft:
     """Return the craft with random errors from one seed.
 
     The number of random draws does not depend on the disturbance multiples, so the random directions of a
     seed are the same for every multiple.
     """
-    moments, axes = principal_axes(inertia_matrix(section.inertia))
+    moments, axes = principal_axes(section.inertia)
     x, y, z = moments.tolist()
     widest = math.radians(disturbances.principal_turn_deg)
     turn = generator.uniform(widest / 3.0, widest) * _direction(generator)
-    arm = PRESSURE_ARM * _direction(generator)
+    arm = section.offset * _direction(generator) - np.array(section.centre_of_mass)
     mirrored = generator.uniform(*_REFLECTED, 6)
-    scale = 1.0 + disturbances.coil_scale * generator.standard_normal(3)
-    tilt = math.radians(disturbances.coil_tilt_deg) * generator.standard_normal((3, 3))
-    np.fill_diagonal(tilt, 1.0)
+    count = section.dipoles.shape[1]
+    scale = 1.0 + disturbances.coil_scale * generator.standard_normal(count)
+    tilt = math.radians(disturbances.coil_tilt_deg) * generator.standard_normal((3, count))
+    tilt[np.arange(count) % 3, np.arange(count)] = 1.0
+    # Each column is the tilted axis of a coil times the coil's dipole per ampere.
+    columns = np.linalg.norm(section.dipoles, axis=0) * scale * tilt / np.linalg.norm(tilt, axis=0)
     constant, sunlit = _direction(generator), _direction(generator)
     worst = disturbances.residual_dipole
     return TrueCraft(
         inertia=(x, y, z),
         to_principal=quaternion.multiply(quaternion.from_matrix(axes), quaternion.from_rotation_vector(turn)),
         faces=box(section.size, arm, mirrored),
-        # Each column is the tilted axis of a coil times the coil's dipole per ampere.
-        coil_dipole=section.dipole_per_ampere * scale * tilt / np.linalg.norm(tilt, axis=0),
+        coil_dipole=np.einsum("kij,jk->ik", coil_frames(section.dipoles), columns),
+        coil_frames=coil_frames(section.dipoles),
         constant_dipole=worst * CONSTANT_DIPOLE * constant,
         sunlit_dipole=worst * SUNLIT_DIPOLE * sunlit,
         walking_dipole=worst * WALKING_DIPOLE,
@@ -410,14 +455,15 @@ class FreeBody:
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
         description: DescriptionErrors = NO_ERRORS,
+        craft: CraftModel | None = None,
     ) -> None:
         """Create the world with a body that is held still until its release.
 
-        `utc` is the UTC at `start_ns`.
+        `utc` is the UTC at `start_ns`. The craft is by default that of `section`.
         """
         errors, tip_off, weather = generators(seed)
         multiples = section.disturbances
-        self.craft = built_craft(section, errors, description)
+        self.craft = built_craft(section, errors, description, craft)
         self.utc_start = julian_date(utc)
         self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS - start_ns
         orbit = elements(section.orbit, self.utc_start)
@@ -599,62 +645,79 @@ def released(tip_off: TipOff, generator: np.random.Generator) -> tuple[FloatArra
 
 
 def built_craft(
-    section: FreeBodySection, errors: np.random.Generator, description: DescriptionErrors
+    section: FreeBodySection,
+    errors: np.random.Generator,
+    description: DescriptionErrors,
+    craft: CraftModel | None = None,
 ) -> TrueCraft:
-    """Return the true craft of a configuration.
+    """Return the true craft, which is described by `craft` or else by `section`.
 
     Its disturbances are drawn from the generator `errors`, and it differs from its description by
-    `description`. Raises ConfigError for a craft without inertia or dipole.
+    `description`. Raises ConfigError as `craft_model`.
     """
-    craft = CRAFTS[section.craft] if isinstance(section.craft, str) else section.craft
-    inertia, dipole = craft.inertia, craft.dipole_per_ampere
-    if inertia is None or dipole is None:
-        raise ConfigError("simulation.free_body.craft", "needs `inertia` and `dipole_per_ampere`")
-    known = CompleteCraft(inertia=inertia, size=craft.size, dipole_per_ampere=dipole)
-    return _differing(build(known, section.disturbances, errors), description)
+    built = build(craft or craft_model(section), section.disturbances, errors)
+    return _differing(built, description)
 
 
-def completed(section: FreeBodySection, config: Config) -> FreeBodySection:
-    """Return the section with the craft's omitted values taken from the flight configuration.
+def craft_model(section: FreeBodySection, config: Config | None = None) -> CraftModel:
+    """Return the craft of a section, whose omitted values are those of the flight configuration.
 
-    Raises ConfigError for an inertia tensor that no body has.
+    Raises ConfigError for an inertia tensor that no body has, and for values that nobody gives.
     """
     craft = section.craft
     if isinstance(craft, str):
-        return section
+        return CRAFTS[craft]
+    if not isinstance(config, OrbitConfig):
+        if craft is None:
+            return CRAFTS["knightcube"]
+        raise ConfigError("simulation.free_body.craft", "needs the configuration of a satellite in orbit")
+    craft, described = craft or CraftSection(), config.craft
+    inertia = described.inertia_matrix()
     if craft.inertia is not None:
         try:
-            problem = inertia_problem(inertia_matrix(craft.inertia))
+            inertia = inertia_matrix(craft.inertia)
+            problem = inertia_problem(inertia)
         except ValueError:
             problem = "mixes moments and rows: give three moments, or three rows of three values"
         if problem:
             raise ConfigError("simulation.free_body.craft.inertia", problem)
-    if isinstance(config, OrbitConfig):
-        described = config.craft
-        craft = msgspec.structs.replace(
-            craft,
-            inertia=craft.inertia or described.inertia,
-            dipole_per_ampere=craft.dipole_per_ampere or described.dipole_per_ampere,
-        )
-    return msgspec.structs.replace(section, craft=craft)
+    coils = config.coils
+    if craft.windings is not None:
+        if len(craft.windings) != len(coils.windings):
+            raise ConfigError(
+                "simulation.free_body.craft.windings", f"must have {len(coils.windings)} entries"
+            )
+        coils = msgspec.structs.replace(coils, windings=craft.windings)
+    return CraftModel(
+        inertia=inertia,
+        size=craft.size or described.size,
+        dipoles=coils.map().dipoles,
+        centre_of_mass=craft.centre_of_mass or described.centre_of_mass,
+        offset=described.accuracy.centre_of_mass,
+    )
 
 
 def _differing(craft: TrueCraft, errors: DescriptionErrors) -> TrueCraft:
     """Return the craft with the errors of its description."""
     x, y, z = (np.array(craft.inertia) * errors.moments).tolist()
     turn = quaternion.from_rotation_vector(errors.axes)
+    columns = []
+    for index, (frame, dipole) in enumerate(zip(craft.coil_frames, craft.coil_dipole.T, strict=True)):
+        first = 3 * (index // 3)
+        columns.append(frame @ errors.coils[:, first : first + 3] @ frame.T @ dipole)
     return replace(
         craft,
         inertia=(x, y, z),
         to_principal=quaternion.multiply(craft.to_principal, turn),
-        coil_dipole=errors.coils @ craft.coil_dipole,
+        coil_dipole=np.stack(columns, axis=1),
     )
 
 
 def coil_supply(inputs: WorldInputs) -> CoilSupply:
     """Return the true resistance and supply voltage of the coils of a configuration."""
     coils, truth = inputs.config.coils, inputs.section.truth
-    return CoilSupply(truth.resistance or coils.resistance, truth.supply_voltage or coils.supply_voltage)
+    x, y, z = truth.resistance or coils.resistance
+    return CoilSupply((x, y, z), truth.supply_voltage or coils.supply_voltage)
 
 
 def make(inputs: WorldInputs) -> FreeBody:
@@ -667,11 +730,12 @@ def make(inputs: WorldInputs) -> FreeBody:
         raise ConfigError("simulation.free_body", "is missing: the world free_body needs it")
     supply = coil_supply(inputs)
     return FreeBody(
-        completed(section.free_body, inputs.config),
+        section.free_body,
         currents,
         supply,
         section.seed,
         section.utc,
         inputs.start_ns,
         description_errors(inputs.config, section),
+        craft_model(section.free_body, inputs.config),
     )

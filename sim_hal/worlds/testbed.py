@@ -160,13 +160,14 @@ def model_of(config: TestbedConfig, section: Simulation) -> tuple[TestbedModel, 
     if release is None:
         raise ConfigError("simulation.release", "is missing: the world testbed needs it")
     plant, truth = config.plant, section.truth
+    x, y, z = truth.resistance or config.coils.resistance
     model = TestbedModel(
         inertia=truth.inertia or plant.inertia,
         dipole_per_ampere=plant.coil_turns * plant.coil_area,
         field=truth.field or plant.field,
         stiffness=section.thread.stiffness,
         damping=section.thread.damping,
-        resistance=truth.resistance or config.coils.resistance,
+        resistance=(x, y, z),
         supply_voltage=truth.supply_voltage or config.coils.supply_voltage,
     )
     return model, 2.0 * float(np.arcsin(release.q2)), release.rate

@@ -30,6 +30,14 @@ def test_the_extended_configuration_has_the_described_values(tmp_path: Path) -> 
     assert own.wide_cameras == base.wide_cameras
 
 
+def test_the_described_coils_are_flown(tmp_path: Path) -> None:
+    text = "extends: orbit.yaml\nname: rods\n" + block("coils:\n  supply_voltage: 5.0")
+    coils = as_orbit(parse(text, str(tmp_path / "rods.yaml"))).coils
+    assert coils.channels == ((0, 1), (2, 3), (4, 5))
+    assert coils.limits == (0.1, 0.1, 0.08)
+    assert coils.map().limits.min() > 0.1
+
+
 def test_the_commands_of_two_line_elements_print_the_same_section() -> None:
     lines = block("python -m flight elements").splitlines()
     assert len(lines) == 2

@@ -250,13 +250,13 @@ class SatelliteControl(BodyControl):
 
     def __init__(self, config: OrbitConfig, estimation: SatelliteEstimation, services: Services) -> None:
         environment, filter_ = estimation.environment, estimation.orbit_filter
-        limit = _limit(config)
-        self._objects = ObjectAim(_sensor(config), limit, services.events)
+        coils = config.coils.map()
+        self._objects = ObjectAim(_sensor(config), float(np.mean(coils.limits)), services.events)
         self._pauses = _pauses(config)
-        paths = PointingPaths(limit, fastest_rate(config))
+        paths = PointingPaths(coils.limits, fastest_rate(config))
         timed = [(step.at, step.target()) for step in config.targets]
         self.modes = frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO}
-        self.dipole_per_ampere = config.craft.dipole_per_ampere
+        self.dipoles = coils.dipoles
         self.free_axis = None
         self.paths = paths
         self.planner = PointingPlanner(
@@ -270,7 +270,7 @@ class SatelliteControl(BodyControl):
         self.targets = PointingTargets(timed, paths, config.looks_for_objects())
         self.tracker = _tracker(config, filter_, environment)
         detumbler = _detumbler(config, filter_, environment)
-        self.detumbling = self.field_detumbling = FieldDetumblingLaw(detumbler, self.dipole_per_ampere)
+        self.detumbling = self.field_detumbling = FieldDetumblingLaw(detumbler, coils)
         self.sun_acquisition = estimation.sun_acquisition
 
     def follows_objects(self) -> bool:
@@ -300,11 +300,6 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
 ORBIT = BodyKind(pointing_job.run, make)
 
 
-def _limit(config: OrbitConfig) -> float:
-    """Return the largest dipole of a coil, A m^2."""
-    return config.coils.current_limit * config.craft.dipole_per_ampere
-
-
 def _pauses(config: OrbitConfig) -> WindowSchedule:
     """Return the windows of pointing: pauses as in detumbling, but a longer time with current."""
     settle, measure, act = config.detumble.settle, config.detumble.measure, config.pointing.act
@@ -312,9 +307,8 @@ def _pauses(config: OrbitConfig) -> WindowSchedule:
 
 
 def _tracker(config: OrbitConfig, filter_: OrbitFilter, environment: EstimatedEnvironment) -> PointingTracker:
-    craft, pauses = config.craft, _pauses(config)
-    inertia = craft.inertia_matrix()
-    return PointingTracker(filter_, environment, pauses, _limit(config), craft.dipole_per_ampere, inertia)
+    inertia = config.craft.inertia_matrix()
+    return PointingTracker(filter_, environment, _pauses(config), config.coils.map(), inertia)
 
 
 def _planned(config: OrbitConfig) -> PlannedCraft:
@@ -330,11 +324,12 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
         axis=axes.pointing,
     )
     pauses = _pauses(config)
-    limit = _limit(config) * pauses.act_ns / pauses.period_ns
+    coils = config.coils.map()
+    limit = coils.limits * pauses.act_ns / pauses.period_ns
     # Without a star camera, the keep-out cones are centred on the pointing axis.
     camera = config.camera
     boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
-    heat = np.array(config.coils.resistance) / config.craft.dipole_per_ampere**2
+    heat = np.diag(coils.heat)
     slew = SlewRequest(section.slew, heat, np.zeros(3), np.array(boresight), section.cones.angles())
     return PlannedCraft(config.craft.inertia_matrix(), axes, weights, limit, slew)
 
@@ -382,10 +377,11 @@ def description_errors(config: OrbitConfig) -> BodyErrors:
 
 def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
     """Return the configured noises of the filter's states."""
-    section = config.estimation
+    section, coils = config.estimation, config.coils.map()
+    strength = float(np.linalg.norm(coils.dipoles, axis=1).max())
     return FreeFilterSettings(
         gyro=(section.bias_start, section.bias_walk),
-        coil_noise=section.current_noise * config.craft.dipole_per_ampere / math.sqrt(CONTROL_RATE_HZ),
+        coil_noise=section.current_noise * strength / math.sqrt(CONTROL_RATE_HZ),
         torque=(section.torque_start, section.torque_walk),
         magnet=(_UNIFORM * config.inertial_unit.accuracy.field_bias, _FIELD_BIAS_WALK),
         field=_FIELD_ERROR,
@@ -405,12 +401,11 @@ def _filter(
 ) -> tuple[OrbitFilter, list[str]]:
     """Return the attitude filter, and the reasons why learned states were rejected."""
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
-    inertia, free = craft.inertia_matrix(), filter_settings(config)
+    inertia, free, coils = craft.inertia_matrix(), filter_settings(config), config.coils.map()
     slow, problems = start_from(learned, free.error_state(inertia), section.changed, utc)
     settings = OrbitFilterSettings(
         inertia=inertia,
-        dipole_per_ampere=craft.dipole_per_ampere,
-        dipole_limit=config.coils.current_limit * craft.dipole_per_ampere,
+        coils=coils,
         gyro_noise=unit.rate_noise,
         field_noise=section.field_noise,
         unknown_psd=config.detumble.torque_noise**2,
@@ -438,13 +433,14 @@ def _sun(
 
 def _sun_acquisition(config: OrbitConfig, services: Services) -> SunAcquisitionLaw | None:
     """Return the law that turns the pointing axis to the Sun in SAFE, or None without solar cells."""
-    section, craft = config.solar_strings, config.craft
+    section, coils = config.solar_strings, config.coils.map()
     if section is None:
         return None
     axis = np.array(config.pointing.axis)
-    settings = SunAcquisitionSettings(inertia=craft.inertia_matrix(), axis=axis, limit=_limit(config))
+    inertia = config.craft.inertia_matrix()
+    settings = SunAcquisitionSettings(inertia=inertia, axis=axis, limit=coils.limits)
     law = SunAcquisition(_pauses(config), settings)
-    return SunAcquisitionLaw(law, _strings(section), craft.dipole_per_ampere, services.events)
+    return SunAcquisitionLaw(law, _strings(section), coils, services.events)
 
 
 def _detumbler(
@@ -462,7 +458,7 @@ def _detumbler(
         errors=description_errors(config),
     )
     braking = FieldDetumblerSettings(
-        limit=_limit(config),
+        limit=config.coils.map().limits,
         horizon=section.horizon,
         replan=section.replan,
         gentle=section.gentle,
@@ -475,12 +471,12 @@ def _detumbler(
 
 def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
     x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
-    inertia, dipole = config.craft.inertia_matrix(), config.craft.dipole_per_ampere
+    inertia = config.craft.inertia_matrix()
     settle_ns = round(config.detumble.settle * SECOND_NS)
     # The field is 16 times weaker than the testbed's, so a coil's torque takes longer to detect.
     response = ResponseSettings(
         inertia,
-        dipole,
+        config.coils.map().dipoles,
         config.inertial_unit.rate_noise,
         bin_samples=16,
         bins=40,

@@ -28,6 +28,7 @@ from hal.interfaces.devices import StringReading
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import FieldAhead
 from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.control.coil_map import CoilMap, limited
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.field_detumbler import FieldDetumbler
 from knightcube.gnc.control.pointing_law import damping_dipole
@@ -39,10 +40,10 @@ from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 class _MagneticLaw:
     """A control law that needs only magnetometer and gyro; implements `flight.loop.body.WindowedLaw`."""
 
-    def __init__(self, law: FieldDetumbler | SunAcquisition, dipole_per_ampere: float) -> None:
-        """`dipole_per_ampere` is the number of turns times the area of each coil (m^2)."""
+    def __init__(self, law: FieldDetumbler | SunAcquisition, coils: CoilMap) -> None:
+        """`coils` maps dipole moments to currents."""
         self._law = law
-        self._dipole_per_ampere = dipole_per_ampere
+        self._coils = coils
         self._field_check = StuckFieldCheck()
 
     def begin(self, now_ns: int) -> None:
@@ -60,11 +61,11 @@ class _MagneticLaw:
         if self._field_check.stuck:
             dipole = np.zeros(3)
             self._law.acts(dipole)
-        return CoilCommand(dipole, dipole / self._dipole_per_ampere)
+        return CoilCommand(dipole, self._coils.currents(dipole))
 
     def sent(self, currents: FloatArray) -> None:
         """Propagate the rate with the currents (3,), A, that flow, which are zero in excluded coils."""
-        self._law.acts(currents * self._dipole_per_ampere)
+        self._law.acts(self._coils.dipole(currents))
 
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the field (3,), T, in body axes at the last command, or None before the field is known."""
@@ -74,9 +75,9 @@ class _MagneticLaw:
 class FieldDetumblingLaw(_MagneticLaw):
     """Detumbles the body; the `detumbler` attribute holds the estimated rate and field."""
 
-    def __init__(self, detumbler: FieldDetumbler, dipole_per_ampere: float) -> None:
-        """`dipole_per_ampere` is the number of turns times the area of each coil (m^2)."""
-        super().__init__(detumbler, dipole_per_ampere)
+    def __init__(self, detumbler: FieldDetumbler, coils: CoilMap) -> None:
+        """`coils` maps dipole moments to currents."""
+        super().__init__(detumbler, coils)
         self.detumbler = detumbler
 
 
@@ -103,11 +104,9 @@ def expected_field(
 class SunAcquisitionLaw(_MagneticLaw):
     """Turns the body to the Sun, and reports whether the solar cells measure a Sun direction."""
 
-    def __init__(
-        self, law: SunAcquisition, strings: SolarStringModel, dipole_per_ampere: float, log: EventLog
-    ) -> None:
-        """`dipole_per_ampere` is the number of turns times the area of each coil (m^2)."""
-        super().__init__(law, dipole_per_ampere)
+    def __init__(self, law: SunAcquisition, strings: SolarStringModel, coils: CoilMap, log: EventLog) -> None:
+        """`coils` maps dipole moments to currents."""
+        super().__init__(law, coils)
         self._acquisition, self._strings = law, strings
         self._events = log
         self._found: bool | None = None
@@ -143,26 +142,22 @@ class PointingTracker:
         filter_: OrbitFilter,
         environment: EstimatedEnvironment,
         pauses: WindowSchedule,
-        limit: float,
-        dipole_per_ampere: float,
+        coils: CoilMap,
         inertia: FloatArray,
     ) -> None:
-        """Create the tracker for coils with the largest dipole `limit` (A m^2).
-
-        `dipole_per_ampere` is the number of turns times the area of each coil (m^2). `inertia` (3, 3) is
-        the inertia tensor in body axes (kg m^2).
-        """
+        """Create the tracker for coils and the inertia tensor `inertia` (3, 3), kg m^2, in body axes."""
         self._inertia = inertia
         self._filter, self._environment = filter_, environment
-        self._pauses, self._limit, self._dipole_per_ampere = pauses, limit, dipole_per_ampere
-        self._held = CoilCommand(_NOTHING, _NOTHING)
+        self._pauses, self._coils = pauses, coils
+        self._nothing = CoilCommand(_NOTHING, coils.currents(_NOTHING))
+        self._held = self._nothing
         self._window: tuple[int, object] | None = None
 
     def command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
         """Return the command of the present control window, which is zero in its pause."""
         pauses, now_ns = self._pauses, reference.time_ns
         if now_ns % pauses.period_ns < pauses.settle_ns + pauses.measure_ns:
-            return CoilCommand(_NOTHING, _NOTHING)
+            return self._nothing
         window = (now_ns // pauses.period_ns, reference.law)
         if window != self._window:
             self._window, self._held = window, self._command(estimate, reference)
@@ -175,7 +170,7 @@ class PointingTracker:
     def _command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
         around = self._environment.at(reference.time_ns)
         if around is None:
-            return CoilCommand(_NOTHING, _NOTHING)
+            return self._nothing
         residual = self._filter.residual_dipole
         field = attitude_matrix(estimate.quaternion) @ around.field
         quaternion, rate = estimate.quaternion, estimate.rate
@@ -187,8 +182,5 @@ class PointingTracker:
             dipole = damping_dipole(self._inertia, rate, field) - residual
         # The factor makes the mean dipole over the window equal to the required dipole.
         dipole = dipole * (self._pauses.period_ns / self._pauses.act_ns)
-        largest = float(np.abs(dipole).max())
-        saturated = largest > self._limit
-        if saturated:
-            dipole = dipole * (self._limit / largest)
-        return CoilCommand(dipole, dipole / self._dipole_per_ampere, saturated)
+        held = limited(dipole, self._coils.limits)
+        return CoilCommand(held, self._coils.currents(held), held is not dipole)

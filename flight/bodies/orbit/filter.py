@@ -34,6 +34,7 @@ from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray, IntArray, cross_product
 from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
+from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation import estimate as form
 from knightcube.gnc.estimation import free_filter as states
 from knightcube.gnc.estimation.error_state import ErrorState
@@ -217,8 +218,8 @@ class OrbitFilterSettings:
     """Settings of the satellite's attitude filter: body, sensors and steps.
 
     Attributes:
-        inertia: inertia matrix (3, 3), kg m^2. dipole_per_ampere: number of turns times area of a coil, m^2.
-            dipole_limit: largest dipole of each coil, A m^2.
+        inertia: inertia matrix (3, 3), kg m^2.
+        coils: the coils of the satellite.
         gyro_noise, field_noise: standard deviations per axis of a gyro sample (rad/s) and of a magnetometer
             sample (T).
         unknown_psd: power spectral density of the angular acceleration while there is no estimate, rad^2/s^3.
@@ -229,8 +230,7 @@ class OrbitFilterSettings:
     """
 
     inertia: FloatArray
-    dipole_per_ampere: float
-    dipole_limit: float
+    coils: CoilMap
     gyro_noise: float
     field_noise: float
     unknown_psd: float
@@ -239,6 +239,11 @@ class OrbitFilterSettings:
     step_ns: int = SECOND_NS
     slow: SlowStates | None = None
     free: FreeFilterSettings = field(default_factory=FreeFilterSettings)
+
+    @property
+    def dipole_limit(self) -> float:
+        """Largest dipole moment along a body axis, A m^2."""
+        return float(self.coils.limits.max())
 
 
 class StepReplay:
@@ -683,7 +688,7 @@ class OrbitFilter:
 
     def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
         """Record the coil currents (3,), A, in force from `time_ns` on; `known` means they are certain."""
-        x, y, z = (self._settings.dipole_per_ampere * currents).tolist()
+        x, y, z = self._settings.coils.dipole(currents).tolist()
         self._dipoles.record(time_ns, (x, y, z), known)
 
     def mark_unknown(self, since_ns: int) -> None:

@@ -75,8 +75,8 @@ class PointingPaths:
         astray: damping and replanning state of a body far off its path.
     """
 
-    def __init__(self, limit: float, fastest: float) -> None:
-        """`limit` is a coil's largest mean dipole (A m^2) over a window.
+    def __init__(self, limit: float | FloatArray, fastest: float) -> None:
+        """`limit` is the largest mean dipole (A m^2) over a window, of all body axes or of each (3,).
 
         `fastest` is the largest rate (rad/s) of a path.
         """
@@ -252,7 +252,10 @@ class ObjectAim:
     """
 
     def __init__(self, sensor: Sensor | None, limit: float, log: EventLog) -> None:
-        """`limit` is a coil's largest dipole (A m^2); `sensor` is None if no objects are searched for."""
+        """`limit` is the mean of the axes' largest dipoles, A m^2.
+
+        `sensor` is None if no objects are searched for.
+        """
         self._sensor, self._limit, self._events = sensor, limit, log
         self._target: PointingTarget | None = None
         self._place: FloatArray | None = None
@@ -363,14 +366,14 @@ class PlannedCraft:
     """The planner's model of the satellite.
 
     `inertia` is the inertia matrix (3, 3), kg m^2, in body axes. `limit` (A m^2) is the largest mean dipole
-    of a coil over a window with its pause. `slew` holds the constraints and heat coefficients that every slew
-    request uses.
+    over a window with its pause, of all body axes or of each (3,). `slew` holds the constraints and heat
+    coefficients that every slew request uses.
     """
 
     inertia: FloatArray
     axes: BodyAxes
     weights: PointingWeights
-    limit: float
+    limit: float | FloatArray
     slew: SlewRequest
 
 

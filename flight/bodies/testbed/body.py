@@ -207,7 +207,7 @@ class TestbedControl(BodyControl):
         guidance = PathGuidance(plant, rules, arrives=settings.strategy is not Strategy.RECEDING)
         steps = [TimedStep(step.at, step.q2, step.rate) for step in config.steps]
         self.modes = frozenset(Mode) - ORBITAL
-        self.dipole_per_ampere = dipole_per_ampere(config)
+        self.dipoles = dipole_per_ampere(config) * np.eye(3)
         self.free_axis = _THREAD_AXIS
         self.paths = guidance
         self.planner = self.planning = Planning(plant, settings, guidance, reader, services)

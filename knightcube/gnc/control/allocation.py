@@ -29,7 +29,7 @@ class Allocation:
     """Allocated currents of the coils, and the torque of these currents.
 
     Attributes:
-        currents: coil currents (3,), zero for coils that are not available, A.
+        currents: coil currents (n,), zero for coils that are not available, A.
         torque: torque (3,) of the allocated currents, N m.
         share: component of the torque along the requested torque, as a fraction of the requested torque, 0 to
             1.
@@ -43,24 +43,25 @@ class Allocation:
 def allocate(
     torque: FloatArray,
     field: FloatArray,
-    dipole_per_ampere: float,
+    dipoles: FloatArray,
     limits: FloatArray,
     available: FloatArray | None = None,
     free: FloatArray | None = None,
 ) -> Allocation:
     """Return currents for a torque (3,) N m in a magnetic field (3,) T, body axes.
 
-    The current limits of the coils are `limits` (3,), A, and the mask `available` (3,) marks the coils that
-    may be used. The mask `free` (3,) marks the axes about which the body can rotate; a suspension thread
-    carries the torque about the other axes. Raises FlightError for an input that is not finite.
+    Column k of `dipoles` (3, n) is the dipole moment of coil k per ampere, m^2. The current limits of the
+    coils are `limits` (n,), A, and the mask `available` (n,) marks the coils that may be used. The mask
+    `free` (3,) marks the axes about which the body can rotate; a suspension thread carries the torque about
+    the other axes. Raises FlightError for an input that is not finite.
     """
     wanted = np.asarray(torque, dtype=np.float64)
     if not (np.isfinite(wanted).all() and np.isfinite(field).all()):
         raise FlightError(f"allocation: torque {wanted} or field {field} is not finite")
     turns = np.ones(3) if free is None else np.asarray(free, dtype=np.float64)
-    usable = np.ones(3) if available is None else np.asarray(available, dtype=np.float64)
+    usable = np.ones(dipoles.shape[1]) if available is None else np.asarray(available, dtype=np.float64)
     # Column i of the matrix `effect` is the torque about the free axes that one ampere in coil i causes.
-    effect = turns[:, None] * np.cross(np.eye(3), field).T * (dipole_per_ampere * usable)
+    effect = turns[:, None] * np.cross(dipoles.T, field).T * usable
     wanted = wanted * turns
     currents = np.linalg.pinv(effect, rcond=WEAKEST) @ wanted * usable
     excess = float(np.max(np.abs(currents) / limits))

@@ -51,8 +51,8 @@ from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSetti
 
 ITERATIONS = 12
 LIMIT_GAIN = 1.4
-"""Assumed mean dipole moment of three coils in a rotating body, relative to the limit of one coil. With all
-coils saturated, the ratio would be 1.5."""
+"""Assumed mean dipole moment of the coils in a rotating body, relative to the mean limit of the body
+axes. With all coils saturated, the ratio would be 1.5."""
 STEEP = 12.0
 """Gain of the dipole moment: a coil reaches the dipole limit where |B x y| (field B, costate y) exceeds its
 mean divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would then
@@ -84,8 +84,9 @@ def momentum_plan(
     """Return the plan that reduces `momentum` (3,) N m s to `rest` N m s in minimum time.
 
     The predicted field after `times` (n,), s, is `field` (n, 3), T, in the inertial axes of the momentum. The
-    dipole limit of each coil is `limit`, A m^2. If the field prediction ends too early, the plan removes as
-    much momentum as possible until the end of the prediction. Raises UsageError for fewer than three times.
+    mean dipole limit of the body axes is `limit`, A m^2. If the field prediction ends too early, the plan
+    removes as much momentum as possible until the end of the prediction. Raises UsageError for fewer than
+    three times.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
@@ -109,11 +110,11 @@ def momentum_plan(
     return MomentumPlan(costate * (STEEP * limit / mean), float(times[long - 1] + spans[long - 1]))
 
 
-def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
+def braking_dipole(costate: FloatArray, field: FloatArray, limit: float | FloatArray) -> FloatArray:
     """Return the dipole moment (3,), A m^2, that a plan commands in a field (3,), T, body axes.
 
-    Each component is clipped separately at `limit`, because each coil removes momentum independently of the
-    other coils.
+    Each component is clipped separately at the limit of its body axis, because each coil removes momentum
+    independently of the other coils.
     """
     return np.clip(-cross_product(field, costate), -limit, limit)
 
@@ -238,7 +239,7 @@ class FieldDetumblerSettings:
     """Settings of the field detumbler.
 
     Attributes:
-        limit: dipole limit of each coil, A m^2.
+        limit: dipole limit along each body axis, equal for all axes or (3,), A m^2.
         horizon: duration of the field prediction, about a quarter of an orbit, s.
         replan: time between momentum plans, s.
         gentle: initial rate below which the upper bound of the rate is the initial rate, rad/s.
@@ -246,7 +247,7 @@ class FieldDetumblerSettings:
         slow: rate below which a body counts as detumbled, rad/s.
     """
 
-    limit: float
+    limit: float | FloatArray
     horizon: float = 1500.0
     replan: float = 5.0
     gentle: float = 0.052
@@ -257,7 +258,7 @@ class FieldDetumblerSettings:
         """Raise UsageError for settings that are not finite and positive."""
         for name in ("limit", "horizon", "replan", "gentle", "spin_up", "slow"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
+            if not (np.isfinite(value).all() and np.min(value) > 0.0):
                 raise UsageError(f"detumbling {name} is {value}: it must be finite and positive")
 
     @property
@@ -434,4 +435,5 @@ class FieldDetumbler:
         else:
             ahead = aligned_to(expected, found.field)
         share = self._schedule.act_ns / self._schedule.period_ns
-        return momentum_plan(found.momentum, ahead, times, share * self._braking.limit, self._rest)
+        limit = share * float(np.mean(self._braking.limit))
+        return momentum_plan(found.momentum, ahead, times, limit, self._rest)

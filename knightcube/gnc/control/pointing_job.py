@@ -98,7 +98,7 @@ class SlewStart:
         times: equally spaced times (m,) of table and preview, s.
         kept: number of steps in the pointing table.
         inertia: (3, 3) kg m^2.
-        limit: mean dipole limit of a coil, A m^2.
+        limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
         sizes: estimated sizes (9,) of the disturbance torques, N m.
     """
 
@@ -107,7 +107,7 @@ class SlewStart:
     times: FloatArray
     kept: int
     inertia: FloatArray
-    limit: float
+    limit: float | FloatArray
     sizes: FloatArray
 
 
@@ -314,7 +314,7 @@ class PointingJob:
     Attributes:
         inertia: (3, 3) kg m^2.
         sizes: estimated sizes (9,) of the disturbance torques, N m.
-        limit: mean dipole limit of a coil, A m^2.
+        limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
         slew: parameters of slews, or None if the body always approaches the law without a slew.
         sight: the sighted object to which to point instead of `target`; None for the target.
     """
@@ -329,7 +329,7 @@ class PointingJob:
     quaternion: FloatArray
     rate: FloatArray
     sizes: FloatArray
-    limit: float
+    limit: float | FloatArray
     slew: SlewRequest | None = None
     sight: ObjectDirection | None = None
 

@@ -22,6 +22,7 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
+from knightcube.gnc.control.coil_map import limited
 from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
 
@@ -50,10 +51,13 @@ class PointingCommand:
 class PointingLaw:
     """The feedback law that computes dipole moments from a pointing table."""
 
-    def __init__(self, table: PointingTable, limit: float) -> None:
-        """Create the law for a table and the dipole limit (A m^2) of each coil."""
+    def __init__(self, table: PointingTable, limit: float | FloatArray) -> None:
+        """Create the law for a table and the dipole limit (A m^2) along each body axis.
+
+        The limit is equal for all axes or has shape (3,).
+        """
         self._table = table
-        self._limit = limit
+        self._limit: FloatArray = np.full(3, limit)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -96,10 +100,7 @@ class PointingLaw:
         pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond
         # The dipole moment along the field is removed, because a dipole along the field causes no torque.
         dipole = field * (float(field @ pull) / float(field @ field)) - pull - residual_dipole
-        # All coils are scaled by one factor, which preserves the direction of the torque.
-        largest = float(np.abs(dipole).max())
-        limited = dipole if largest <= self._limit else dipole * (self._limit / largest)
-        return PointingCommand(limited, rotation, missed)
+        return PointingCommand(limited(dipole, self._limit), rotation, missed)
 
 
 def _cut(vector: FloatArray, longest: float) -> FloatArray:

@@ -238,7 +238,7 @@ class PathConditions:
         pressures: pressures of air and sunlight, which determine the sizes of the torques.
         sizes: estimated sizes (9,) of the disturbance torques, N m.
         inertia, inverse: inertia tensor (3, 3) in body axes, kg m^2, and the inverse of this tensor.
-        limit: dipole limit of each coil, A m^2.
+        limit: dipole limit along each body axis, equal for all axes or (3,), A m^2.
     """
 
     wanted: AttitudeReferences
@@ -248,7 +248,7 @@ class PathConditions:
     sizes: FloatArray
     inertia: FloatArray
     inverse: FloatArray
-    limit: float
+    limit: float | FloatArray
 
     @cached_property
     def around(self) -> FloatArray:

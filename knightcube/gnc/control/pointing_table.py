@@ -192,9 +192,10 @@ def best_course(
             kept and (step.rotated < DONE or before - cost - defect < SAVED * (1.0 + before))
         ):
             break
-    strongest = float(np.abs(motion.control).max())
+    strongest = np.abs(motion.control).max(axis=0)
+    within = bool((strongest <= expected.limit).all())
     speed = float(np.linalg.norm(motion.rate[:first], axis=1).max())
-    return (motion, step.gains) if kept and strongest <= expected.limit and speed <= fastest else None
+    return (motion, step.gains) if kept and within and speed <= fastest else None
 
 
 @dataclass(eq=False)
@@ -384,13 +385,13 @@ class PointingPreview:
 
 
 def pointing_table(
-    ahead: PointingPreview, inertia: FloatArray, limit: float, weights: PointingWeights
+    ahead: PointingPreview, inertia: FloatArray, limit: float | FloatArray, weights: PointingWeights
 ) -> PointingTable:
     """Return the pointing table for the instants of `ahead.initial`.
 
-    The inertia tensor `inertia` (3, 3) is in kg m^2, and `limit` is the dipole limit of each coil in A m^2.
-    The preview after the table should cover one revolution of the orbit. Raises UsageError for times that are
-    not equally spaced.
+    The inertia tensor `inertia` (3, 3) is in kg m^2. The dipole `limit` along each body axis, in A m^2, is
+    equal for all axes or has shape (3,). The preview after the table should cover one revolution of the
+    orbit. Raises UsageError for times that are not equally spaced.
     """
     steps = np.diff(ahead.wanted.times)
     count = len(ahead.initial.times) - 1

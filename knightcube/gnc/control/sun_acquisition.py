@@ -23,6 +23,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, cross_product
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.gnc.control.coil_map import limited
 from knightcube.gnc.control.detumble import WindowSchedule
 
 MEMORY = 2400.0
@@ -97,10 +98,11 @@ class ResidualDipole:
     field are also attributed to the residual dipole moment, and are therefore cancelled as well.
     """
 
-    def __init__(self, inertia: FloatArray, bound: float) -> None:
+    def __init__(self, inertia: FloatArray, bound: float | FloatArray) -> None:
         """Create an observer for an inertia tensor (3, 3) kg m^2.
 
-        Each component of the estimated dipole moment is limited to +-`bound`, A m^2.
+        Each component of the estimated dipole moment is limited to +-`bound`, A m^2. The bound is equal for
+        all axes or has shape (3,).
         """
         self._inertia, self._bound = inertia, bound
         self._inverse: FloatArray = np.asarray(np.linalg.inv(inertia), dtype=float)
@@ -156,18 +158,18 @@ class SunAcquisitionSettings:
     Attributes:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
         axis: unit vector (3,) of the body axis to align with the Sun.
-        limit: dipole limit of each coil, A m^2.
+        limit: dipole limit along each body axis, equal for all axes or (3,), A m^2.
     """
 
     inertia: FloatArray
     axis: FloatArray
-    limit: float
+    limit: float | FloatArray
 
     @property
     def speed(self) -> float:
         """Bandwidth w of the Sun pointing law for this body, rad/s."""
         largest = float(np.linalg.eigvalsh(self.inertia).max())
-        return min(BANDWIDTH, math.sqrt(SHARE * self.limit * _FIELD / largest))
+        return min(BANDWIDTH, math.sqrt(SHARE * float(np.min(self.limit)) * _FIELD / largest))
 
 
 class SunAcquisition:
@@ -237,8 +239,7 @@ class SunAcquisition:
             self._acts = _NO_DIPOLE
             return _NO_DIPOLE
         dipole = cross_product(field, self._torque(field)) / float(field @ field) - self._residual.dipole
-        largest = float(np.abs(dipole).max())
-        self._acts = dipole if largest <= seeking.limit else dipole * (seeking.limit / largest)
+        self._acts = limited(dipole, np.full(3, seeking.limit))
         return self._acts
 
     def _torque(self, field: FloatArray) -> FloatArray:

@@ -26,9 +26,10 @@ from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body import (
     KNIGHTCUBE_SUPPLY,
     CoilSupply,
+    CraftModel,
     built_craft,
     coil_supply,
-    completed,
+    craft_model,
     generators,
     released,
 )
@@ -59,15 +60,18 @@ class BasiliskWorld:
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
         description: DescriptionErrors = NO_ERRORS,
+        craft: CraftModel | None = None,
     ) -> None:
         """Create the world with a body that is held still until its release.
+
+        The craft is by default that of `section`.
 
         Raises ConfigError if Basilisk is not installed.
         """
         if section.disturbances.gravity_gradient not in {0.0, 1.0}:
             raise ConfigError("simulation.free_body.disturbances.gravity_gradient", "is 0 or 1 in Basilisk")
         errors, tip_off, _ = generators(seed)
-        self.craft = built_craft(section, errors, description)
+        self.craft = built_craft(section, errors, description, craft)
         self._attitude, rate = released(section.release, tip_off)
         self._tip_off = np.array(rate)
         self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS
@@ -220,6 +224,8 @@ def make(inputs: WorldInputs) -> BasiliskWorld:
     if section.free_body is None:
         raise ConfigError("simulation.free_body", "is missing: this world needs it")
     supply = coil_supply(inputs)
-    body = completed(section.free_body, inputs.config)
-    description = description_errors(inputs.config, section)
-    return BasiliskWorld(body, currents, supply, section.seed, section.utc, inputs.start_ns, description)
+    body, description = section.free_body, description_errors(inputs.config, section)
+    craft = craft_model(body, inputs.config)
+    return BasiliskWorld(
+        body, currents, supply, section.seed, section.utc, inputs.start_ns, description, craft
+    )

@@ -41,7 +41,7 @@ class PlainTracker:
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
     testbed = TESTBED.make(config, services, learned)
     field = np.array([0.0, 0.0, -as_testbed(config).plant.field])
-    tracker = PlainTracker(field, config.coils.current_limit, testbed.control.dipole_per_ampere)
+    tracker = PlainTracker(field, config.coils.current_limit, float(testbed.control.dipoles[0, 0]))
     testbed.control.tracker = tracker
     return testbed
 

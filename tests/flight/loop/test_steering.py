@@ -40,7 +40,7 @@ def _drive(resting: list[bool]) -> tuple[CoilDrive, Coils, SimpleNamespace]:
         tumble_rate=0.0175,
         correction=CoilCorrection(),
     )
-    settings = CoilDriveSettings(DIPOLE, np.full(3, 0.148), None)
+    settings = CoilDriveSettings(DIPOLE * np.eye(3), np.full(3, 0.148), None)
     services = SimpleNamespace(facts=None, events=None)
     drive = CoilDrive(
         cast(TorqueCoils, coils), None, cast(CoilMonitor, watch), settings, cast(Services, services)

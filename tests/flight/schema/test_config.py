@@ -7,6 +7,7 @@ import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -89,7 +90,7 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
 @pytest.mark.parametrize(
     ("right", "wrong", "complaint"),
     [
-        ("supply_voltage: 3.4", "supply_voltage: -3.4", r":28: `coils.supply_voltage` is -3.4: expected"),
+        ("supply_voltage: 3.4", "supply_voltage: -3.4", r":30: `coils.supply_voltage` is -3.4: expected"),
         (
             "supply_voltage",
             "suply_voltage",
@@ -103,7 +104,7 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
         ("{at: 0.0,", "{att: 0.0,", "did you mean `at`"),
         ("at: 200.0", "at: 50", "must be in order of time"),
         ("duration: 700.0", "duration: 600.0", "must be later than the last target, at 600.0 s"),
-        ("[[0, 1],", "[[0, 2],", "a channel of the PWM chip twice"),
+        ("channels: [0, 1]", "channels: [0, 2]", "a channel of the PWM chip twice"),
         ("address: 0x45", "address: 0x40", "the address of the PWM chip"),
         ("exposure: 1.0", "exposure: 6.0", "must be shorter than `camera.period`"),
         ("replan_period: 5.0", "replan_period: 12.0", "must be shorter than `guidance.horizon`"),
@@ -140,8 +141,8 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
             "has its roll in its quaternion",
         ),
         (
-            "axis: [0.0, 0.0, 1.0]",
-            "axis: [0.0, 0.0, 2.0]",
+            "\n  axis: [0.0, 0.0, 1.0]",
+            "\n  axis: [0.0, 0.0, 2.0]",
             "`pointing.axis` has length 2: give a unit",
         ),
         ("across: [1.0, 0.0, 0.0]", "across: [0.0, 0.6, 0.8]", "is 36.9 deg from `pointing.axis`"),
@@ -263,3 +264,53 @@ def test_what_a_lens_differs_by_from_a_pinhole_counts_as_unknown_to_the_streaks(
     known = camera_knowledge(camera)
     assert known.centre == pytest.approx(5.0)
     assert known.distortion == pytest.approx(0.01)
+
+
+COIL = "{axis: [0.0, 0.0, 1.0], dipole_per_ampere: 0.648, resistance: 23.0, channels: [4, 5]}"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        (COIL.replace("1.0]", "0.0]"), r"windings\[2\].axis` is zero"),
+        (COIL.replace("[0.0, 0.0, 1.0]", "[1.0, 1.0, 0.0]"), "the coils lie in one plane"),
+        (
+            COIL.replace("dipole_per_ampere: 0.648, ", ""),
+            r"windings\[2\].dipole_per_ampere` is missing",
+        ),
+        (COIL.replace("648", "648, turns: 80, area: 0.0081"), "leave `turns` and `area` out"),
+        (COIL.replace("dipole_per_ampere: 0.648", "turns: 80"), r"windings\[2\].turns` needs both"),
+        (COIL.replace("23.0", "46.0"), "`coils.current_limit` is 0.148: the supply drives 0.0739 A"),
+        (
+            COIL.replace("23.0", "23.0, current_limit: 0.2"),
+            r"\[2\].current_limit` is 0.2: the supply",
+        ),
+        ("", "has 2 entries: this version flies three coils"),
+    ],
+)
+def test_a_mistake_in_the_coils_gets_one_line(wrong: str, complaint: str) -> None:
+    text = ORBIT.replace(f"    - {COIL}", f"    - {wrong}" if wrong else "", 1)
+    assert text != ORBIT
+    with pytest.raises(ConfigError, match=complaint) as caught:
+        reader.parse(text, "orbit.yaml")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_rod_and_an_air_coil_have_their_own_limits_and_strengths() -> None:
+    air = "{axis: [0.0, 0.0, 2.0], turns: 80, area: 0.0081, resistance: 40.0, current_limit: 0.05}"
+    coils = as_orbit(reader.parse(ORBIT.replace(COIL, air, 1))).coils
+    assert coils.limits == (0.148, 0.148, 0.05)
+    assert coils.channels == ((0, 1), (2, 3), (4, 5))
+    np.testing.assert_allclose(coils.map().dipoles, 0.648 * np.eye(3))
+    np.testing.assert_allclose(coils.map().limits, 0.648 * np.array(coils.limits))
+
+
+def test_the_craft_needs_its_inertia_or_its_mass() -> None:
+    inertia = next(line for line in ORBIT.splitlines() if line.startswith("  inertia:"))
+    box = as_orbit(reader.parse(ORBIT.replace(inertia, "", 1))).craft.inertia_matrix()
+    np.testing.assert_allclose(box, 0.611 * 0.01 / 6.0 * np.eye(3))
+    mass = next(line for line in ORBIT.splitlines() if line.startswith("  mass:"))
+    with pytest.raises(ConfigError, match="`craft` needs `inertia` or `mass`"):
+        reader.parse(ORBIT.replace(inertia, "", 1).replace(mass, "", 1))
+    with pytest.raises(ConfigError, match=r"centre_of_mass` is 0.06 m along y: outside the box"):
+        reader.parse(ORBIT.replace(inertia, f"{inertia}\n  centre_of_mass: [0.0, 0.06, 0.0]", 1))

@@ -275,8 +275,10 @@ def test_errors_of_sections_name_the_file_of_the_value(tmp_path: Path) -> None:
     wrong = text.replace("release: {speed: 0.1745}", "release: {speed: -1.0}")
     line = 1 + next(i for i, one in enumerate(wrong.splitlines()) if "speed: -1.0" in one)
     write(tmp_path, "base.yaml", wrong)
-    top = write(tmp_path, "top.yaml", "extends: base.yaml\nsimulation: {seed: 2}\ncoils: {resistance: -1}\n")
-    with pytest.raises(ConfigError, match=r"top\.yaml:3: `coils\.resistance` is -1"):
+    top = write(
+        tmp_path, "top.yaml", "extends: base.yaml\nsimulation: {seed: 2}\ncoils: {supply_voltage: -1}\n"
+    )
+    with pytest.raises(ConfigError, match=r"top\.yaml:3: `coils\.supply_voltage` is -1"):
         load(top)
     with pytest.raises(
         ConfigError, match=rf"base\.yaml:{line}: `simulation\.free_body\.release\.speed` is -1"

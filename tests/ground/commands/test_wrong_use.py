@@ -64,7 +64,7 @@ def test_the_plan_s_configuration_is_found_in_any_folder(
         (
             "current_limit: 0.148",
             "current_limit: 148",
-            ":29: `coils.current_limit` is 148.0: must be 0.001 to 1 A",
+            ":31: `coils.current_limit` is 148.0: must be 0.001 to 1 A",
         ),
         (
             "strategy: goal",

@@ -17,7 +17,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from sim_hal.settings import CraftSection, Disturbances, FreeBodySection, OrbitSection, Simulation, TipOff
 from sim_hal.worlds import free_body
-from sim_hal.worlds.free_body import CRAFTS, FreeBody, Loads, Rotation, State, box, build, completed
+from sim_hal.worlds.free_body import CRAFTS, FreeBody, Loads, Rotation, State, box, build, craft_model
 from sim_hal.worlds.world import World, WorldInputs, make_world
 from tests.support.flights import demo_config, demo_world
 from tests.support.pointing_settings import WEIGHTS
@@ -160,7 +160,7 @@ def test_the_documents_section_is_read_and_flies() -> None:
     assert section is not None
     world = make_world(WorldInputs(demo_config(1.0, camera=False), section, lambda: np.zeros(3), 0))
     assert isinstance(world, FreeBody)
-    assert world.craft.inertia == CRAFTS["cubesat_3u"].inertia
+    np.testing.assert_array_equal(np.diag(world.craft.inertia), CRAFTS["cubesat_3u"].inertia)
 
 
 QUIET = Disturbances(drag=0.0, solar_pressure=0.0, residual_dipole=0.0)
@@ -275,15 +275,14 @@ FOLDER = Path(__file__).resolve().parents[3] / "config"
 def test_the_believed_coils_and_inertia_are_the_true_ones(name: str) -> None:
     """Errors of a few per cent are drawn by the seed; other coils than believed are a wrong configuration."""
     config = as_orbit(reader.load(FOLDER / name))
-    believed = config.craft
     text = (FOLDER / name).read_text(encoding="utf-8")
     section = reader.simulation_section(text, name, Simulation)
     assert section is not None
     assert section.free_body is not None
-    true = completed(section.free_body, config).craft
-    craft = CRAFTS[true] if isinstance(true, str) else true
-    assert believed.dipole_per_ampere == pytest.approx(craft.dipole_per_ampere, rel=0.01)
-    assert believed.inertia == pytest.approx(craft.inertia, rel=0.01)
+    true = craft_model(section.free_body, config)
+    np.testing.assert_array_equal(true.dipoles, config.coils.map().dipoles)
+    np.testing.assert_array_equal(true.inertia, config.craft.inertia_matrix())
+    assert true.size == config.craft.size
 
 
 TENSOR = ((4.0e-3, 2.0e-4, -1.0e-4), (2.0e-4, 5.0e-3, 3.0e-4), (-1.0e-4, 3.0e-4, 6.0e-3))
@@ -295,17 +294,19 @@ def test_the_true_body_has_the_described_tensor_unless_it_is_given_another() -> 
     calm = Disturbances(principal_turn_deg=0.0, coil_scale=0.0, coil_tilt_deg=0.0)
     size = (0.3, 0.1, 0.1)
     described = FreeBodySection(craft=CraftSection(size=size), disturbances=calm)
-    body = FreeBody(completed(described, config), lambda: np.zeros(3))
+    body = FreeBody(described, lambda: np.zeros(3), craft=craft_model(described, config))
     np.testing.assert_allclose(inertia_matrix(body), TENSOR, rtol=1e-9)
     np.testing.assert_allclose(body.craft.coil_dipole, 1.351 * np.eye(3))
     own = FreeBodySection(craft=CraftSection(size=size, inertia=(1.0, 1.0, 1.5)), disturbances=calm)
-    body = FreeBody(completed(own, config), lambda: np.zeros(3))
+    body = FreeBody(own, lambda: np.zeros(3), craft=craft_model(own, config))
     np.testing.assert_allclose(inertia_matrix(body), np.diag([1.0, 1.0, 1.5]))
     with pytest.raises(ConfigError, match=r"craft.inertia: has the principal moments 1, 1, 5: the largest"):
-        completed(FreeBodySection(craft=CraftSection(size=size, inertia=(1.0, 1.0, 5.0))), config)
+        craft_model(FreeBodySection(craft=CraftSection(size=size, inertia=(1.0, 1.0, 5.0))), config)
     with pytest.raises(ConfigError, match=r"craft.inertia: mixes moments and rows"):
-        completed(FreeBodySection(craft=CraftSection(size=size, inertia=(1.0, 1.0, (0.0, 0.0, 1.0)))), config)
-    with pytest.raises(ConfigError, match="needs `inertia` and `dipole_per_ampere`"):
+        craft_model(
+            FreeBodySection(craft=CraftSection(size=size, inertia=(1.0, 1.0, (0.0, 0.0, 1.0)))), config
+        )
+    with pytest.raises(ConfigError, match="needs the configuration of a satellite"):
         FreeBody(described, lambda: np.zeros(3))
 
 

@@ -31,7 +31,7 @@ from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 from knightcube.gnc.estimation.free_filter import ATTITUDE, FreeFilter
 from sim_hal.settings import FaultEntry, FreeBodySection, Simulation, TipOff
-from sim_hal.worlds.free_body import FreeBody, completed
+from sim_hal.worlds.free_body import FreeBody
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, PAUSE, STAR_SIGMA, PointingFlight
 from tests.support.flights import CONFIG, fly
@@ -71,7 +71,7 @@ def _world(path: Path, seed: tuple[int, ...], lit: float, silent: float) -> tupl
     assert section.free_body is not None
     node = float(np.random.default_rng(seed).uniform(*NODES))
     first = configuration.replace(section.free_body.orbit, local_time=node, true_anomaly_deg=0.0)
-    body = completed(configuration.replace(section.free_body, orbit=first), configuration.load(path))
+    body = configuration.replace(section.free_body, orbit=first)
     start = _state(body, section.utc)
     revolution = 2.0 * math.pi * math.sqrt((SEMI_MAJOR_AXIS + first.altitude) ** 3 / GRAVITATIONAL_PARAMETER)
     ahead = predict(start, lit + 1.5 * revolution)

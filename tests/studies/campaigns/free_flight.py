@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.schema.values import inertia_matrix
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
@@ -65,9 +64,9 @@ class FreeFlight:
         self.body = FreeBody(section, lambda: self._currents, seed=seed, utc=UTC)
         self.body.release_at(0)
         shape = CRAFTS[craft]
-        self.inertia: FloatArray = inertia_matrix(shape.inertia)
+        self.inertia: FloatArray = shape.inertia
         self.limit = CRAFT[craft]
-        self._dipole_per_ampere = shape.dipole_per_ampere
+        self._dipole_per_ampere = float(shape.dipoles[0, 0])
         self.time_ns = 0
         self.square = 0.0
         """A^2 m^4 s: the integral of the commanded dipole squared."""

@@ -20,6 +20,7 @@ from knightcube.astro.quaternion import (
     multiply,
     normalise,
 )
+from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement
@@ -41,8 +42,7 @@ class Still:
         self.attitude = normalise(np.random.default_rng(seed).standard_normal(4))
         settings = OrbitFilterSettings(
             inertia=1e-3 * np.eye(3),
-            dipole_per_ampere=1.0,
-            dipole_limit=0.1,
+            coils=CoilMap.equal(1.0, 0.1),
             gyro_noise=1e-4,
             field_noise=1e-7,
             unknown_psd=1e-8,

@@ -10,6 +10,7 @@ from flight.loop.facts import EventLog
 from hal.interfaces.devices import StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.sun_acquisition import MEMORY, SunAcquisition, SunAcquisitionSettings
 from knightcube.vision.solar_cells import SolarStringModel
@@ -27,7 +28,9 @@ class Seen:
             WindowSchedule(SECOND_NS // 10, SECOND_NS // 10, 18 * SECOND_NS // 10),
             SunAcquisitionSettings(inertia=1e-3 * np.eye(3), axis=np.array([1.0, 0.0, 0.0]), limit=0.1),
         )
-        self.law = SunAcquisitionLaw(law, SolarStringModel(), 0.648, EventLog(self._tell))
+        self.law = SunAcquisitionLaw(
+            law, SolarStringModel(), CoilMap.equal(0.648, 0.148), EventLog(self._tell)
+        )
         self.law.begin(0)
 
     def _tell(self, kind: EventKind, _time_ns: int, _held: int, text: str) -> None:

@@ -19,6 +19,7 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
+from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Knowledge
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
@@ -44,8 +45,7 @@ class Flown:
         self.filter = OrbitFilter(
             OrbitFilterSettings(
                 inertia=INERTIA,
-                dipole_per_ampere=1.0,
-                dipole_limit=0.1,
+                coils=CoilMap.equal(1.0, 0.1),
                 gyro_noise=1e-4,
                 field_noise=1e-7,
                 unknown_psd=1e-8,

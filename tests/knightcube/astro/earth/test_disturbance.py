@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.schema.values import inertia_matrix
 from knightcube.astro.earth.disturbance import AIR, Pressures, box_areas, pressures, shapes
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.gnc.control.pointing_job import slew
@@ -35,7 +34,7 @@ def test_a_torque_seen_at_one_attitude_tells_those_at_all_others(name: str) -> N
     flows = (SPEED * (VIEWS @ flight)).tolist()
     true = np.array([air_torque(faces, (x, y, z), DENSITY) for x, y, z in flows])
     missed = []
-    for pressed in (air.facing(box_areas(inertia_matrix(craft.inertia)), VIEWS), air):
+    for pressed in (air.facing(box_areas(craft.inertia), VIEWS), air):
         shape = shapes(pressed, VIEWS)[:, :, AIR]
         size = np.linalg.lstsq(shape[:10].reshape(-1, 3), true[:10].reshape(-1), rcond=None)[0]
         error = true[10:] - shape[10:] @ size
