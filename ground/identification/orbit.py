@@ -145,7 +145,7 @@ def fragment(found: LearnedDescription, folder: Path, extends: str) -> str:
     that were not learned, and the residual dipole and the gyro bias, which have no key, are omitted.
     Raises InputError if no body has the learned inertia.
     """
-    sections = [_craft(found), _inertial_unit(found), _camera(found)]
+    sections = [_craft(found), _coils(found), _inertial_unit(found), _camera(found)]
     lines = [
         f"# Made by `python -m flight identify` from {str(folder)!a} at {found.time:.0f} s; +- is 1 sigma.",
         f"extends: {json.dumps(extends)}",
@@ -155,18 +155,51 @@ def fragment(found: LearnedDescription, folder: Path, extends: str) -> str:
 
 def _craft(found: LearnedDescription) -> list[str]:
     """Return the lines of the section `craft`."""
-    one = found.quantities["inertia"]
-    if not one.learned:
+    inertia, coils = found.quantities["inertia"], found.quantities["coils"]
+    accuracy = found.config.craft.accuracy
+    values, accuracies = [], []
+    if inertia.learned:
+        if problem := inertia_problem(tensor(inertia.value)):
+            raise InputError("the learned inertia", problem)
+        values = [f"  inertia:   # kg m^2 +- {inertia.claim.max():.2g}, scaled to the configured trace"]
+        values += _rows(tensor(inertia.value), 4)
+        moments, axes_deg = _inertia_accuracy(found)
+        accuracies = [f"moments: {_above(moments)}", f"axes_deg: {_above(axes_deg)}"]
+    if coils.learned:
+        gain, axes = _largest(coils)
+        accuracies += [
+            f"coil_gain: {_above(min(gain, accuracy.coil_gain))}",
+            f"coil_axes_deg: {_above(min(math.degrees(axes), accuracy.coil_axes_deg))}",
+        ]
+    return ["craft:", *values, f"  accuracy: {{{', '.join(accuracies)}}}"] if accuracies else []
+
+
+def _coils(found: LearnedDescription) -> list[str]:
+    """Return the lines of the section `coils`, whose list of coils is complete."""
+    learned, coils = found.quantities["coils"], found.config.coils
+    if not learned.learned:
         return []
-    if problem := inertia_problem(tensor(one.value)):
-        raise InputError("the learned inertia", problem)
-    moments, axes_deg = _inertia_accuracy(found)
-    return [
-        "craft:",
-        f"  inertia:   # kg m^2 +- {one.claim.max():.2g}, scaled to the configured trace",
-        *_rows(tensor(one.value), 4),
-        f"  accuracy: {{moments: {_above(moments)}, axes_deg: {_above(axes_deg)}}}",
-    ]
+    lines = ["coils:", f"  windings:   # +- {learned.claim.max():.2g} relative to the inertia"]
+    dipoles = learned.value.reshape(3, 3) @ coils.map().dipoles
+    for coil, channels, dipole in zip(coils.windings, coils.channels, dipoles.T, strict=True):
+        strength = float(np.linalg.norm(dipole))
+        entries = [
+            f"axis: {_row(dipole / strength)}",
+            f"dipole_per_ampere: {strength:.6g}",
+            f"resistance: {coil.resistance!r}",
+            f"channels: {list(channels)}",
+        ]
+        entries += [f"current_limit: {coil.current_limit!r}"] if coil.current_limit is not None else []
+        entries += ["sign: -1"] if coil.sign == -1 else []
+        lines.append(f"    - {{{', '.join(entries)}}}")
+    return lines
+
+
+def _largest(matrix: LearnedQuantity) -> tuple[float, float]:
+    """Return the largest errors of the elements on and off the diagonal of a learned matrix."""
+    diagonal = np.eye(3, dtype=bool).ravel()
+    claims = (matrix.claim[diagonal].max(), matrix.claim[~diagonal].max())
+    return _UNIFORM * float(claims[0]), _UNIFORM * float(claims[1])
 
 
 def _inertia_accuracy(found: LearnedDescription) -> tuple[float, float]:
@@ -199,8 +232,7 @@ def _inertial_unit(found: LearnedDescription) -> list[str]:
         # The readings were corrected by the configured matrix, so the learned matrix is the remaining error.
         values += [f"    gyro_matrix:   # +- {gyro.claim.max():.2g}"]
         values += _rows(np.array(known.gyro_matrix) @ gyro.value.reshape(3, 3), 6)
-        diagonal = np.eye(3, dtype=bool).ravel()
-        scale, alignment = _UNIFORM * gyro.claim[diagonal].max(), _UNIFORM * gyro.claim[~diagonal].max()
+        scale, alignment = _largest(gyro)
         accuracies += [
             f"gyro_scale: {_above(min(scale, accuracy.gyro_scale))}",
             f"gyro_alignment: {_above(min(alignment, accuracy.gyro_alignment))}",

@@ -19,10 +19,14 @@ from tests.ground.commands.in_process import command
 from tests.support.packed_run import packed_run
 
 TRUE = np.array([[0.0063, 0.0004, -0.0003], [0.0004, 0.0345, 0.0005], [-0.0003, 0.0005, 0.0320]])
+WINDINGS = [
+    {"axis": axis, "dipole_per_ampere": 1.18, "resistance": 9.13}
+    for axis in ([1.0, 0.02, 0.0], [0.0, 1.0, -0.03], [0.0, 0.0, 1.0])
+]
 WORLD = f"""
 simulation:
   free_body:
-    craft: {{size: [0.3, 0.1, 0.1], inertia: {TRUE.tolist()}, dipole_per_ampere: 1.18}}
+    craft: {{inertia: {TRUE.tolist()}, windings: {json.dumps(WINDINGS)}}}
     errors: 0.0
     release: {{speed: 0.1}}
 """
@@ -83,6 +87,12 @@ def test_the_fragment_states_the_truth_within_its_claims(flown: tuple[Path, dict
     change = (np.array(one["value"]) - one["described"]) / one["claim"]
     np.testing.assert_allclose(one["change_sigmas"], change)
     assert not facts["quantities"]["sunlit_dipole"]["learned"]
+    true = np.array([coil["axis"] for coil in WINDINGS], dtype=float)
+    true *= 1.18 * scale / np.trace(TRUE) / np.linalg.norm(true, axis=1)[:, None]
+    error = config.coils.map().dipoles - true.T
+    assert np.abs(error).max() < 4.0 * 1.351 * max(facts["quantities"]["coils"]["claim"])
+    assert np.abs(error).max() < 0.5 * np.abs(described.coils.map().dipoles - true.T).max()
+    assert config.craft.accuracy.coil_gain < 0.5 * described.craft.accuracy.coil_gain
 
 
 def test_the_table_names_each_value_and_what_was_not_learned(flown: tuple[Path, dict[str, Any]]) -> None:
@@ -134,6 +144,7 @@ def test_the_learned_sensors_are_combined_with_the_configured_ones(tmp_path: Pat
     packet: dict[str, Any] = {
         "inertia": [0.0066, 0.0333, 0.0333, 0.0, 0.0, 0.0],
         "inertia_ratio_sigma": [1.0] * 6,
+        "coils_ratio_sigma": [1.0] * 9,
         "gyro": matrix,
         "gyro_sigma": [1e-4] * 9,
         "field": matrix,
