@@ -1,6 +1,6 @@
-"""Packet definition table as Markdown for people and as JSON for ground stations.
+"""Packet definition tables as Markdown for people and as JSON for ground stations.
 
-`python -m ground.documentation [--json]`
+`python -m ground.documentation [--telecommands | --json]`
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from flight.link.commands import LAYOUTS as COMMAND_LAYOUTS
+from flight.link.process.directives import LAYOUTS as DIRECTIVE_LAYOUTS
 from flight.link.telemetry.definitions import Field, Range
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout, wraps_at
 
@@ -33,9 +34,30 @@ Every packet is a CCSDS space packet (133.0-B-2), all numbers big-endian:
 | 7 | i8 | mission time, ns |
 | 15 | | the fields below |
 | last 2 | u2 | CRC-16: x^16 + x^12 + x^5 + 1, preset to ones, over everything before it |
-
+"""
+_TYPES = """
 A type is u (unsigned integer), i (signed integer) or f (IEEE 754), with its size in bytes. S with a size in
 bytes is UTF-8 text, padded with zeros; its last byte is always zero.
+"""
+_FOREWORD_OF_TELECOMMANDS = """\
+# Telecommands
+
+Made from `flight/link/commands.py` and `flight/link/process/directives.py` by
+`python -m ground.documentation --telecommands > docs/telecommands.md`. The page
+[commands and telemetry](fly/commands.md) explains the commands to the flight, and the page
+[the link](fly/link.md) the commands to the link and the frames that protect both.
+
+Every telecommand is a CCSDS space packet (133.0-B-2), all numbers big-endian:
+
+| byte | type | content |
+|---|---|---|
+| 0 | u2 | version 0 (3 bits), type 1 = telecommand (1), secondary header 1 (1), APID (11) |
+| 2 | u2 | 3 = unsegmented (2 bits), sequence count, chosen by the sender and repeated in the report (14) |
+| 4 | u2 | bytes that follow this word, less one |
+| 6 | u1 | version of the packet's definition |
+| 7 | i8 | time of the command by the sender's clock, ns since 1970 UTC |
+| 15 | | the fields below |
+| last 2 | u2 | CRC-16: x^16 + x^12 + x^5 + 1, preset to ones, over everything before it |
 """
 
 
@@ -59,8 +81,14 @@ def command_table(layouts: Mapping[str, Layout] = COMMAND_LAYOUTS) -> list[dict[
 
 
 def markdown() -> str:
-    """Return the packet definition table as Markdown."""
-    return _FOREWORD + "".join(_section(layout) for layout in LAYOUTS.values())
+    """Return the table of telemetry packets as Markdown."""
+    return _FOREWORD + _TYPES + "".join(_section(layout) for layout in LAYOUTS.values())
+
+
+def markdown_of_telecommands() -> str:
+    """Return the table of telecommands, to the flight and to the link, as Markdown."""
+    sections = (_section(layout) for layout in (*COMMAND_LAYOUTS.values(), *DIRECTIVE_LAYOUTS.values()))
+    return _FOREWORD_OF_TELECOMMANDS + _TYPES + "".join(sections)
 
 
 def _packet(layout: Layout) -> dict[str, Any]:
@@ -130,16 +158,12 @@ def _offsets(layout: Layout) -> list[tuple[Field, int]]:
 
 def _section(layout: Layout) -> str:
     packet = layout.packet
-    identity = f"APID 0x{packet.apid:03X}, version {packet.version}, {layout.length} bytes"
-    lines = [
-        "",
-        f"## {packet.name}",
-        "",
-        f"{packet.meaning}. {identity}, {packet.rate}.",
-        "",
-        "| byte | field | type | unit | meaning |",
-        "|---|---|---|---|---|",
-    ]
+    identity = [f"APID 0x{packet.apid:03X}", f"version {packet.version}", f"{layout.length} bytes"]
+    identity += [] if packet.telecommand else [packet.rate]
+    hazard = f" Hazard: {packet.hazard}." if packet.hazard else ""
+    lines = ["", f"## {packet.name}", "", f"{packet.meaning}. {', '.join(identity)}.{hazard}"]
+    if packet.fields:
+        lines += ["", "| byte | field | type | unit | meaning |", "|---|---|---|---|---|"]
     for field, offset in _offsets(layout):
         kind = f"{field.kind} x {field.count}" if field.count > 1 else field.kind
         lines.append(f"| {offset} | {field.name} | {kind} | {field.unit} | {meaning_of(field)} |")
@@ -149,9 +173,14 @@ def _section(layout: Layout) -> str:
 def main() -> None:
     """Print the documentation."""
     parser = argparse.ArgumentParser(prog="python -m ground.documentation", description=__doc__)
-    parser.add_argument("--json", action="store_true", help="print the ground database instead of Markdown")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument("--json", action="store_true", help="print the ground database instead of Markdown")
+    kinds.add_argument("--telecommands", action="store_true", help="print the telecommands")
     arguments = parser.parse_args()
-    sys.stdout.write(json.dumps(database(), indent=2) + "\n" if arguments.json else markdown())
+    if arguments.json:
+        sys.stdout.write(json.dumps(database(), indent=2) + "\n")
+    else:
+        sys.stdout.write(markdown_of_telecommands() if arguments.telecommands else markdown())
 
 
 if __name__ == "__main__":

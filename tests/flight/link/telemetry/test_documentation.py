@@ -10,7 +10,8 @@ import pytest
 
 from flight.link.telemetry.definitions import CONTROL, PACKETS
 from flight.link.telemetry.packets import Packer
-from ground.documentation import database, main, markdown
+from ground.documentation import database, main, markdown, markdown_of_telecommands
+from tests.flight.link.published import COMMANDS, DIRECTIVES
 from tests.flight.link.telemetry.samples import plain_contents
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -19,6 +20,16 @@ ROOT = Path(__file__).resolve().parents[4]
 def test_the_document_in_the_repository_is_in_step_with_the_table() -> None:
     cure = "run: python -m ground.documentation > docs/telemetry.md"
     assert (ROOT / "docs" / "telemetry.md").read_text(encoding="utf-8") == markdown(), cure
+
+
+def test_the_telecommands_in_the_repository_are_in_step_with_their_tables() -> None:
+    cure = "run: python -m ground.documentation --telecommands > docs/telecommands.md"
+    text = (ROOT / "docs" / "telecommands.md").read_text(encoding="utf-8")
+    assert text == markdown_of_telecommands(), cure
+    for name, apid, _, hazard in (*COMMANDS, *DIRECTIVES):
+        section = text.split(f"\n## {name}\n")[1].split("\n## ")[0]
+        assert f"0x{apid:03X}" in section
+        assert ("Hazard" in section) == hazard
 
 
 def test_every_field_of_every_packet_is_documented() -> None:
@@ -46,11 +57,14 @@ def test_the_ground_database_is_enough_to_read_a_packet() -> None:
     assert struct.unpack_from(">H", raw)[0] & 0x7FF == control["apid"]
 
 
-@pytest.mark.parametrize("arguments", [[], ["--json"]])
+@pytest.mark.parametrize("arguments", [[], ["--json"], ["--telecommands"]])
 def test_the_command_prints_either(
     arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["documentation", *arguments])
     main()
     printed = capsys.readouterr().out
-    assert json.loads(printed) == database() if arguments else printed == markdown()
+    if arguments == ["--json"]:
+        assert json.loads(printed) == database()
+    else:
+        assert printed == (markdown_of_telecommands() if arguments else markdown())
