@@ -14,6 +14,7 @@ import numpy as np
 
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.mean_elements import FittedElements
+from knightcube.astro.inertia import box_inertia
 from sim_hal.settings import OrbitSection
 from sim_hal.worlds.orbit import elements, log_density, sun_position
 
@@ -118,12 +119,6 @@ class Derived:
     beta_deg: float
 
 
-def cuboid_inertia(mass: float, size: Vector) -> Vector:
-    """Return the moments of inertia (3,), kg m^2, of a homogeneous cuboid about its axes of symmetry."""
-    x, y, z = (side * side for side in size)
-    return mass / 12.0 * (y + z), mass / 12.0 * (z + x), mass / 12.0 * (x + y)
-
-
 def sun_synchronous_inclination(altitude: float, eccentricity: float) -> float | None:
     """Return the inclination (deg) at which J2 turns the node with the mean Sun, or None if there is none.
 
@@ -151,7 +146,8 @@ def largest_dipole(coils: tuple[Coil, ...]) -> float:
 def derived(satellite: Satellite, julian_date: float) -> Derived:
     """Return the values that follow from the description; the flight begins at `julian_date`, UTC."""
     orbit, size = satellite.orbit, satellite.size
-    inertia = cuboid_inertia(satellite.mass, size)
+    x, y, z = np.diag(box_inertia(satellite.mass, size)).tolist()
+    inertia = (x, y, z)
     axis = EARTH_RADIUS + orbit.altitude
     period = 2.0 * math.pi * math.sqrt(axis**3 / GRAVITATIONAL_PARAMETER)
     towards_pole = math.sin(math.radians(orbit.inclination_deg))

@@ -210,6 +210,47 @@ def test_a_configuration_that_is_refused_is_one_line_and_status_2(
     assert complaint in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("text", "line", "complaint"),
+    [
+        (
+            "craft: {inertia: [1.0e-3, 1.0e-3, 2.1e-3]}",
+            2,
+            "`craft.inertia` has the principal moments 0.001, 0.001, 0.0021: the largest must not exceed",
+        ),
+        (
+            "craft: {inertia: [[1.0e-3, 2.0e-3, 0.0], [2.0e-3, 1.0e-3, 0.0], [0.0, 0.0, 1.0e-3]]}",
+            2,
+            "`craft.inertia` has the principal moments -0.001, 0.001, 0.003: all must be positive",
+        ),
+        (
+            "simulation: {free_body: {craft: {size: [0.1, 0.1, 0.1], inertia: [1.0e-3, 1.0e-3, 3.0e-3]}}}",
+            2,
+            "`simulation.free_body.craft.inertia` has the principal moments 0.001, 0.001, 0.003",
+        ),
+        (
+            "gps: none\nelements: null",
+            None,
+            "`targets[0].point` is sun: pointing needs the position: add `gps`",
+        ),
+        (
+            "simulation: {utc: '2027-01-01T00:00:00Z'}",
+            None,
+            "`elements` are up to ",
+        ),
+    ],
+)
+def test_an_impossible_satellite_is_refused_in_one_line_before_it_is_flown(
+    text: str, line: int | None, complaint: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"extends: orbit\n{text}\n", encoding="utf-8")
+    done = command("check", path)
+    assert (done.returncode, done.stderr.count("\n"), done.stdout) == (2, 1, "")
+    assert complaint in done.stderr
+    assert line is None or f"mine.yaml:{line}: " in done.stderr
+
+
 def test_a_file_that_is_not_what_was_accepted_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, DEMO, camera="none")
     (tmp_path / "mine.yaml.sha256").write_text("00  mine.yaml\n")
