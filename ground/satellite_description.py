@@ -19,6 +19,8 @@ from sim_hal.settings import OrbitSection
 from sim_hal.worlds.orbit import elements, log_density, sun_position
 
 Vector = tuple[float, float, float]
+Line = str | tuple[str, str]
+"""A line of the file, or a value and its comment."""
 
 TILT_DEG = 22.0
 """Angle of the star camera from the normal of the orbit towards the zenith, deg."""
@@ -28,6 +30,10 @@ _EQUATOR_FIELD = 2.98e-5
 """Field of the Earth's dipole at the equator at one Earth radius, T [IGRF-13]."""
 _OFFSET, _DRAG_COEFFICIENT, _SUN_PRESSURE = 0.02, 2.2, 4.56e-6
 """Mass offset (m) that the CubeSat Design Specification allows, drag coefficient, light pressure (Pa)."""
+_CURRENT_ERROR, _CURRENT_SIGMA = 3.5e-3 / 0.148, 2.0e-3 / 0.148
+"""Bound of the simulated current error, and assumed noise, relative to the limit [as in `orbit`]."""
+_STRAY_FIELD = 7.4e-5
+"""Field (T) of a coil at the magnetometer at the current limit [as in `orbit`]."""
 _KNIGHTCUBE_INERTIA = 1.047e-3
 """Mean moment of inertia of the configuration `orbit`, kg m^2."""
 
@@ -223,9 +229,12 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
         ("craft:", "model that the flight application uses"),
         (f"  mass: {_text(satellite.mass)}", "kg [given]"),
         (f"  size: [{size}]", "m, edges along the body axes [given]"),
-        (f"  inertia: [{moments}]", "kg m^2, body axes [computed: homogeneous cuboid]"),
-        *_coil_lines(satellite),
+        (
+            f"  inertia: [{moments}]",
+            "kg m^2, body axes [computed: homogeneous cuboid; replace it by that of the CAD model]",
+        ),
         "",
+        *_coil_lines(satellite),
         *_camera_lines(satellite, values),
         *wide,
         (
@@ -248,6 +257,10 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
             "N m, expected disturbance torque [computed: scaled by area and air density]",
         ),
         (f"  torque_walk: {2e-3 * values.torque_start:.1e}", "N m per sqrt(s) [computed]"),
+        (
+            f"  current_noise: {_CURRENT_SIGMA * min(coil.current_limit for coil in satellite.coils):.2g}",
+            "A, noise of the current of a coil [computed]",
+        ),
         "",
         ("pointing:", "body +z points to the goal, and +x along the flight if the roll is given"),
         (
@@ -285,36 +298,51 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
             f"    release: {{speed: {math.radians(satellite.release_deg):.4g}}}",
             f"rad/s ({satellite.release_deg:g} deg/s), about a random axis [given]",
         ),
+        *_current_lines(satellite),
     )
 
 
-def _coil_lines(satellite: Satellite) -> list[str | tuple[str, str]]:
+def _coil_lines(satellite: Satellite) -> list[Line]:
     """Return the lines of the coils."""
-    first = satellite.coils[0]
-    windings = []
+    largest = max(coil.current_limit for coil in satellite.coils)
+    windings: list[Line] = []
     for coil in satellite.coils:
         axis = ", ".join(_text(component) for component in coil.axis)
-        own = (
-            ""
-            if coil.current_limit == first.current_limit
-            else f", current_limit: {_text(coil.current_limit)}"
-        )
-        strength = f"dipole_per_ampere: {_text(coil.dipole_per_ampere)}, resistance: {_text(coil.resistance)}"
-        windings.append(f"    - {{axis: [{axis}], {strength}{own}}}")
+        values = f"dipole_per_ampere: {_text(coil.dipole_per_ampere)}, resistance: {_text(coil.resistance)}"
+        if coil.current_limit != largest:
+            values += f", current_limit: {_text(coil.current_limit)}"
+        dipole = f"{coil.dipole:.3g} A m^2 at {coil.current_limit:.3g} A"
+        windings.append((f"    - {{axis: [{axis}], {values}}}", f"{dipole} [given]"))
     return [
-        "",
         "coils:",
-        ("  windings:", f"m^2 and ohm [given: {first.dipole:.3g} A m^2 at {first.current_limit:.3g} A]"),
+        ("  windings:", "direction of the dipole in body axes, dipole per current (m^2), resistance (ohm)"),
         *windings,
         (
             f"  supply_voltage: {_text(satellite.supply_voltage)}",
-            "V across a coil that is fully on, after all losses",
+            "V across a coil that is fully on [computed]",
         ),
-        (f"  current_limit: {_text(first.current_limit)}", "A [given]"),
+        (f"  current_limit: {_text(largest)}", "A [given]"),
+        "",
     ]
 
 
-def _camera_lines(satellite: Satellite, values: Derived) -> list[str | tuple[str, str]]:
+def _current_lines(satellite: Satellite) -> list[Line]:
+    """Return the simulated errors of the currents, in proportion to those of the configuration `orbit`."""
+    least = min(coil.current_limit for coil in satellite.coils)
+    lines: list[Line] = [
+        (
+            f"  current_noise: {_CURRENT_ERROR * least:.2g}",
+            "A, bound of a uniform error in each cycle [computed]",
+        )
+    ]
+    if len(satellite.coils) == 3:
+        columns = [np.array(coil.axis) * _STRAY_FIELD / coil.current_limit for coil in satellite.coils]
+        rows = ", ".join(f"[{', '.join(f'{value:.2g}' for value in row)}]" for row in np.array(columns).T)
+        lines.append((f"  coil_field: [{rows}]", "T/A, field of each coil at the magnetometer [assumed]"))
+    return lines
+
+
+def _camera_lines(satellite: Satellite, values: Derived) -> list[Line]:
     """Return the lines of the star camera."""
     if satellite.field_of_view_deg is None:
         return [("camera: none", "no star camera"), ""]
@@ -331,7 +359,7 @@ def _camera_lines(satellite: Satellite, values: Derived) -> list[str | tuple[str
     ]
 
 
-def _cone_lines(satellite: Satellite) -> list[str | tuple[str, str]]:
+def _cone_lines(satellite: Satellite) -> list[Line]:
     """Return the exclusion cones of the star camera, outside the corner of its field of view."""
     if satellite.field_of_view_deg is None:
         return []
@@ -352,7 +380,7 @@ def _text(value: float) -> str:
     return f"{value:.6g}" if "." in f"{value:.6g}" or "e" in f"{value:.6g}" else f"{value:.6g}.0"
 
 
-def _laid_out(*lines: str | tuple[str, str]) -> str:
+def _laid_out(*lines: Line) -> str:
     """Return lines of text, where a pair is a value and its comment."""
     texts = []
     for line in lines:

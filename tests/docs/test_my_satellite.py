@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 from flight.schema.orbit import as_orbit
 from flight.schema.reader import load, parse
+from tests.docs.blocks import blocks
 from tests.ground.commands.in_process import command
 from tests.support.places import ROOT
 
@@ -45,3 +52,31 @@ def test_the_commands_of_two_line_elements_print_the_same_section() -> None:
     assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr
     assert first.stdout == second.stdout
     assert first.stdout.startswith("elements: ")
+
+
+def newcomer() -> tuple[list[str], list[str]]:
+    """Return the commands of the page that install the software, and those that fly one's own satellite."""
+    first, second = [one for one in blocks() if one.page == "docs/fly/my-satellite.md" and one.commands][:2]
+    return first.commands, second.commands
+
+
+def test_a_newcomer_needs_at_most_ten_commands() -> None:
+    install, fly = newcomer()
+    assert len(install) + len(fly) <= 10
+    assert [line.split()[3] for line in fly] == ["new-satellite", "check", "run", "report"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_the_commands_of_a_newcomer_describe_and_detumble_a_satellite(tmp_path: Path) -> None:
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": path}
+    _, fly = newcomer()
+    for line in (*fly[:3], f"{fly[3]} --json --no-figures"):
+        done = subprocess.run(
+            ["bash", "-c", line], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+    (phase,) = json.loads(done.stdout)["detumbling"]["periods"]
+    assert phase["slowed"]
+    assert phase["duration_s"] < 300.0
