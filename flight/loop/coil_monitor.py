@@ -400,14 +400,18 @@ class Probe:
         self._running: tuple[int, int] | None = None  # axis, and start time (ns)
         self._tried: set[int] = set()
 
-    def begin(self, axes: set[int], now_ns: int) -> int | None:
-        """Begin a wave on the next untried axis of `axes`; return its end (ns), or None after all axes."""
-        candidates = sorted(axes - self._tried)
+    def begin(self, axes: set[int], now_ns: int, prime: int | None = None) -> int | None:
+        """Begin a wave on the next untried axis of `axes`; return its end (ns), or None after all axes.
+
+        The axis `prime` is tried first.
+        """
+        candidates = axes - self._tried
         if not candidates:
             self._tried.clear()
             return None
-        self._tried.add(candidates[0])
-        self._running = (candidates[0], now_ns)
+        axis = min(candidates, key=lambda axis: (axis != prime, axis))
+        self._tried.add(axis)
+        self._running = (axis, now_ns)
         return now_ns + 2 * self._half_ns
 
     def stop(self) -> None:
@@ -440,6 +444,8 @@ _READING_NS = 200_000_000
 _MOST_EVIDENCE, _MOST_SEGMENTS = 40, 4
 _IN_DOUBT = 5
 """Number of readings after which a verdict may name an axis with an uncertain kind of fault."""
+_AGAIN_NS = 60_000_000_000
+"""Shortest time (ns) from one series of probes because of missing torque to the next."""
 _LONGEST_REST_NS = 600_000_000_000
 """Longest time (ns) for which a coil whose sign changes repeatedly is kept at zero current."""
 _MOST_CHANGES = 2
@@ -489,6 +495,11 @@ class Evidence:
             for fault in ELECTRICAL
             if all(fits(segment, self._bounds, known, axis, fault) for segment in segments)
         ]
+
+    def rejects_healthy_now(self, known: Mapping[int, CoilFault]) -> bool:
+        """Return whether the readings of the newest segment contradict healthy coils."""
+        newest = self._segments[-1]
+        return bool(newest) and not fits(newest, self._bounds, known)
 
     def is_normal_again(
         self, known: Mapping[int, CoilFault], possible: Sequence[tuple[int, CoilFault]]
@@ -621,6 +632,8 @@ class CoilMonitor:
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
         self._weak = ""  # text about the coil whose torque is missing in the motion
+        self._weak_ns = -_AGAIN_NS  # time (ns) of the last probes because of missing torque
+        self._prime: int | None = None  # axis to probe first
         self._verdicts: dict[int, CoilVerdict] = {}
         self.correction = CoilCorrection()
         self._news: list[str] = []  # texts of the changes of the correction
@@ -762,6 +775,17 @@ class CoilMonitor:
         if response is self._slow:
             feeble = [axis for axis in response.axes(Finding.FEEBLE) if axis not in known]
             self._weak = f"coil {AXES[feeble[0]]}: {response.text(feeble[0])}" if feeble else ""
+            if feeble:
+                self._probe_weak_coil(feeble[0], now_ns)
+
+    def _probe_weak_coil(self, axis: int, now_ns: int) -> None:
+        """Have the current monitor, if it gives readings, decide by probes whether a coil is open."""
+        silent = now_ns - self._reading_ns > self._settings.window_ns
+        if silent or self._suspected_ns is not None or now_ns - self._weak_ns < _AGAIN_NS:
+            return
+        self._weak_ns = now_ns
+        self._suspect(self._weak)
+        self._prime = axis
 
     def _reverse(self, axis: int, response: CoilResponse, now_ns: int, *, in_tumble: bool) -> None:
         """Change the sign of a coil, or keep it at zero current if its sign has changed too often."""
@@ -928,7 +952,9 @@ class CoilMonitor:
             return
         axes = {axis for axis, _ in left}
         waited = now_ns >= self._judge_ns
-        if len(axes) == 1 and (len(left) == 1 or waited):
+        # The only axis left may be healthy, if the fault has ended or only the motion raised the suspicion.
+        certain = len(axes) == 1 and evidence.rejects_healthy_now(self._known)
+        if certain and (len(left) == 1 or waited):
             axis, fault = left[0]
             self._conclude(axis, fault if len(left) == 1 else CoilFault.UNCERTAIN, now_ns)
         elif waited:
@@ -961,7 +987,7 @@ class CoilMonitor:
         New evidence is needed, because no hypothesis explains an intermittent fault or a wrong current
         monitor.
         """
-        ends_ns = self._probe.begin(axes, now_ns)
+        ends_ns = self._probe.begin(axes, now_ns, self._prime)
         self._evidence.begin_segment()
         if ends_ns is None:
             self._evidence.clear()
@@ -978,4 +1004,5 @@ class CoilMonitor:
         self._suspected_ns = None
         self._evidence.clear()
         self._probe.stop()
+        self._prime = None
         self._strangeness = ""

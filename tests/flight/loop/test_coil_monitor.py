@@ -110,6 +110,49 @@ def test_normal_readings_of_another_coil_do_not_end_a_suspicion() -> None:
     assert evidence.is_normal_again({}, left), "the currents of coils at zero are known"
 
 
+def _probed_for_missing_torque(gains: FloatArray, silent: bool = False) -> tuple[CoilMonitor, FloatArray]:
+    """Return a watch whose motion missed the torque of coil z at 4 mA, and the currents (k, 3), A, flown.
+
+    A coil of gain 0 is open. If `silent`, the current monitor gives no readings after the suspicion begins.
+    """
+    watch, flown = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL))), []
+    for cycle in range(40 * 16):
+        now_ns, time = cycle * 25_000_000, cycle / 40
+        wanted = np.full(3, 0.004) if watch.probe is None else watch.probe
+        watch.commanded(now_ns, np.where(watch.available, wanted, 0.0))
+        flown.append(wanted)
+        if cycle % 8 == 0 and not (silent and time > 3.0):
+            watch.measured(reading(time, float(np.abs(gains * wanted).sum())))
+        if time >= 5.0:
+            watch._weak = "coil z: the motion shows +0.1 of its torque"
+            watch._probe_weak_coil(2, now_ns)
+    return watch, np.array(flown)
+
+
+def test_coils_that_draw_their_currents_in_the_probes_are_not_isolated_for_missing_torque() -> None:
+    """No axis is guilty by elimination: the coil may lack torque for another reason."""
+    watch, flown = _probed_for_missing_torque(np.ones(3))
+    assert watch.verdicts == ()
+    alone = np.flatnonzero(np.abs(flown).max(axis=1) > 0.03)
+    order = list(dict.fromkeys(int(axis) for axis in np.abs(flown[alone]).argmax(axis=1)))
+    assert order == [2, 0, 1], "the suspected axis is probed first"
+    assert np.count_nonzero(flown[alone], axis=1).max() == 1
+    assert len(alone) < 40 * 5.5, "the probes are not repeated within a minute"
+
+
+def test_an_open_coil_that_the_motion_shows_is_isolated_after_its_probe() -> None:
+    watch, flown = _probed_for_missing_torque(np.array([1.0, 1.0, 0.0]))
+    assert [(verdict.axis, verdict.fault) for verdict in watch.verdicts] == [(2, CoilFault.OPEN)]
+    assert np.abs(flown[:, :2]).max() < 0.03, "no other coil had to be probed"
+
+
+def test_missing_torque_is_not_probed_without_readings_of_the_current_monitor() -> None:
+    watch, flown = _probed_for_missing_torque(np.ones(3), silent=True)
+    assert np.abs(flown).max() < 0.03
+    assert watch._suspected_ns is None, "an endless suspicion would prevent the change of a sign"
+    assert watch.verdicts == ()
+
+
 def test_a_reversed_coil_on_the_thread_is_used_with_its_sign_changed() -> None:
     seen = observe(hold(TARGET), FAULT_AT + 14.0, [f"coil-x: reversed @ {FAULT_AT}"])
     assert seen.found == []
