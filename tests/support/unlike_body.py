@@ -31,9 +31,9 @@ def without_cameras(config: OrbitConfig, duration: float) -> OrbitConfig:
     return configuration.replace(config, duration=duration, camera=None, wide_cameras=())
 
 
-def with_fault(world: Simulation, seed: int, fault: str = "") -> Simulation:
-    """Return a world with other errors of the configuration's description, and perhaps a fault."""
-    entries = (FaultEntry(fault=fault, at=0.0),) if fault else ()
+def with_fault(world: Simulation, seed: int, fault: str = "", at: float = 0.0) -> Simulation:
+    """Return a world with other errors of the configuration's description, and perhaps a fault at `at` s."""
+    entries = (FaultEntry(fault=fault, at=at),) if fault else ()
     return configuration.replace(world, seed=seed, faults=entries)
 
 
