@@ -38,6 +38,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, cross_matrices, tangent_basis
 from knightcube.astro.chi_square import bound
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
+from knightcube.gnc.estimation.error_state import updated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,12 +186,10 @@ def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArr
 def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> LineOfSightState:
     """Return the line of sight updated with a direction (3,) of covariance (3, 3), rad^2."""
     seen = compare(state, direction, covariance)
-    gain = np.linalg.solve(seen.covariance, seen.observation @ state.covariance).T
+    cross = state.covariance @ seen.observation.T
+    gain = np.asarray(np.linalg.solve(seen.covariance, cross.T).T)
     change = gain @ seen.residual
-    kept = np.eye(6) - gain @ seen.observation
-    basis = tangent_basis(state.direction)
-    noise = basis @ covariance @ basis.T
-    spread = kept @ state.covariance @ kept.T + gain @ noise @ gain.T
+    spread = updated(state.covariance, gain, cross, seen.covariance)
     position, velocity = state.direction + change[:3], state.velocity + change[3:]
     return _at_unit_range(state.time_ns, position, velocity, spread)
 

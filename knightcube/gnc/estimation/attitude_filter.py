@@ -31,16 +31,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro import chi_square
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.quaternion import exponential, twist
+from knightcube.gnc.estimation.error_state import ErrorState, StateBlock, gate_bounds, joined
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     BIAS,
-    DISTURBANCE,
-    FIELD_BIAS,
     LATENCY,
-    PARAMETERS,
     RATE,
     SIZE,
     Estimate,
@@ -256,29 +253,36 @@ class FilterSettings:
     history_ns: int
     longest_step: float = LONGEST_STEP
 
-    def gates(self) -> dict[int, float]:
-        """Return the chi-square bound of the gate for 1, 2 and 3 degrees of freedom."""
-        chance = math.erfc(self.gate_sigma / math.sqrt(2.0))
-        return {degrees: chi_square.bound(chance, degrees) for degrees in (1, 2, 3)}
-
 
 def free_axes(body: RigidBody) -> FloatArray:
     """Return an array (3,) with 1 for each axis about which the body can rotate, and 0 for other axes."""
     return np.array([0.0, 1.0, 0.0]) if body.suspended else np.ones(3)
 
 
-def process_noise(body: RigidBody, settings: FilterSettings) -> ProcessNoise:
-    """Return the process noise of `body` according to the settings."""
+def error_state(body: RigidBody, settings: FilterSettings, prior: SlowPrior) -> ErrorState:
+    """Return the declared error state of `body`. A block of zero variance is not estimated."""
     free = free_axes(body)
-    walks = np.zeros(SIZE)
-    walks[BIAS] = settings.bias_walk**2 * free
-    walks[DISTURBANCE] = settings.disturbance_walk**2 * free
-    walks[LATENCY] = settings.latency_walk**2
-    walks[FIELD_BIAS] = settings.field_bias_walk**2
+    latency = np.array([[prior.latency_variance]])
+    disturbance, walk = settings.disturbance_start * free, settings.disturbance_walk * free
+    return ErrorState(
+        [
+            StateBlock("attitude", np.zeros(3)),
+            StateBlock("rate", np.zeros(3)),
+            StateBlock("gyro_bias", prior.bias_covariance, settings.bias_walk * free),
+            StateBlock("disturbance", disturbance, walk),
+            StateBlock("parameters", prior.parameters_covariance),
+            StateBlock("latency", latency, settings.latency_walk),
+            StateBlock("field_bias", np.full(3, settings.field_bias_start), settings.field_bias_walk),
+        ]
+    )
+
+
+def process_noise(body: RigidBody, settings: FilterSettings, layout: ErrorState) -> ProcessNoise:
+    """Return the process noise of `body` with the declared error state `layout`."""
     return ProcessNoise(
         settings.current_noise**2 * settings.control_period,
-        np.diag(settings.rate_walk**2 * free),
-        walks,
+        np.diag(settings.rate_walk**2 * free_axes(body)),
+        layout.walks,
         settings.unknown_current,
     )
 
@@ -296,7 +300,7 @@ def slow_prior(body: RigidBody, settings: FilterSettings) -> SlowPrior:
 
 def first_checkpoint(
     model: PropagationModel,
-    settings: FilterSettings,
+    layout: ErrorState,
     prior: SlowPrior,
     attitude: AttitudeMeasurement,
     rate: RateMeasurement,
@@ -309,26 +313,20 @@ def first_checkpoint(
     a, b, c, d = attitude.quaternion.tolist()
     quaternion = exponential(0.0, twist((a, b, c, d)), 0.0) if suspended else (a, b, c, d)
     x, y, z = (free * (rate.rate - prior.bias)).tolist()
-    bias_variance = prior.bias_covariance
-    covariance = np.zeros((SIZE, SIZE))
-    covariance[ATTITUDE, ATTITUDE] = attitude.covariance * np.outer(free, free)
-    # The gyro measures the sum of rate and bias, so the errors of the estimated rate and bias are opposite.
-    covariance[RATE, RATE] = rate.covariance * np.outer(free, free) + bias_variance
-    covariance[RATE, BIAS] = covariance[BIAS, RATE] = -bias_variance
-    covariance[BIAS, BIAS] = bias_variance
-    covariance[DISTURBANCE, DISTURBANCE] = np.diag(settings.disturbance_start**2 * free)
-    covariance[PARAMETERS, PARAMETERS] = prior.parameters_covariance
-    covariance[FIELD_BIAS, FIELD_BIAS] = settings.field_bias_start**2 * np.eye(3)
     bx, by, bz = prior.bias.tolist()
     none = (0.0, 0.0, 0.0)
     state = FilterState(quaternion, (x, y, z), (bx, by, bz), none, prior.parameters, latency=prior.latency)
     newest: Measurement = attitude if attitude.time_ns >= rate.time_ns else rate
+    alone = np.zeros((6, 6))
+    alone[ATTITUDE, ATTITUDE] = attitude.covariance * np.outer(free, free)
+    alone[RATE, RATE] = rate.covariance * np.outer(free, free)
+    by_states = np.zeros((6, SIZE))
+    # The gyro measures the sum of rate and bias, so the errors of the estimated rate and bias are opposite.
+    by_states[RATE, BIAS] = -np.eye(3)
     # The body moves during the age of the samples, so the errors of attitude, rate and age are correlated.
-    age = np.zeros(SIZE)
-    age[ATTITUDE], age[RATE] = (x, y, z), model.rate_change(state, covariance, newest.time_ns).acceleration
-    age[LATENCY] = 1.0
-    covariance += prior.latency_variance * np.outer(age, age)
-    return Checkpoint(newest, True, state, covariance)
+    change = model.rate_change(state, np.zeros((SIZE, SIZE)), newest.time_ns)
+    by_states[ATTITUDE, LATENCY], by_states[RATE, LATENCY] = (x, y, z), change.acceleration
+    return Checkpoint(newest, True, state, joined(layout.prior, by_states, alone))
 
 
 OnApplied = Callable[[list[bool]], None]
@@ -373,8 +371,9 @@ class AttitudeFilter:
         self._settings = settings
         self._prior = prior or slow_prior(body, settings)
         self._commands = CommandHistory(body, settings.history_ns)
-        noise = process_noise(body, settings)
-        self._model = PropagationModel(body, noise, self._commands, settings.longest_step, settings.gates())
+        self._layout = error_state(body, settings, self._prior)
+        noise, gates = process_noise(body, settings, self._layout), gate_bounds(settings.gate_sigma)
+        self._model = PropagationModel(body, noise, self._commands, settings.longest_step, gates)
         self._check = CommandCheck(self._model)
         self._history = CheckpointHistory(settings.history_ns)
         self._branch: _Branch | None = None
@@ -417,7 +416,7 @@ class AttitudeFilter:
 
         For a suspended body, only their components about the thread are used.
         """
-        first = first_checkpoint(self._model, self._settings, self._prior, attitude, rate)
+        first = first_checkpoint(self._model, self._layout, self._prior, attitude, rate)
         self._history.restart(first)
         self._discard_branch()
         self._refused_in_a_row = {}

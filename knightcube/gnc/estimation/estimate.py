@@ -10,12 +10,24 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import Quaternion, Vector
+from knightcube.gnc.estimation.error_state import slices
 from knightcube.gnc.estimation.measurements import MeanRateMeasurement
 
-ATTITUDE, RATE, BIAS, DISTURBANCE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-PARAMETERS, LATENCY, FIELD_BIAS = slice(12, 15), 15, slice(16, 19)
-"""Indices of attitude, rate and the other components of the error state in the covariance (19, 19)."""
-SIZE = 19
+BLOCKS = {
+    "attitude": 3,
+    "rate": 3,
+    "gyro_bias": 3,
+    "disturbance": 3,
+    "parameters": 3,
+    "latency": 1,
+    "field_bias": 3,
+}
+"""Sizes of the blocks of the error state, in order."""
+ATTITUDE, RATE, BIAS, DISTURBANCE, PARAMETERS, _AGE, FIELD_BIAS = slices(BLOCKS)
+"""Indices of the blocks of the error state in the covariance (19, 19)."""
+LATENCY = _AGE.start
+"""Index of the age of the inertial unit's samples in the error state."""
+SIZE = FIELD_BIAS.stop
 """Size of the error state."""
 
 

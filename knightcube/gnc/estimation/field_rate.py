@@ -35,6 +35,7 @@ from knightcube.astro.quaternion import (
     skew,
     times,
 )
+from knightcube.gnc.estimation.error_state import Weighed, updated, weigh
 from knightcube.gnc.estimation.rigid_body import BodyErrors, by_inertia, inertia_covariance, tensor
 
 RATE, FIELD, CHANGE, INERTIA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 15)
@@ -188,17 +189,15 @@ class FieldRate:
         if age:
             x, y, z = self._rate
             field = np.array(matrix(exponential(age * x, age * y, age * z))) @ field
-        covariance = self._covariance
-        spread = covariance[FIELD, FIELD] + self._settings.field_sigma**2 * np.eye(3)
-        gain = np.linalg.solve(spread, covariance[FIELD]).T
         innovation = field - self._field
-        if not float(innovation @ np.linalg.solve(spread, innovation)) <= self._gate:
+        weighed = self._weigh(innovation, FIELD, self._settings.field_sigma)
+        if not weighed.square <= self._gate:
             self._refused += 1
             if self._refused >= self._settings.refusals:
                 self._restart_counted(self._gyro_used or self._gyro_refused >= self._settings.refusals)
             return False
         self._refused = 0
-        self._correct(np.asarray(gain), innovation, FIELD)
+        self._correct(weighed, innovation)
         return True
 
     def measure_rate(self, rate: FloatArray) -> None:
@@ -212,9 +211,9 @@ class FieldRate:
         settings, covariance = self._settings, self._covariance
         if self._rate is None or self._gyro_refused >= settings.refusals or not np.all(np.isfinite(rate)):
             return
-        spread = covariance[RATE, RATE] + settings.gyro_sigma**2 * np.eye(3)
         innovation = rate - np.array(self._rate)
-        if not float(innovation @ np.linalg.solve(spread, innovation)) <= self._gate:
+        weighed = self._weigh(innovation, RATE, settings.gyro_sigma)
+        if not weighed.square <= self._gate:
             self._gyro_refused += 1
             if self._gyro_used and self._gyro_refused >= settings.refusals:
                 self._restart_counted(exclude_gyro=True)
@@ -222,7 +221,7 @@ class FieldRate:
         self._gyro_refused = 0
         if float(covariance.diagonal()[RATE].max()) > settings.gyro_sigma**2:
             self._gyro_used = True
-            self._correct(np.asarray(np.linalg.solve(spread, covariance[RATE]).T), innovation, RATE)
+            self._correct(weighed, innovation)
 
     def _restart_counted(self, exclude_gyro: bool) -> None:
         """Restart and count it."""
@@ -230,16 +229,19 @@ class FieldRate:
         self._gyro_refused = self._settings.refusals if exclude_gyro else 0
         self.restarts += 1
 
-    def _correct(self, gain: FloatArray, innovation: FloatArray, measured: slice) -> None:
-        """Correct the state by a gain (15, 3) and an innovation (3,) of the components `measured`."""
+    def _weigh(self, innovation: FloatArray, measured: slice, sigma: float) -> Weighed:
+        """Return the weight of an innovation (3,) of the states `measured` with noise `sigma` per axis."""
+        return weigh(self._covariance, innovation, _EYE[measured], sigma**2 * np.eye(3))
+
+    def _correct(self, weighed: Weighed, innovation: FloatArray) -> None:
+        """Correct the state by an innovation (3,) and its weight."""
         assert self._rate is not None
-        change = (gain @ innovation).tolist()
+        change = (weighed.gain @ innovation).tolist()
         self._rate = added(self._rate, change[RATE])
         self._field = added(self._field, change[FIELD])
         self._change = added(self._change, change[CHANGE])
         self._set_inertia(self._error + np.array(change[INERTIA]))
-        covariance = self._covariance - gain @ self._covariance[measured]
-        self._covariance = 0.5 * (covariance + covariance.T)
+        self._covariance = updated(self._covariance, weighed.gain, weighed.cross, weighed.spread)
         self._update_unexplained()
 
     def _update_unexplained(self) -> None:

@@ -35,7 +35,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro import chi_square
 from knightcube.astro.arrays import BoolArray, FloatArray, cross_matrix, cross_product, tangent_basis
 from knightcube.astro.earth.disturbance import AIR, SIZES, Pressures, box_areas, shapes
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
@@ -46,7 +45,17 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.gnc.estimation.error_state import ErrorState, Role, StateBlock, slices, with_role
+from knightcube.gnc.estimation.error_state import (
+    ErrorState,
+    Role,
+    StateBlock,
+    gate_bounds,
+    joined,
+    slices,
+    updated,
+    weigh,
+    with_role,
+)
 from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.rigid_body import BodyErrors, by_inertia, inertia_covariance, tensor
 
@@ -340,8 +349,7 @@ class FreeFilter:
         self.motion = FreeMotion(inertia)
         self.layout = settings.error_state(inertia)
         self._settings = settings
-        tail = math.erfc(settings.gate_sigma / math.sqrt(2.0))
-        self._gates = {n: chi_square.bound(tail, n) for n in (1, 2, 3)}
+        self._gates = gate_bounds(settings.gate_sigma)
         self._constants: FloatArray = np.zeros(STATES)
         self.acceleration: FloatArray = np.zeros(3)
         self._slope: FloatArray = np.zeros((3, STATES))  # derivative of the acceleration by the states
@@ -388,12 +396,9 @@ class FreeFilter:
         measured = gyro - self._constants[GYRO]
         self.rate = np.asarray(np.linalg.solve(_EYE + self._matrix(GYRO_MATRIX), measured), dtype=float)
         first[RATE, GYRO], first[RATE, GYRO_MATRIX] = -_EYE, -by_matrix(self.rate)
-        whole = self.covariance
-        whole[:6] = first @ whole
-        whole[:, :6] = whole[:6].T
-        whole[:6, :6] = whole[:6] @ first.T
-        whole[ATTITUDE, ATTITUDE] += covariance
-        whole[RATE, RATE] += self._settings.rate_start**2 * _EYE
+        alone = np.zeros((6, 6))
+        alone[ATTITUDE, ATTITUDE], alone[RATE, RATE] = covariance, self._settings.rate_start**2 * _EYE
+        self.covariance = joined(self.covariance, first, alone)
         self.begin_mean()
         self.started = True
 
@@ -685,13 +690,13 @@ class FreeFilter:
 
     def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:
         """Correct by an innovation (k,), rows (k, STATES) and noise (k, k); return whether it passed."""
-        cross = self.covariance @ rows.T
-        weight = np.linalg.inv(rows @ cross + noise)
-        if not 0.0 <= float(value @ weight @ value) <= self._gates[len(value)]:  # a NaN does not pass
+        square, gain, cross, spread = weigh(self.covariance, value, rows, noise)
+        if not 0.0 <= square <= self._gates[len(value)]:  # a NaN does not pass
             self.refused += 1
             return False
         self.changes += 1
-        self.covariance, gain = self.layout.kalman_update(self.covariance, cross @ weight, cross)
+        gain = self.layout.estimated(gain)
+        self.covariance = updated(self.covariance, gain, cross, spread)
         error = gain @ value
         self.quaternion = multiply(from_rotation_vector(error[ATTITUDE]), self.quaternion)
         self.rate = self.rate + error[RATE]

@@ -37,6 +37,7 @@ from knightcube.astro.quaternion import (
     times,
     twist,
 )
+from knightcube.gnc.estimation.error_state import Weighed, updated, weigh
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     DISTURBANCE,
@@ -215,32 +216,26 @@ def _rows(firsts: tuple[int, ...], size: int) -> FloatArray:
     return rows
 
 
-def normalised_square(found: Innovation, covariance: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Return the normalised square y^T S^-1 y of an innovation y, the gain P H^T S^-1 and covariance S."""
-    cross = covariance.dot(found.rows.T)
-    spread = found.rows.dot(cross) + found.noise
-    weight = _inverted(spread)
-    y = np.array(found.value)
-    return float(y @ weight @ y), cross.dot(weight), spread
+def weigh_innovation(found: Innovation, covariance: FloatArray) -> Weighed:
+    """Return the weight of an innovation against the covariance of the state."""
+    return weigh(covariance, np.array(found.value), found.rows, found.noise)
 
 
 def correct(
-    state: FilterState, covariance: FloatArray, found: Innovation, gain: FloatArray
+    state: FilterState, covariance: FloatArray, found: Innovation, weighed: Weighed
 ) -> tuple[FilterState, FloatArray]:
-    """Return corrected state and covariance; Joseph's form keeps the covariance symmetric and positive."""
-    # For small matrices, ndarray.dot takes two thirds of the time of the @ operator.
-    keep = _identity(len(covariance)) - gain.dot(found.rows)
-    error = gain.dot(found.value).tolist()
+    """Return corrected state and covariance. The gain of `weighed` may differ from the optimal gain."""
+    error = weighed.gain.dot(found.value).tolist()
+    covariance = updated(covariance, weighed.gain, weighed.cross, weighed.spread)
     # The reset rotates the axes of the remaining attitude error by half the correction.
     for first in (0, *range(SIZE, len(covariance), 3)):
-        x, y, z = error[first : first + 3]
+        axes = slice(first, first + 3)
+        x, y, z = error[axes]
         reset = np.array(((1.0, 0.5 * z, -0.5 * y), (-0.5 * z, 1.0, 0.5 * x), (0.5 * y, -0.5 * x, 1.0)))
-        keep[first : first + 3] = reset.dot(keep[first : first + 3])
-        gain[first : first + 3] = reset.dot(gain[first : first + 3])
-    covariance = keep.dot(covariance).dot(keep.T)
-    covariance += gain.dot(found.noise).dot(gain.T)
-    covariance = covariance + covariance.T
-    covariance *= 0.5
+        moved = reset.dot(covariance[axes])
+        among = moved[:, axes].dot(reset.T)
+        covariance[axes], covariance[:, axes] = moved, moved.T
+        covariance[axes, axes] = 0.5 * (among + among.T)
     corrected = FilterState(
         compose(exponential(*error[0:3]), state.quaternion),
         added(state.rate, error[3:6]),
@@ -275,23 +270,3 @@ def release_attitude(
     pick = [*range(first), *range(first + 3, len(covariance))]
     kept = state.kept[:index] + state.kept[index + 1 :]
     return state._replace(kept=kept), covariance[np.ix_(pick, pick)]
-
-
-@functools.cache
-def _identity(size: int) -> FloatArray:
-    return np.eye(size)
-
-
-def _inverted(s: FloatArray) -> FloatArray:
-    """Return the inverse of a symmetric (1, 1), (2, 2) or (3, 3) matrix, by cofactors."""
-    if len(s) == 1:
-        return np.asarray(1.0 / s)
-    if len(s) == 2:
-        (a, b), (_, d) = s.tolist()
-        scale = 1.0 / (a * d - b * b)
-        return np.array(((scale * d, -scale * b), (-scale * b, scale * a)))
-    (a, b, c), (_, d, e), (_, _, f) = s.tolist()
-    ca, cb, cc = d * f - e * e, c * e - b * f, b * e - c * d
-    cd, ce, cf = a * f - c * c, b * c - a * e, a * d - b * b
-    scale = 1.0 / (a * ca + b * cb + c * cc)
-    return np.asarray(np.array(((ca, cb, cc), (cb, cd, ce), (cc, ce, cf))) * scale)

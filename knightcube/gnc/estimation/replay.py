@@ -25,9 +25,9 @@ from knightcube.gnc.estimation.mekf import (
     correct,
     innovation,
     keep_attitude,
-    normalised_square,
     rate_change,
     release_attitude,
+    weigh_innovation,
 )
 from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody, Torquing, propagate
 
@@ -211,24 +211,31 @@ class Replay:
         if isinstance(measurement, RateMeasurement) and measurement.latency is not None:
             change = model.rate_change(state, covariance, measurement.time_ns)
         found = innovation(state, measurement, model.body.suspended, change)
-        nis, gain, variance = normalised_square(found, covariance)
-        used = 0.0 <= nis <= model.gate[len(found.value)]  # a NaN does not pass
-        # The gain may be changed, because Joseph's form of the covariance update is valid for any gain.
-        if is_rate and model.noise.unknown_current and nis > _RATE_ONLY[len(found.value)]:
-            rate_gain = np.zeros_like(gain)
-            rate_gain[RATE] = gain[RATE]
-            gain = rate_gain
+        weighed = weigh_innovation(found, covariance)
+        used = 0.0 <= weighed.square <= model.gate[len(found.value)]  # a NaN does not pass
+        # The gain may be changed, because the covariance update is valid for any gain.
+        if is_rate and model.noise.unknown_current and weighed.square > _RATE_ONLY[len(found.value)]:
+            rate_gain = np.zeros_like(weighed.gain)
+            rate_gain[RATE] = weighed.gain[RATE]
+            weighed = weighed._replace(gain=rate_gain)
         elif change is not None:
-            gain = gain.copy()
-            gain[LATENCY] = 0.0  # considered, not estimated
+            weighed.gain[LATENCY] = 0.0  # considered, not estimated
         if used:
-            state, covariance = correct(state, covariance, found, gain)
+            state, covariance = correct(state, covariance, found, weighed)
         if isinstance(measurement, MeanRateMeasurement):
             state, covariance = release_attitude(state, covariance, measurement)
         self._state, self._covariance = state, covariance
         alone = state._replace(kept=()) if state.kept else state
         self.checkpoints.append(
-            Checkpoint(measurement, used, alone, covariance[:SIZE, :SIZE], nis, found.value, variance)
+            Checkpoint(
+                measurement,
+                used,
+                alone,
+                covariance[:SIZE, :SIZE],
+                weighed.square,
+                found.value,
+                weighed.spread,
+            )
         )
 
     def _propagate_to(self, time_ns: int) -> None:

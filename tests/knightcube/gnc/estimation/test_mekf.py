@@ -23,8 +23,8 @@ from knightcube.gnc.estimation.mekf import (
     correct,
     innovation,
     keep_attitude,
-    normalised_square,
     release_attitude,
+    weigh_innovation,
 )
 from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody, Torquing, propagate
 from tests.knightcube.gnc.estimation.filter_states import STATE, moved
@@ -164,7 +164,7 @@ def test_correcting_by_an_exact_attitude_gives_that_attitude() -> None:
     exact = AttitudeMeasurement(0, np.array(target), 1e-20 * np.eye(3))
     found = innovation(STATE, exact, False)
     covariance = 1e-2 * np.eye(SIZE)
-    state, covariance = correct(STATE, covariance, found, normalised_square(found, covariance)[1])
+    state, covariance = correct(STATE, covariance, found, weigh_innovation(found, covariance))
     np.testing.assert_allclose(difference(state, STATE)[:3], (0.02, -0.03, 0.01), atol=1e-12)
     assert np.all(np.diag(covariance)[:3] < 1e-19)
 
@@ -185,7 +185,7 @@ def test_the_covariance_stays_symmetric_and_positive(seed: int) -> None:
         else:
             measured = np.array(state.rate) + np.array(state.bias)
             found = innovation(state, RateMeasurement(0, measured, size * np.eye(3)), False)
-        state, covariance = correct(state, covariance, found, normalised_square(found, covariance)[1])
+        state, covariance = correct(state, covariance, found, weigh_innovation(found, covariance))
         state, covariance = propagate(FREE, noise, state, covariance, TORQUING, 0.025)
         np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9, atol=1e-12 * covariance.max())
         scale = np.sqrt(np.diag(covariance))
