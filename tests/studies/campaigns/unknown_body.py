@@ -41,9 +41,9 @@ from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, su
 from tests.support.flights import fly
 from tests.support.unlike_body import configured
 
-SPEED = math.radians(5.0)
-"""Angular rate (rad/s) at the release."""
-FLOWN = {"orbit": 1300.0, "orbit_3u": 2400.0}
+SPEED = {"orbit": math.radians(5.0), "orbit_3u": math.radians(3.0)}
+"""Angular rates (rad/s) at the release by configuration."""
+FLOWN = {"orbit": 1300.0, "orbit_3u": 1900.0}
 """Durations (s) of the flights by configuration."""
 PHASES = ("tumble", "acquisition", "slew", "sunlit", "eclipse")
 EVERY = 10.0
@@ -61,7 +61,8 @@ def run(case: Case) -> Result:
     """Fly the case; its parameters `seconds` and `speed` (rad/s) may shorten it and slow the release."""
     given = case.parameters
     name = given["name"]
-    config, world = _flight(name, case.seed, given.get("seconds", FLOWN[name]), given.get("speed", SPEED))
+    duration, speed = given.get("seconds", FLOWN[name]), given.get("speed", SPEED[name])
+    config, world = _flight(name, case.seed, duration, speed)
     with TemporaryDirectory(prefix="unknown-body-") as folder:
         flown = fly(config, Path(folder), section=world)
     return {"name": name, **facts(flown, config)}
