@@ -6,6 +6,7 @@ import argparse
 import csv
 import json
 import sys
+import textwrap
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +19,7 @@ from flight.schema import reader as configuration
 from flight.schema.document import config_path, read_text
 from flight.schema.orbit import as_orbit
 from ground.commands.options import finite
+from ground.commands.satellite_questions import check_values, read_value
 from ground.telemetry import read_run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.mean_elements import FittedElements, fit_elements
@@ -29,6 +31,8 @@ from sim_hal.worlds.orbit import elements, julian_date, propagate
 
 _SPAN, _STEP = 86_400.0, 600.0
 """Span and interval (s) of the positions to which the elements of an orbit are fitted."""
+_ECCENTRICITY = OrbitSection().eccentricity
+"""Default eccentricity of an orbit."""
 _COLUMNS, _VELOCITY = ("utc", "x", "y", "z"), ("vx", "vy", "vz")
 """Columns of a CSV file of fixes: the required ones, and those of the velocity."""
 _ORBIT = ("inclination", "eccentricity", "node", "local_time", "perigee", "anomaly", "epoch")
@@ -36,7 +40,7 @@ _ORBIT = ("inclination", "eccentricity", "node", "local_time", "perigee", "anoma
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flight elements` to the parser."""
-    parser.description = (
+    parser.description = textwrap.fill(
         "Make two-line elements for the section `elements` of a satellite's configuration: of an orbit that "
         "is given by its altitude, of the simulated orbit of a configuration, or by a fit to positions. "
         "Prints the elements, the distances of the positions from them, and the standard deviation of the "
@@ -68,7 +72,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     orbit = parser.add_argument_group("with --altitude")
     orbit.add_argument("--inclination", type=finite, metavar="DEG", help="required")
     orbit.add_argument("--epoch", metavar="UTC", help="required, such as 2026-03-20T12:00:00")
-    orbit.add_argument("--eccentricity", type=finite, metavar="E", help="default 0.001")
+    orbit.add_argument("--eccentricity", type=finite, metavar="E", help=f"default {_ECCENTRICITY:g}")
     node = orbit.add_mutually_exclusive_group()
     node.add_argument("--node", type=finite, metavar="DEG", help="right ascension of the ascending node (0)")
     node.add_argument(
@@ -114,6 +118,12 @@ def _given_orbit(options: argparse.Namespace) -> tuple[OrbitSection, float]:
     for name in ("inclination", "epoch"):
         if getattr(options, name) is None:
             raise UsageError(f"--altitude needs --{name}")
+    shape = {
+        name: read_value(name, f"{value:g}")
+        for name in ("altitude", "inclination", "eccentricity")
+        if (value := getattr(options, name)) is not None
+    }
+    check_values("altitude", {"eccentricity": _ECCENTRICITY, **shape})
     values = {
         "altitude": 1e3 * options.altitude,
         "inclination_deg": options.inclination,

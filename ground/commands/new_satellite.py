@@ -9,6 +9,7 @@ import shlex
 import signal
 import sys
 import tempfile
+import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -31,6 +32,7 @@ from ground.commands.satellite_questions import (
     Values,
     check_values,
     coil_number,
+    read_value,
 )
 from ground.satellite_description import (
     Derived,
@@ -49,7 +51,7 @@ _WEAK = 3.0
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flight new-satellite` to the parser."""
-    parser.description = (
+    parser.description = textwrap.fill(
         "Write the configuration of a satellite, which `flight check` and `flight run` accept. On a "
         "terminal, the values that are not given are asked for, and an empty answer takes the value in "
         "brackets. The inertia is that of a homogeneous cuboid, two-line elements are fitted to the orbit, "
@@ -71,7 +73,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             f"--{question.name}",
             action="append" if repeated else "store",
-            metavar="KEY=VALUE,..." if repeated else question.name.rpartition("-")[2].upper(),
+            metavar=question.metavar,
             help=f"{question.text} ({default}{'; repeatable' if repeated else ''})",
         )
     parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default NAME.yaml)")
@@ -224,14 +226,8 @@ class Answers:
         """Take the texts of a value. Raises UsageError if it is impossible."""
         name = question.name
         for text in texts:
-            try:
-                value = question.read(text)
-                if name == "coil":
-                    value = [*self.values.get(name, ()), *value]
-                self.values[name] = value
-            except ValueError as error:
-                self.values.pop(name, None)
-                raise UsageError(f"--{name} {text}: {error}") from error
+            value = read_value(name, text)
+            self.values[name] = [*self.values.get(name, ()), *value] if name == "coil" else value
         try:
             check_values(name, self.values)
         except UsageError as error:

@@ -28,8 +28,8 @@ _FORMS = {
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _DENSITIES = (20.0, 20_000.0)
 """Range of the mean density, kg/m^3: from an empty box of thin sheet to solid tungsten."""
-_LOWEST_PERIGEE = 180.0
-"""Lowest perigee, km above the equatorial radius, at which a satellite stays in orbit for some days."""
+_LOWEST_PERIGEE = 150.0
+"""Lowest perigee that is flown, km above the equatorial radius."""
 _HIGHEST_VOLTAGE = 36.0
 """Largest voltage across a coil, V."""
 _COIL_RANGES = {
@@ -48,12 +48,14 @@ class Question:
 
     Attributes:
         name: name of the option without dashes.
+        metavar: kind or unit of its texts in the help.
         text: the question, with the unit.
         read: function that returns the value of a text; it raises ValueError with the permitted values.
         default: text of the default value; None for a value that must be given.
     """
 
     name: str
+    metavar: str
     text: str
     read: Callable[[str], Any]
     default: str | None = None
@@ -168,34 +170,41 @@ def _read_yes(text: str) -> bool:
 
 
 QUESTIONS = (
-    Question("name", "name of the satellite", _read_name, "my_satellite"),
-    Question("mass", "mass, kg", number(0.1, 500.0, "kg")),
+    Question("name", "NAME", "name of the satellite", _read_name, "my_satellite"),
+    Question("mass", "KG", "mass, kg", number(0.1, 500.0, "kg")),
     Question(
         "size",
+        "XxYxZ",
         "sides along body x, y and z, m, such as 0.3x0.1x0.1; or 1u, 2u, 3u, 6u, 12u, longest along x",
         _read_size,
     ),
     Question(
         "altitude",
+        "KM",
         "altitude of the orbit (semi-major axis minus 6378 km), km",
         number(200.0, 2000.0, "km"),
         "500",
     ),
-    Question("eccentricity", "eccentricity of the orbit", number(0.0, 0.1, ""), "0.001"),
-    Question("inclination", "inclination, deg, or sso for Sun-synchronous", _read_inclination, "sso"),
+    Question("eccentricity", "E", "eccentricity of the orbit", number(0.0, 0.1, ""), "0.001"),
+    Question("inclination", "DEG", "inclination, deg, or sso for Sun-synchronous", _read_inclination, "sso"),
     Question(
-        "local-time", "mean local time of the ascending node at the begin, h", number(0.0, 24.0, "h"), "10.5"
+        "local-time",
+        "H",
+        "mean local time of the ascending node at the begin, h",
+        number(0.0, 24.0, "h"),
+        "10.5",
     ),
-    Question("utc", "begin of the flight, UTC", _read_utc, "2026-03-20T12:00:00"),
+    Question("utc", "UTC", "begin of the flight, UTC", _read_utc, "2026-03-20T12:00:00"),
     Question(
         "coil",
+        "KEY=VALUE,...",
         "equal coils by axis, dipole (A m^2) at the current limit (A), and resistance (ohm), such as "
         f"{COIL_EXAMPLE}; an air coil also by turns and area (m^2) instead of the dipole",
         read_coils,
     ),
-    Question("star-camera", "field of view of the star camera, deg, or none", _read_camera, "20"),
-    Question("horizon-cameras", "six cameras for Sun and horizon, yes or no", _read_yes, "yes"),
-    Question("release", "rate at the release, deg/s", number(0.1, 30.0, "deg/s"), "10"),
+    Question("star-camera", "DEG", "field of view of the star camera, deg, or none", _read_camera, "20"),
+    Question("horizon-cameras", "yes|no", "six cameras for Sun and horizon, yes or no", _read_yes, "yes"),
+    Question("release", "DEG/S", "rate at the release, deg/s", number(0.1, 30.0, "deg/s"), "10"),
 )
 COIL_QUESTIONS = (
     (
@@ -206,6 +215,15 @@ COIL_QUESTIONS = (
     ("resistance", "resistance of each coil, ohm"),
 )
 """Keys and questions of three equal coils on the body axes."""
+
+
+def read_value(name: str, text: str) -> Any:
+    """Return the value of a text for the question `name`. Raises UsageError with value and cure."""
+    (question,) = (one for one in QUESTIONS if one.name == name)
+    try:
+        return question.read(text)
+    except ValueError as error:
+        raise UsageError(f"--{name} {text}: {error}") from error
 
 
 def check_values(name: str, values: Values) -> None:

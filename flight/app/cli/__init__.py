@@ -85,6 +85,7 @@ examples:
   {PROGRAM} check step_demo
   {PROGRAM} run step_demo --out runs/demo
   {PROGRAM} report runs/demo
+  {PROGRAM} new-satellite
   {PROGRAM} plan --from 0.4 --to -0.3 --picture path.png
   {PROGRAM} samples
   {PROGRAM} rate samples/streaks.png --fov 15 --exposure 0.4 --overlay found.png

@@ -143,7 +143,7 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
         (("--altitude", "20000"), "--altitude 20000: give a number from 200 to 2000 km"),
         (
             ("--altitude", "500", "--eccentricity", "0.1"),
-            "the perigee is at -188 km, below 180 km: at 500 km give",
+            "the perigee is at -188 km, below 150 km: at 500 km give",
         ),
         (("--inclination", "polar"), "--inclination polar: give a number from 0 to 180 deg, or sso"),
         (("--utc", "noon"), "--utc noon: give a time such as 2026-03-20T12:00:00"),
