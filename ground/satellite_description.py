@@ -97,11 +97,9 @@ class Derived:
         slow_within: estimated limit of the time of detumbling, s.
         duration: duration of the flight, s.
         detumble_horizon: planning horizon of detumbling, s.
-        torque_noise: process noise of the detumbler, rad/s per sqrt(s).
         slew: duration of a slew, s.
         pointing_dipole: dipole whose cost equals that of an attitude error of 1 deg, A m^2.
         roll: roll error of the same cost, rad.
-        torque_start: expected size of the disturbance torques, N m.
         sun_side: whether the Sun is on the side of body +y while +z points to nadir and +x along the flight.
         beta_deg: angle of the Sun from the plane of the orbit, deg.
     """
@@ -116,11 +114,9 @@ class Derived:
     slow_within: float
     duration: float
     detumble_horizon: float
-    torque_noise: float
     slew: float
     pointing_dipole: float
     roll: float
-    torque_start: float
     sun_side: bool
     beta_deg: float
 
@@ -178,11 +174,9 @@ def derived(satellite: Satellite, julian_date: float) -> Derived:
         slow_within=slow_within,
         duration=_rounded_up(slow_within + 1.1 * period, 100.0),
         detumble_horizon=1500.0 if momentum_time < 375.0 else 3000.0,
-        torque_noise=0.1 * torque * float(np.mean([1.0 / moment for moment in inertia])),
         slew=min(max(_rounded_up(16.0 * math.sqrt(max(inertia) / torque), 10.0), 60.0), 1500.0),
         pointing_dipole=min(3.0e-4 * math.sqrt(float(np.mean(inertia)) / _KNIGHTCUBE_INERTIA), 0.02 * dipole),
         roll=0.524 if disturbance / max(inertia) > 3e-6 else 0.0524,
-        torque_start=1.0e-9 * area / 0.01 * _worst_pressure(orbit.altitude) / _worst_pressure(500e3),
         sun_side=beta < 0.0,
         beta_deg=math.degrees(beta),
     )
@@ -246,17 +240,8 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
         "",
         "detumble:",
         (f"  horizon: {values.detumble_horizon:g}", "s, planning horizon of detumbling [computed]"),
-        (
-            f"  torque_noise: {values.torque_noise:.1e}",
-            "rad/s per sqrt(s) [computed: a tenth of the coils' angular acceleration]",
-        ),
         "",
         "estimation:",
-        (
-            f"  torque_start: {values.torque_start:.1e}",
-            "N m, expected disturbance torque [computed: scaled by area and air density]",
-        ),
-        (f"  torque_walk: {2e-3 * values.torque_start:.1e}", "N m per sqrt(s) [computed]"),
         (
             f"  current_noise: {_CURRENT_SIGMA * min(coil.current_limit for coil in satellite.coils):.2g}",
             "A, noise of the current of a coil [computed]",

@@ -24,12 +24,12 @@ ExclusionAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 class OrbitSection(Section, frozen=True, kw_only=True):
     """The orbit of the craft at simulation time zero.
 
-    `altitude` (m) is the semi-major axis minus the Earth's radius.
+    `altitude` (m) is the semi-major axis minus the Earth's radius. The perigee must be higher than 150 km.
 
     `local_time`, the mean local time of the ascending node in hours, overrides `ascending_node_deg`.
     """
 
-    altitude: Annotated[float, Meta(ge=200e3, le=1_000e3)] = 500e3
+    altitude: Annotated[float, Meta(ge=200e3, le=2_000e3)] = 500e3
     eccentricity: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.001
     inclination_deg: Annotated[float, Meta(ge=0.0, le=180.0)] = 97.4
     ascending_node_deg: Angle = 0.0

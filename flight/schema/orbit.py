@@ -28,8 +28,19 @@ from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
 """Range of valid magnetometer readings, T.
 
-In a low orbit the field is 1.5e-5 to 6.5e-5 T, and the coils may add as much.
+At a height of 200 km the field is up to 6.5e-5 T, and the coils may add as much. It is at least 7e-6 T up to
+a height of 2,840 km, the apogee of the highest orbit that is flown.
 """
+
+_FIELD = 3.3e-5
+"""Typical magnetic field in a low orbit, T."""
+_PRESSURE = 5.0e-6
+"""Expected pressure of air and sunlight on a face at an altitude of 500 km, Pa.
+
+The pressure is a tenth of that at solar maximum and perpendicular incidence on one face only.
+"""
+_DIPOLE, _MOMENT = 3.0e-4, 1.047e-3
+"""Dipole (A m^2) with the cost of an attitude error of 1 deg, tuned for a mean moment (kg m^2) of a 1U."""
 
 ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 
@@ -84,13 +95,14 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
     """Detumbling by the momentum plan in the measured field (`knightcube.gnc.control`).
 
     The noise `field_noise` (T, per axis and sample) includes constant errors of the magnetometer. The noise
-    `torque_noise` (rad/s per sqrt(s)) represents unmodelled torques. The momentum plan covers `horizon` s and
+    `torque_noise` (rad/s per sqrt(s)) represents unmodelled torques; without it, it is computed
+    (`OrbitConfig.torque_noise`). The momentum plan covers `horizon` s and
     is renewed every `replan` s. A body that starts slower than `gentle` rad/s never exceeds its initial rate;
     a faster body may reach `spin_up` times its initial rate.
     """
 
     field_noise: Positive = 5.0e-7
-    torque_noise: Positive = 1.0e-5
+    torque_noise: Positive | None = None
     horizon: Positive = 1500.0
     replan: Annotated[float, Meta(ge=1.0)] = 5.0
     gentle: Positive = 0.052
@@ -117,14 +129,12 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
 
     The value `bias_walk` is the random walk of the gyro bias, rad/s per sqrt(s), and `field_noise` is the
     noise of a magnetometer sample, T per axis. The value `torque_start` is the expected size (N m) of the
-    disturbance torques before they are estimated: drag at an altitude of 500 km plus twice the solar
-    radiation pressure. The value `torque_walk` is the random walk of the disturbance torques, N m per
-    sqrt(s). The values `torque_start` and `torque_walk` should be smaller for a light satellite, because
-    plans extrapolate an estimated torque along the field for an hour. From one boot to the next, the gyro
-    bias may change by 10 deg/h, and the residual dipole by the fraction `changed` of its initial standard
-    deviation. The mapping `roles` gives blocks of the error state another role: `estimated`, `considered`
-    (the block is not corrected, but its uncertainty is part of every covariance) or `fixed` (the block is
-    known exactly).
+    disturbance torques at an altitude of 500 km before they are estimated, and `torque_walk` their random
+    walk, N m per sqrt(s). Without these values, they are computed (`OrbitConfig.torque_sizes`). From one boot
+    to the next, the gyro bias may change by 10 deg/h, and the residual dipole by the fraction `changed` of
+    its initial standard deviation. The mapping `roles` gives blocks of the error state another role:
+    `estimated`, `considered` (the block is not corrected, but its uncertainty is part of every covariance) or
+    `fixed` (the block is known exactly).
     """
 
     bias_walk: NotNegative = 2.0e-6
@@ -132,8 +142,8 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     gate_sigma: Annotated[float, Meta(ge=3.0)] = 5.0
     history: Positive = 12.0
     changed: Share = 0.05
-    torque_start: Positive = 3.0e-9
-    torque_walk: Positive = 5.0e-12
+    torque_start: Positive | None = None
+    torque_walk: Positive | None = None
     roles: dict[BlockName, Literal["estimated", "considered", "fixed"]] = msgspec.field(default_factory=dict)
 
 
@@ -159,18 +169,19 @@ class PointingSection(Section, frozen=True, kw_only=True):
     `roll`, a roll error costs as much as any other attitude error. The coils act for `act` s between pauses
     for the magnetometer, which last as long as those of detumbling. Plans are renewed every `replan_period`
     s. A slew to a distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones`
-    of the star camera.
+    of the star camera. Without `dipole` or `slew`, the value is computed (`OrbitConfig.dipole_weight`,
+    `OrbitConfig.slew_duration`).
     """
 
     axis: Vector = (0.0, 0.0, 1.0)
     across: Vector = (1.0, 0.0, 0.0)
     turn: Positive = 0.0175
     rate: Positive = 1.0
-    dipole: Positive = 1.0e-4
+    dipole: Positive | None = None
     roll: Positive | None = None
     act: Annotated[float, Meta(ge=0.1, le=10.0)] = 1.8
     replan_period: Annotated[float, Meta(ge=10.0, le=900.0)] = 300.0
-    slew: Annotated[float, Meta(ge=60.0, le=1500.0)] = 600.0
+    slew: Annotated[float, Meta(ge=60.0, le=1500.0)] | None = None
     cones: ExclusionCones = ExclusionCones()
 
 
@@ -227,6 +238,60 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def hardware(self) -> tuple[Section, ...]:
         """Return the hardware sections on which the validity of learned parameters depends."""
         return (self.craft, *super().hardware())
+
+    def torque_noise(self) -> float:
+        """Return the noise of unmodelled torques in detumbling, rad/s per sqrt(s).
+
+        Unless it is configured, it is a tenth of the root mean square of the angular accelerations that the
+        mean dipole limit causes about the three principal axes in a typical field.
+        """
+        if self.detumble.torque_noise is not None:
+            return self.detumble.torque_noise
+        rates = 1.0 / np.linalg.eigvalsh(self.craft.inertia_matrix())
+        torque = _FIELD * float(self.coils.map().limits.mean())
+        return _two_digits(0.1 * torque * float(np.sqrt(np.mean(rates**2))))
+
+    def torque_sizes(self) -> tuple[float, float]:
+        """Return size (N m) and random walk (N m per sqrt(s)) of the disturbance torques at 500 km.
+
+        Unless it is configured, the size is that of drag and sunlight on the largest face, with the lever arm
+        of the described and the unknown offset of the centre of mass. The random walk is then the size times
+        2e-3 per sqrt(s), because plans extrapolate an estimated torque along the field for an hour.
+        """
+        craft, section = self.craft, self.estimation
+        x, y, z = craft.size
+        arm = craft.accuracy.centre_of_mass + math.hypot(*craft.centre_of_mass)
+        start = section.torque_start or _two_digits(_PRESSURE * max(x * y, y * z, z * x) * arm)
+        return start, section.torque_walk or _two_digits(2.0e-3 * start)
+
+    def dipole_weight(self) -> float:
+        """Return the dipole (A m^2) whose cost equals that of an attitude error of `pointing.turn`.
+
+        Unless it is configured, it is proportional to the square root of the mean moment of inertia, as tuned
+        for a 1U and a 3U CubeSat, and at most a fiftieth of the mean dipole limit.
+        """
+        if self.pointing.dipole is not None:
+            return self.pointing.dipole
+        moment = float(np.trace(self.craft.inertia_matrix())) / 3.0
+        largest = 0.02 * float(self.coils.map().limits.mean())
+        return _two_digits(min(_DIPOLE * math.sqrt(moment / _MOMENT), largest))
+
+    def slew_duration(self) -> float:
+        """Return the requested duration of a slew to a distant target, s.
+
+        Unless it is configured, it is sixteen times the square root of the largest moment of inertia divided
+        by the torque of the mean dipole limit in a typical field.
+        """
+        if self.pointing.slew is not None:
+            return self.pointing.slew
+        moment = float(np.linalg.eigvalsh(self.craft.inertia_matrix())[-1])
+        torque = _FIELD * float(self.coils.map().limits.mean())
+        return min(max(10.0 * round(1.6 * math.sqrt(moment / torque)), 60.0), 1500.0)
+
+
+def _two_digits(value: float) -> float:
+    """Return a value rounded to two significant digits, because it is known to no more."""
+    return float(f"{value:.1e}")
 
 
 def as_orbit(config: Config) -> OrbitConfig:

@@ -33,6 +33,7 @@ import numpy.typing as npt
 from scipy.integrate import OdeSolution, solve_ivp
 from scipy.interpolate import CubicSpline
 
+from flight.schema.document import ConfigError
 from hal.interfaces.errors import OutOfRange
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
@@ -191,7 +192,16 @@ def julian_date(utc: str) -> float:
 
 
 def elements(orbit: OrbitSection, date: float) -> KeplerianElements:
-    """Return the Keplerian elements of a configured orbit at a Julian date."""
+    """Return the Keplerian elements of a configured orbit at a Julian date.
+
+    Raises ConfigError for a perigee that is too low.
+    """
+    perigee = (EARTH_RADIUS + orbit.altitude) * (1.0 - orbit.eccentricity) - EARTH_RADIUS
+    if perigee < _LOWEST_PERIGEE:
+        problem = f"is {orbit.eccentricity:g}: the perigee is at {1e-3 * perigee:.0f} km and must be above"
+        raise ConfigError(
+            "simulation.free_body.orbit.eccentricity", f"{problem} {1e-3 * _LOWEST_PERIGEE:.0f} km"
+        )
     node = math.radians(orbit.ascending_node_deg)
     if orbit.local_time is not None:
         x, y, _ = sun_position(date).tolist()
@@ -234,9 +244,17 @@ _PROFILE = np.array(
         [800e3, 1.170e-14],
         [900e3, 5.245e-15],
         [1000e3, 3.019e-15],
+        [1500e3, 4.67e-16],
+        [2000e3, 7.23e-17],
+        [3000e3, 1.73e-18],
     ]
 )
-"""Heights (m) and air densities (kg/m^3) of the exponential profile."""
+"""Heights (m) and air densities (kg/m^3) of the exponential profile [Vallado, table 8-4].
+
+Above 1,000 km, the values follow from the scale height at 1,000 km, 268 km.
+"""
+_LOWEST_PERIGEE = 150e3
+"""Lowest height (m) of the perigee of a configured orbit. Below it a satellite decays within a revolution."""
 _NIGHT, _DAY = 0.4, 1.6
 """Factors of the air density opposite to the day bulge and at the apex of the day bulge."""
 _MEAN = _NIGHT + (_DAY - _NIGHT) / 3.0

@@ -318,7 +318,7 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     weights = PointingWeights(
         turn=section.turn,
         rate=section.rate,
-        dipole=section.dipole,
+        dipole=config.dipole_weight(),
         fastest=fastest,
         roll=section.roll,
         axis=axes.pointing,
@@ -330,7 +330,7 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     camera = config.camera
     boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
     heat = np.diag(coils.heat)
-    slew = SlewRequest(section.slew, heat, np.zeros(3), np.array(boresight), section.cones.angles())
+    slew = SlewRequest(config.slew_duration(), heat, np.zeros(3), np.array(boresight), section.cones.angles())
     return PlannedCraft(config.craft.inertia_matrix(), axes, weights, limit, slew)
 
 
@@ -382,7 +382,7 @@ def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
     return FreeFilterSettings(
         gyro=(section.bias_start, section.bias_walk),
         coil_noise=section.current_noise * strength / math.sqrt(CONTROL_RATE_HZ),
-        torque=(section.torque_start, section.torque_walk),
+        torque=config.torque_sizes(),
         magnet=(_UNIFORM * config.inertial_unit.accuracy.field_bias, _FIELD_BIAS_WALK),
         field=_FIELD_ERROR,
         errors=description_errors(config),
@@ -408,7 +408,7 @@ def _filter(
         coils=coils,
         gyro_noise=unit.rate_noise,
         field_noise=section.field_noise,
-        unknown_psd=config.detumble.torque_noise**2,
+        unknown_psd=config.torque_noise() ** 2,
         settle_ns=round(config.detumble.settle * SECOND_NS),
         history_ns=round(section.history * SECOND_NS),
         slow=slow,
@@ -453,7 +453,7 @@ def _detumbler(
     settings = FieldRateSettings(
         inertia=craft.inertia_matrix(),
         field_sigma=section.field_noise,
-        torque_walk=section.torque_noise,
+        torque_walk=config.torque_noise(),
         gyro_sigma=config.estimation.bias_start,
         errors=description_errors(config),
     )

@@ -51,6 +51,15 @@ class OrbitState:
         """Unit vector (3,) from the satellite to the centre of the Earth."""
         return np.asarray(-self.position / np.linalg.norm(self.position))
 
+    @property
+    def period(self) -> float:
+        """Period of the Keplerian orbit, s, or infinity for an open orbit."""
+        energy = 0.5 * float(self.velocity @ self.velocity)
+        energy -= GRAVITATIONAL_PARAMETER / float(np.linalg.norm(self.position))
+        if energy >= 0.0:
+            return math.inf
+        return 2.0 * math.pi * GRAVITATIONAL_PARAMETER / (-2.0 * energy) ** 1.5
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpsFix:

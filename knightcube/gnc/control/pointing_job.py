@@ -271,7 +271,7 @@ def _tracking(
 
 @dataclass(frozen=True, slots=True)
 class TableSpan:
-    """Durations of the prediction (`preview`) and of the table (`kept`), and the step of the table, s."""
+    """Shortest duration of the prediction (`preview`), duration of the table (`kept`), and its step, s."""
 
     preview: float
     kept: float
@@ -280,6 +280,10 @@ class TableSpan:
 
 STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
 """Durations and steps of tables for lasting goals, and for a passing object."""
+_COVERED = 1.25
+"""Shortest prediction for a lasting goal, in revolutions of the orbit."""
+_LONGEST = 10_000.0
+"""Longest prediction (s), a revolution and a quarter at an altitude of 2,200 km."""
 LEAD = 2.0
 """Time (s) from the estimated state to the start of the table, in which the table is computed."""
 FAR = math.radians(15.0)
@@ -351,8 +355,11 @@ def run(job: PointingJob) -> PointingTable:
     field is unknown, and UsageError if the law does not define an attitude.
     """
     span = job.span
-    ahead = predict(job.orbit, span.preview + 4.0 * STEADY.step)
-    times = np.arange(LEAD, span.preview, span.step)
+    preview = span.preview
+    if span is STEADY:
+        preview = min(max(preview, _COVERED * job.orbit.period), _LONGEST)
+    ahead = predict(job.orbit, preview + 4.0 * STEADY.step)
+    times = np.arange(LEAD, preview, span.step)
     kept = round(span.kept / span.step)
     quaternion = multiply(from_rotation_vector(LEAD * job.rate), job.quaternion)
     sight, axis = job.sight, job.axes.pointing

@@ -314,3 +314,34 @@ def test_the_craft_needs_its_inertia_or_its_mass() -> None:
         reader.parse(ORBIT.replace(inertia, "", 1).replace(mass, "", 1))
     with pytest.raises(ConfigError, match=r"centre_of_mass` is 0.06 m along y: outside the box"):
         reader.parse(ORBIT.replace(inertia, f"{inertia}\n  centre_of_mass: [0.0, 0.06, 0.0]", 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "noise", "size", "dipole"),
+    [("orbit", 3.0e-4, 1.0e-9, 3.0e-4), ("orbit_3u", 6.0e-5, 3.0e-9, 1.4e-3)],
+)
+def test_values_that_follow_from_craft_and_coils_are_those_tuned_for_the_shipped_satellites(
+    name: str, noise: float, size: float, dipole: float
+) -> None:
+    config = as_orbit(reader.load(FOLDER / f"{name}.yaml"))
+    estimation = reader.replace(config.estimation, torque_walk=None)
+    pointing = reader.replace(config.pointing, dipole=None, slew=None)
+    config = reader.replace(config, estimation=estimation, pointing=pointing)
+    assert (config.torque_noise(), config.torque_sizes()) == (noise, (size, pytest.approx(2e-3 * size)))
+    assert config.dipole_weight() == dipole
+    # A rigid body turns by a fixed angle in a time that grows with the square root of its moment.
+    heavy = reader.replace(config.craft, inertia=tuple(4.0 * moment for moment in config.craft.inertia or ()))
+    ratio = reader.replace(config, craft=heavy).slew_duration() / config.slew_duration()
+    assert ratio == pytest.approx(min(2.0, 1500.0 / config.slew_duration()), rel=0.03)
+
+
+def test_given_values_replace_the_computed_ones() -> None:
+    config = as_orbit(reader.parse(ORBIT))
+    changes = {
+        "detumble": reader.replace(config.detumble, torque_noise=1e-6),
+        "estimation": reader.replace(config.estimation, torque_start=2e-9, torque_walk=3e-12),
+        "pointing": reader.replace(config.pointing, dipole=4e-4, slew=500.0),
+    }
+    config = reader.replace(config, **changes)
+    assert (config.torque_noise(), config.torque_sizes()) == (1e-6, (2e-9, 3e-12))
+    assert (config.dipole_weight(), config.slew_duration()) == (4e-4, 500.0)

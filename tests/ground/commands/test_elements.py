@@ -123,7 +123,7 @@ def test_check_refuses_elements_that_do_not_fit_and_accepts_those_that_are_made(
     path.write_text(f"extends: orbit_3u\nduration: 1.0\n{orbit}", encoding="utf-8")
     done = command("check", path)
     assert done.returncode == 2
-    assert "orbit_3u.yaml:" in done.stderr
+    assert "orbit.yaml:" in done.stderr
     assert "`elements` are up to " in done.stderr
     assert "km from the first revolution of `simulation.free_body.orbit`" in done.stderr
     assert "must be within 100 km: `flight elements --config FILE` makes" in done.stderr

@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
+from flight.schema.document import ConfigError
+from flight.schema.orbit import LARGEST_FIELD, LEAST_FIELD
 from hal.interfaces.errors import OutOfRange
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
@@ -29,6 +31,7 @@ from sim_hal.worlds.orbit import (
     sun_position,
 )
 
+DATE = julian_date("2026-03-20T12:00:00Z")
 VALLADO = KeplerianElements(
     semi_major_axis=11_067_790.0 / (1.0 - 0.83285**2),
     eccentricity=0.83285,
@@ -353,3 +356,27 @@ def test_what_is_random_depends_on_the_seed_alone() -> None:
         asked_often.at(float(time))
     assert asked_often.at(1499.0) == asked_once.at(1499.0)
     assert asked_once.at(1499.0).walk != other.at(1499.0).walk
+
+
+@pytest.mark.parametrize(
+    ("altitude", "eccentricity", "inclination"),
+    [(200e3, 0.0, 97.0), (2_000e3, 0.1, 0.0), (2_000e3, 0.1, 30.0), (1_100e3, 0.1, 90.0)],
+)
+def test_the_field_of_every_permitted_orbit_is_within_the_accepted_range(
+    altitude: float, eccentricity: float, inclination: float
+) -> None:
+    orbit = OrbitSection(altitude=altitude, eccentricity=eccentricity, inclination_deg=inclination)
+    start = elements(orbit, DATE)
+    world = Environment(start, DATE, np.random.default_rng(1))
+    times = np.linspace(0.0, 86_400.0, 800)
+    field = [float(np.linalg.norm(world.position_and_field(time)[1])) for time in times.tolist()]
+    assert LEAST_FIELD < min(field) <= max(field) < 0.5 * LARGEST_FIELD
+
+
+def test_a_perigee_in_the_air_is_refused_and_the_air_thins_up_to_two_thousand_kilometres() -> None:
+    with pytest.raises(ConfigError, match="the perigee is at -188 km and must be above 150 km"):
+        elements(OrbitSection(altitude=500e3, eccentricity=0.1), DATE)
+    distances = EARTH_RADIUS + np.array([[1_000e3], [1_268e3], [2_000e3]])
+    logs = log_density(distances * [1.0, 0.0, 0.0], np.array([1.5e11, 0.0, 0.0]))
+    assert logs[0] - logs[1] == pytest.approx(1.0, abs=0.01)
+    assert logs[0] - logs[2] == pytest.approx(1_000.0 / 268.0, abs=0.01)
