@@ -58,7 +58,7 @@ class OrbitState:
         energy -= GRAVITATIONAL_PARAMETER / float(np.linalg.norm(self.position))
         if energy >= 0.0:
             return math.inf
-        return 2.0 * math.pi * GRAVITATIONAL_PARAMETER / (-2.0 * energy) ** 1.5
+        return 2.0 * math.pi * GRAVITATIONAL_PARAMETER / math.pow(-2.0 * energy, 1.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -327,10 +327,12 @@ def test_values_that_follow_from_craft_and_coils_are_those_tuned_for_the_shipped
     estimation = reader.replace(config.estimation, torque_walk=None)
     pointing = reader.replace(config.pointing, dipole=None, slew=None)
     config = reader.replace(config, estimation=estimation, pointing=pointing)
-    assert (config.torque_noise(), config.torque_sizes()) == (noise, (size, pytest.approx(2e-3 * size)))
+    assert config.torque_noise() == noise
+    assert config.torque_sizes() == pytest.approx((size, 2e-3 * size))
     assert config.dipole_weight() == dipole
     # A rigid body turns by a fixed angle in a time that grows with the square root of its moment.
-    heavy = reader.replace(config.craft, inertia=tuple(4.0 * moment for moment in config.craft.inertia or ()))
+    rows = (4.0 * config.craft.inertia_matrix()).tolist()
+    heavy = reader.replace(config.craft, inertia=tuple(tuple(row) for row in rows))
     ratio = reader.replace(config, craft=heavy).slew_duration() / config.slew_duration()
     assert ratio == pytest.approx(min(2.0, 1500.0 / config.slew_duration()), rel=0.03)
 
