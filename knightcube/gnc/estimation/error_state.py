@@ -1,7 +1,7 @@
-"""The error state of a Kalman filter as a declared list of blocks, and the Kalman update.
+"""The error state of a Kalman filter as a declared list of blocks, and the steps of the filter.
 
 The filters of the testbed (`attitude_filter`) and of the satellite (`free_filter`) are two lists of blocks.
-Both filters use the Kalman update of this module.
+Both filters use the start, the propagation and the update of this module.
 
 Each block is a vector with a name, a prior covariance, a random walk and a role. An estimated block is
 corrected by measurements. A considered block (Schmidt 1966) is not corrected, but its uncertainty and its
@@ -126,6 +126,39 @@ def updated(covariance: FloatArray, gain: FloatArray, cross: FloatArray, spread:
     half = gain.dot((cross - 0.5 * gain.dot(spread)).T)
     covariance = covariance - half - half.T
     return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def propagated(
+    covariance: FloatArray, flow: FloatArray, seconds: float, density: FloatArray, walks: FloatArray
+) -> FloatArray:
+    """Return the covariance (n, n) after a step of `seconds`, in which only attitude and rate are driven.
+
+    The first six states are attitude and rate. `flow` (6, k) holds the derivatives of their time derivatives
+    with respect to the first k states, `density` (3, 3), rad^2/s^3, is the spectral density of the angular
+    acceleration, and `walks` (k,) are the variances per second of the random walks. Further states do not
+    change. The transition matrix is I + F dt + (F dt)^2 / 2.
+    """
+    size = flow.shape[1]
+    flow = seconds * flow
+    # Only attitude and rate have nonzero rows in F, so F^2 needs only the columns of attitude and rate.
+    half = 0.5 * flow[:, _MOTION] + _IDENTITY
+    transition = half.dot(flow)
+    transition[:, _MOTION] += _IDENTITY
+    moved = transition.dot(covariance[:size])
+    among = moved[:, :size].dot(transition.T)
+    # White angular acceleration adds to the covariance of attitude and rate.
+    of_attitude, of_both = seconds**3 / 3.0, 0.5 * seconds * seconds
+    over = np.array((of_attitude, of_both, of_both, seconds)).reshape(2, 1, 2, 1)
+    among += (over * density[:, np.newaxis]).reshape(6, 6)
+    after = covariance.copy()
+    after[_MOTION], after[:, _MOTION], after[_MOTION, _MOTION] = moved, moved.T, among
+    after.reshape(-1)[: size * len(after) : len(after) + 1] += seconds * walks
+    return after
+
+
+_MOTION = slice(0, 6)
+"""Indices of attitude and rate in the error state of a filter."""
+_IDENTITY: FloatArray = np.eye(6)
 
 
 def joined(covariance: FloatArray, by_states: FloatArray, first: FloatArray) -> FloatArray:

@@ -51,6 +51,7 @@ from knightcube.gnc.estimation.error_state import (
     StateBlock,
     gate_bounds,
     joined,
+    propagated,
     slices,
     updated,
     weigh,
@@ -660,19 +661,9 @@ class FreeFilter:
         self.quaternion = multiply(rotation, self.quaternion)
         self.acceleration = acceleration
         self.rate = after
-        flow *= dt
-        flow += 0.5 * (flow[:, :6] @ flow)
-        flow[:, :6] += np.eye(6)
-        covariance = self.covariance
-        covariance[:6] = flow @ covariance
-        covariance[:, :6] = covariance @ flow.T
-        density = dt * self.rate_noise(driven, around, doubt)
-        covariance[RATE, RATE] += density
-        covariance[ATTITUDE, ATTITUDE] += dt * dt / 3.0 * density
-        covariance[ATTITUDE, RATE] += 0.5 * dt * density
-        covariance[RATE, ATTITUDE] += 0.5 * dt * density
-        covariance.reshape(-1)[:: STATES + 1] += dt * self.layout.walks
-        covariance[TORQUES, TORQUES] += dt * density_walk(self._constants[TORQUES])
+        noise = self.rate_noise(driven, around, doubt)
+        self.covariance = propagated(self.covariance, flow, dt, noise, self.layout.walks)
+        self.covariance[TORQUES, TORQUES] += dt * density_walk(self._constants[TORQUES])
         self._propagate_field_error(dt)
         self._propagate_horizon(dt)
 

@@ -40,6 +40,7 @@ from knightcube.astro.quaternion import (
     twist,
 )
 from knightcube.errors import UsageError
+from knightcube.gnc.estimation.error_state import propagated
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     DISTURBANCE,
@@ -249,18 +250,18 @@ def propagate(
         model = body.linearise(middle, state.rate, state.parameters, torquing, half)
         ax, ay, az = (a + d for a, d in zip(model.acceleration, state.disturbance, strict=True))
         moved = exponential(dt * (wx + half * ax), dt * (wy + half * ay), dt * (wz + half * az))
-        covariance = _propagated_covariance(noise, covariance, state.rate, model, torquing, dt)
+        flow, density = _flow(state.rate, model), _density(noise, model, torquing)
+        covariance = propagated(covariance, flow, dt, density, noise.walks)
         state = state._replace(
             quaternion=compose(moved, state.quaternion), rate=(wx + dt * ax, wy + dt * ay, wz + dt * az)
         )
     return state, covariance
 
 
-def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
-    """Return the rows (6, 19) for attitude and rate of the transition matrix I + F dt + (F dt)^2 / 2.
+def _flow(rate: Vector, model: Linearised) -> FloatArray:
+    """Return the rows (6, 19) for attitude and rate of the linearised error dynamics.
 
-    F is the matrix of the linearised error dynamics, such as e' = -w x e + rate error for the attitude error
-    e. The other rows of the transition matrix equal the rows of I.
+    For the attitude error e, the dynamics are e' = -w x e + rate error.
     """
     x, y, z = rate
     flow = _FLOW.copy()
@@ -268,50 +269,18 @@ def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
     flow[RATE, ATTITUDE] = model.by_attitude
     flow[RATE, RATE] = model.by_rate
     flow[RATE, PARAMETERS] = model.by_parameters
-    flow *= dt
-    # Only attitude and rate have nonzero rows in F, so F^2 needs only the columns of attitude and rate.
-    half = flow[:, _MOTION] * 0.5
-    half += _IDENTITY
-    transition = np.asarray(half.dot(flow))
-    transition[:, _MOTION] += _IDENTITY
-    return transition
+    return flow
 
 
-def _propagated_covariance(
-    noise: ProcessNoise,
-    covariance: FloatArray,
-    rate: Vector,
-    model: Linearised,
-    torquing: Torquing,
-    dt: float,
-) -> FloatArray:
-    """Return the covariance after a propagation step.
-
-    Apart from random walks, only the rows and columns of attitude and rate change. All other elements are
-    copied, so the covariance stays exactly symmetric.
-    """
-    transition = _transition(rate, model, dt)
-    moved = transition.dot(covariance[:SIZE])
-    among = moved[:, :SIZE].dot(transition.T)
-    # White angular acceleration during dt adds to the covariance of attitude and rate.
+def _density(noise: ProcessNoise, model: Linearised, torquing: Torquing) -> FloatArray:
+    """Return the spectral density (3, 3) of the angular acceleration, rad^2/s^3."""
     steady = 0.0 if torquing.known else noise.unknown_current**2 * _UNKNOWN_FOR
     weights = [noise.current * driven + steady for driven in torquing.driven]
-    density = noise.rate
-    if any(weights):
-        density = density + (model.by_current * np.array(weights)).dot(model.by_current.T)
-    of_attitude, of_both = dt**3 / 3.0, 0.5 * dt * dt
-    over = np.array((of_attitude, of_both, of_both, dt)).reshape(2, 1, 2, 1)
-    among += (over * density[:, np.newaxis]).reshape(6, 6)
-    after = covariance.copy()
-    after[_MOTION] = moved
-    after[:, _MOTION] = moved.T
-    after[_MOTION, _MOTION] = among
-    after.reshape(-1)[: SIZE * len(after) : len(after) + 1] += dt * noise.walks
-    return after
+    if not any(weights):
+        return noise.rate
+    return np.asarray(noise.rate + (model.by_current * np.array(weights)).dot(model.by_current.T))
 
 
-_MOTION = slice(ATTITUDE.start, RATE.stop)
-_IDENTITY: FloatArray = np.eye(6)
 _FLOW: FloatArray = np.zeros((6, SIZE))
 _FLOW[ATTITUDE, RATE] = np.eye(3)
 _FLOW[RATE, DISTURBANCE] = np.eye(3)
