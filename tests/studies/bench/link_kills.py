@@ -3,7 +3,11 @@
 Each time a link process takes the commands of a ground while an attacker sends every old frame again, and is
 killed (SIGKILL) before or after one of its calls that write to the disk or to the socket of the flight;
 some of the writes are cut in the middle first. The ground's sender is killed in the same way. Counted
-are commands that the flight got twice, and counters that two frames have.
+are commands that the flight received twice, and counters that two frames have.
+
+With `--scheduled` the commands stand in the link's schedule and fall due while the link process is killed.
+A second process, which is not killed, takes over. Counted are commands that the flight received twice,
+commands that it never received, of which each kill may cost one, and schedules without a good copy.
 """
 
 from __future__ import annotations
@@ -23,12 +27,15 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.link.commands import CommandPacker, Ping, open_unix
+from flight.link.commands import CommandPacker, DatagramChannel, Ping, open_unix, unpack
 from flight.link.frames import TELECOMMAND_HEADER, TELEMETRY_HEADER
-from flight.link.process.commanding import ControlLine, Sent
+from flight.link.modes import Mode
+from flight.link.process.commanding import ControlLine, Sent, Timetable
 from flight.link.process.downlink import LogFollower
 from flight.link.process.station import TURN_NS, Station, StationSettings
 from flight.link.security import Vault
+from flight.link.telemetry.definitions import MODE
+from flight.link.telemetry.packets import Packer
 from ground.link.terminal import Terminal, TerminalSettings, make_keys
 from tests.flight.link.process.both_ends import SETTINGS, GroundWire, Wire
 from tests.manual_clock import ManualClock
@@ -44,50 +51,66 @@ _RATE = 1e6
 
 @dataclass
 class Findings:
-    """What came of the kills.
+    """Counts of commands, frames and schedules after the kills.
 
     Attributes:
-        kills: of the link and of the sender.
+        kills: processes that were killed.
+        scheduled: commands that were put into the schedule.
+        schedules_lost: schedules of which no copy was good.
         counters_twice: counters, of either direction, under which two different frames were seen.
         seen: frames by SPI and IV.
-        obeyed: how often the flight got each command.
+        obeyed: how often the flight received each command, by the number of its ping.
     """
 
     kills: int = 0
+    scheduled: int = 0
+    schedules_lost: int = 0
     counters_twice: int = 0
     seen: dict[bytes, bytes] = field(default_factory=dict)
-    obeyed: Counter[bytes] = field(default_factory=Counter)
+    obeyed: Counter[int] = field(default_factory=Counter)
 
     @property
     def obeyed_twice(self) -> int:
-        """How often the flight got a command that it had got before."""
+        """How often the flight received a command that it had received before."""
         return self.obeyed.total() - len(self.obeyed)
 
+    @property
+    def never(self) -> int:
+        """Number of scheduled commands that the flight never received."""
+        return self.scheduled - len(self.obeyed)
+
     def note(self, frames: Sequence[bytes], header_bytes: int) -> None:
-        """Take note of the counters of frames."""
+        """Record the counters of frames."""
         for frame in frames:
             identifier = frame[header_bytes : header_bytes + 14]  # SPI and IV
             known = self.seen.setdefault(identifier, frame)
             self.counters_twice += known != frame
 
+    def receive(self, flight: DatagramChannel) -> None:
+        """Record the commands that the flight has received since the last call."""
+        while got := flight.poll():
+            commands = [unpack(data) for data, _ in got]
+            self.obeyed.update(command.number for command in commands if isinstance(command, Ping))
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Kill, count, print; return 0 when nothing was obeyed or used twice."""
+    """Kill, count, print; return 0 if nothing came twice and a kill cost one command at most."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=1000, metavar="N", help="of the link (default 1000)")
     parser.add_argument("--seed", type=int, default=1, metavar="S")
+    parser.add_argument("--scheduled", action="store_true", help="kill while scheduled commands fall due")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
-        found = measure(Path(place), options.kills, options.seed)
-    facts = {
-        "kills": found.kills,
-        "commands": len(found.obeyed),
-        "obeyed_twice": found.obeyed_twice,
-        "frames": len(found.seen),
-        "counters_twice": found.counters_twice,
-    }
+        measured = measure_scheduled if options.scheduled else measure
+        found = measured(Path(place), options.kills, options.seed)
+    facts = {"kills": found.kills, "commands": len(found.obeyed), "obeyed_twice": found.obeyed_twice}
+    if options.scheduled:
+        facts |= {"scheduled": found.scheduled, "never": found.never, "schedules_lost": found.schedules_lost}
+    else:
+        facts |= {"frames": len(found.seen), "counters_twice": found.counters_twice}
     sys.stdout.write(json.dumps(facts) + "\n")
-    return int(found.obeyed_twice + found.counters_twice > 0 or not found.obeyed)
+    twice = found.obeyed_twice + found.counters_twice + found.schedules_lost
+    return int(twice > 0 or found.never > found.kills or not found.obeyed)
 
 
 def measure(place: Path, kills: int, seed: int) -> Findings:
@@ -103,10 +126,35 @@ def measure(place: Path, kills: int, seed: int) -> Findings:
         shuffled = [frames[index] for index in draw.permutation(len(frames)).tolist()]
         point, torn = int(draw.integers(0, _LINK_POINTS)), bool(draw.integers(2))
         first = new if draw.integers(2) else []
-        found.note(killed(partial(_serve, place, [*first, *shuffled]), point, torn), TELEMETRY_HEADER.size)
-        while got := flight.poll():
-            found.obeyed.update(data for data, _ in got)
+        served = killed(partial(_serve, place, [*first, *shuffled], 20), point, torn)
+        found.note(served, TELEMETRY_HEADER.size)
+        found.receive(flight)
         found.kills += 2
+    flight.close()
+    return found
+
+
+def measure_scheduled(place: Path, kills: int, seed: int) -> Findings:
+    """Schedule three commands and kill the link that executes them, `kills` times."""
+    make_keys(place / "keys")
+    run = place / "run-000001"
+    run.mkdir()
+    fields = {"before": 0, "mode": int(Mode.HOLD), "trigger": "start", "reason": "", "target_q2": 0.0}
+    (run / "flight-0001.ccsds").write_bytes(Packer().pack(MODE, 1, fields))
+    folder, flight = Vault(place / "keys" / "satellite").folder, open_unix(place / "commands")
+    draw, found = np.random.default_rng(seed), Findings()
+    due_ns = ManualClock().utc_ns() + 2 * TURN_NS
+    for _ in range(kills):
+        table = Timetable(folder)
+        found.schedules_lost += table.lost
+        for _ in range(_AT_ONCE):
+            table.add(due_ns, 1, 0, f"ping {found.scheduled}")
+            found.scheduled += 1
+        killed(partial(_serve, place, None, 6), int(draw.integers(0, _LINK_POINTS)), bool(draw.integers(2)))
+        found.kills += 1
+        found.receive(flight)
+        killed(partial(_serve, place, None, 6), sys.maxsize, torn=False)
+        found.receive(flight)
     flight.close()
     return found
 
@@ -214,17 +262,19 @@ def _send(place: Path, number: int, way: Way) -> None:
     """Send three commands from the ground."""
     terminal = Terminal(_GroundOut(way), Vault(place / "keys" / "ground"), TerminalSettings())
     for count in range(_AT_ONCE):
-        terminal.send(CommandPacker().pack(Ping(count), number * _AT_ONCE + count))
+        sent = number * _AT_ONCE + count
+        terminal.send(CommandPacker().pack(Ping(sent), sent))
 
 
-def _serve(place: Path, frames: list[bytes], way: Way) -> None:
-    """Serve as the link for a moment, with these frames coming in."""
+def _serve(place: Path, frames: list[bytes] | None, turns: int, way: Way) -> None:
+    """Serve as the link for some turns, with these frames coming in; None if the link has no line."""
     control: ControlLine[Sent] = ControlLine(place / "commands", place)
     clock = ManualClock()
     settings = StationSettings(SETTINGS.spacecraft, SETTINGS.frame_bytes, _RATE)
     vault = Vault(place / "keys" / "satellite")
-    station = Station(settings, vault, [_SkyWire(way, frames)], control, LogFollower(place), clock)
-    for _ in range(20):
+    wires = [_SkyWire(way, frames)] if frames is not None else []
+    station = Station(settings, vault, wires, control, LogFollower(place), clock)
+    for _ in range(turns):
         station.turn()
         clock.advance(TURN_NS)
 

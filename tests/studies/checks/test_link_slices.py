@@ -9,8 +9,7 @@ import pytest
 from flight.link.process.commanding import Timetable
 from flight.link.security import Vault
 from ground.link.terminal import make_keys
-from tests.studies.bench import schedule_kills
-from tests.studies.bench.link_kills import measure
+from tests.studies.bench.link_kills import measure, measure_scheduled
 
 
 def test_nothing_is_obeyed_twice_and_no_counter_used_twice(tmp_path: Path) -> None:
@@ -32,8 +31,8 @@ def test_a_sender_that_stores_nothing_is_found_out(tmp_path: Path, monkeypatch: 
 
 
 def test_no_scheduled_command_comes_twice_and_a_kill_costs_one_at_most(tmp_path: Path) -> None:
-    found = schedule_kills.measure(tmp_path, 12, seed=3)
-    assert (found.twice, found.lost) == (0, 0)
+    found = measure_scheduled(tmp_path, 12, seed=3)
+    assert (found.obeyed_twice, found.schedules_lost) == (0, 0)
     assert 0 < found.never <= found.kills
 
 
@@ -41,4 +40,4 @@ def test_a_schedule_that_keeps_what_it_hands_over_is_found_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Timetable, "remove", Timetable.forget)
-    assert schedule_kills.measure(tmp_path, 6, seed=3).twice > 0
+    assert measure_scheduled(tmp_path, 6, seed=3).obeyed_twice > 0
