@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -27,11 +28,28 @@ def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=100)
 
 
-@pytest.mark.parametrize("words", [[], ["run"], ["report"], ["export"], ["plan"]])
-def test_help_is_everywhere(words: list[str]) -> None:
-    done = command(*words, "--help")
+def obeyed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
+    """Return status, output and error output of a command that this process runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        try:
+            status: Any = main([str(argument) for argument in arguments])
+        except SystemExit as ended:
+            status = ended.code
+    return status, *capsys.readouterr()
+
+
+def test_the_program_shows_its_help() -> None:
+    done = command("--help")
     assert done.returncode == 0
     assert "usage: python -m flight" in done.stdout
+
+
+@pytest.mark.parametrize("words", [["run"], ["report"], ["export"], ["plan"]])
+def test_help_is_everywhere(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    status, output, _ = obeyed(capsys, *words, "--help")
+    assert status == 0
+    assert "usage: python -m flight" in output
 
 
 def test_a_short_flight_says_what_it_did_and_what_to_do_next(tmp_path: Path) -> None:
@@ -42,9 +60,9 @@ def test_a_short_flight_says_what_it_did_and_what_to_do_next(tmp_path: Path) -> 
     assert (tmp_path / "run" / "config.yaml").read_text() == DEMO.read_text()
 
 
-def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
-    done = command("run", DEMO, "--duration", "2", "--out", tmp_path / "run", "--json")
-    facts = json.loads(done.stdout)
+def test_json_is_one_object_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, output, _ = obeyed(capsys, "run", DEMO, "--duration", "2", "--out", tmp_path / "run", "--json")
+    facts = json.loads(output)
     assert facts["mission_time_s"] == pytest.approx(2.0)
     assert facts["interrupted"] is False
 
@@ -64,20 +82,24 @@ def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
         (["export", "/nowhere"], "/nowhere: no such folder"),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_status_2(words: list[str], complaint: str, tmp_path: Path) -> None:
-    done = command(*[str(word).format(tmp=tmp_path) for word in words])
-    assert done.returncode == 2
-    assert complaint in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert "Traceback" not in done.stderr
+def test_a_mistake_is_one_line_and_exit_status_2(
+    words: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, output, error = obeyed(capsys, *[str(word).format(tmp=tmp_path) for word in words])
+    assert status == 2
+    assert complaint in error
+    assert error.count("\n") == 1
+    assert output == ""
 
 
-def test_a_run_is_not_written_over(tmp_path: Path) -> None:
-    assert command("run", DEMO, "--duration", "1", "--out", tmp_path).returncode == 0
+def test_a_run_is_not_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert obeyed(capsys, "run", DEMO, "--duration", "1", "--out", tmp_path)[0] == 0
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     again = command("run", DEMO, "--duration", "1", "--out", tmp_path)
     assert again.returncode == 2
     assert "already contains a run" in again.stderr
+    assert again.stderr.count("\n") == 1
+    assert "Traceback" not in again.stderr
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -138,16 +160,18 @@ def test_plan_shows_a_stretched_horizon_and_draws_it(tmp_path: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_plan_refuses_what_no_coil_can_reach() -> None:
-    done = command("plan", "--from", "0.9", "--to", "0.0")
-    assert done.returncode == 2
-    assert done.stderr == "flight: --from 0.9: must be -0.68 to 0.68\n"
+def test_plan_refuses_what_no_coil_can_reach(capsys: pytest.CaptureFixture[str]) -> None:
+    status, _, error = obeyed(capsys, "plan", "--from", "0.9", "--to", "0.0")
+    assert status == 2
+    assert error == "flight: --from 0.9: must be -0.68 to 0.68\n"
 
 
-def test_export_writes_a_table_for_each_kind_of_packet(tmp_path: Path) -> None:
-    command("run", DEMO, "--duration", "1", "--out", tmp_path)
-    done = command("export", tmp_path, "--json")
-    files = [Path(name).name for name in json.loads(done.stdout)["files"]]
+def test_export_writes_a_table_for_each_kind_of_packet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    obeyed(capsys, "run", DEMO, "--duration", "1", "--out", tmp_path)
+    _, output, _ = obeyed(capsys, "export", tmp_path, "--json")
+    files = [Path(name).name for name in json.loads(output)["files"]]
     assert {"control.csv", "imu.csv", "truth.csv", "event.csv"} <= set(files)
 
 
