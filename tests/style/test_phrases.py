@@ -34,7 +34,10 @@ REFUSED = {
 }
 """Patterns of inversions, hearsay words and idioms, each with what plain English says."""
 
-ANY = re.compile("|".join(REFUSED), re.IGNORECASE)
+ANY = re.compile("|".join(REFUSED))
+BEGINS = re.compile("|".join(pattern.removeprefix("(?<!there )").removeprefix(r"\b") for pattern in REFUSED))
+"""`REFUSED` without what must stand before a phrase: found more often, and six times as fast."""
+GAPS = str.maketrans('#"_', "   ")
 
 TEXT_TOKENS = (tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING))
 
@@ -81,7 +84,8 @@ def refused_phrases(text: str) -> list[tuple[int, str, str]]:
 
 def may_have_any(text: str) -> bool:
     """Return whether a text has a refused phrase if code counts as text: most files have none."""
-    return bool(ANY.search(re.sub(r'[\s#"_]+', " ", text)))
+    flat = " ".join(text.lower().translate(GAPS).split())
+    return bool(BEGINS.search(flat) and ANY.search(flat))
 
 
 @pytest.mark.parametrize(
