@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +31,9 @@ def run(words: list[str], tree: Path, status: int = 0) -> subprocess.CompletedPr
 
 
 def patched(name: str, folder: Path) -> Path:
-    """Return a copy of the packages with `name`.diff applied."""
+    """Return a copy of the packages with `name`.diff applied, with the bytecode of all other modules."""
     for package in ("knightcube", "flight", "hal", "sim_hal", "ground", "config"):
-        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / package, folder / package)
     words = ["git", "apply", "-C1", "--unidiff-zero", str(EXAMPLES / f"{name}.diff")]
     environment = {**os.environ, "GIT_CEILING_DIRECTORIES": str(folder.parent)}
     done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
@@ -45,6 +46,12 @@ def files_of(name: str) -> list[str]:
     return re.findall(
         r"^\+\+\+ b/(.+)$", (EXAMPLES / f"{name}.diff").read_text(encoding="utf-8"), re.MULTILINE
     )
+
+
+@cache
+def printed_by(script: str) -> str:
+    """Return what an example that needs no other tree prints."""
+    return run([str(EXAMPLES / f"{script}.py")], ROOT).stdout
 
 
 @pytest.mark.parametrize(("name", "most"), [("command", 3), ("packet", 1), ("field", 2), ("config_key", 2)])
@@ -143,7 +150,7 @@ NUMBER = re.compile(r"[+-]?\d+\.?\d*")
 )
 def test_an_example_of_the_library_prints_what_its_page_shows(page: str, script: str) -> None:
     """The words are equal, and the numbers to two units of their last digit: processors round differently."""
-    printed = run([str(EXAMPLES / f"{script}.py")], ROOT).stdout.rstrip()
+    printed = printed_by(script).rstrip()
     text = (ROOT / "docs" / "library" / f"{page}.md").read_text(encoding="utf-8")
     shown = text.partition("It prints:\n\n```\n")[2].partition("\n```")[0]
     assert NUMBER.sub("#", printed).split() == NUMBER.sub("#", shown).split()
@@ -154,13 +161,13 @@ def test_an_example_of_the_library_prints_what_its_page_shows(page: str, script:
 
 def test_the_examples_find_what_they_have_drawn() -> None:
     """Each script prints its result beside the value that it has put into the image."""
-    streaks = run([str(EXAMPLES / "streak_rate.py")], ROOT).stdout
+    streaks = printed_by("streak_rate")
     rate, true = (np.array(text.split(), dtype=float) for text in re.findall(r"\[([^\]]+)\]", streaks)[:2])
     sigma = np.array(re.findall(r"1 sigma +\[([^\]]+)\]", streaks)[0].split(), dtype=float)
     assert np.all(np.abs(rate - true) < 4.0 * sigma)
     assert np.all(sigma < 0.02 * np.linalg.norm(true))
     assert streaks.count("object ") == 1
-    lens = run([str(EXAMPLES / "lens.py")], ROOT).stdout
+    lens = printed_by("lens")
     focal_length, error = map(float, re.findall(r"focal length +([\d.]+) \+- ([\d.]+) px", lens)[0])
     assert abs(focal_length - 2250.0) < max(4.0 * error, 0.05)
     k1, error = map(float, re.findall(r"k1 +(\S+) \+- (\S+)", lens)[0])
