@@ -57,8 +57,9 @@ console: $(READY) ## the demonstration flying in real time in the browser, with 
 quick: $(TOOLS) ## style, import arrows and the fast tests: under 90 s on two cores
 	@$(MAKE) --no-print-directory lint arrows fast
 
+# The tests begin first: they wait for processes and sockets, and the other checks fill the pauses.
 test: $(TOOLS)  ## every check, two at a time
-	@$(MAKE) --no-print-directory --jobs 2 lint types arrows docs unit
+	@$(MAKE) --no-print-directory --jobs 2 unit lint types arrows docs
 
 test-container: $(TOOLS)  ## the service installed and booted under systemd in a container; needs root and nspawn
 	$(RUN) -m pytest -rs tests/deploy/test_container.py
