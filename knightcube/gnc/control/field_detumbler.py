@@ -29,16 +29,21 @@ momentum across the field, which is removed later. The plan leaves a residual mo
 last momentum along a slowly rotating field would take most of the time.
 
 The minimum-time plan first accelerates a body that spins along the field, about an axis across the field. The
-settings `gentle` and `spin_up` therefore give an upper bound of the rate. At this upper bound of the rate,
-the commanded dipole moment does not increase the rate. If the upper bound equals the initial rate, detumbling
-takes longer, because a spin along the field is then stopped only after the field has rotated by a right
-angle.
+settings `gentle` and `spin_up` therefore give upper bounds of the rate and of the kinetic energy. At an upper
+bound, the commanded dipole moment does not increase the bounded quantity. If the bounds equal the initial
+values, detumbling takes longer, because a spin along the field is then stopped only after the field has
+rotated by a right angle.
+
+The magnetometer alone shows the rate along the field late. Until all components of the rate are known, the
+coils therefore do no positive work. The work of the coils depends on the rate across the field, but neither
+on the rate along the field nor on the inertia tensor. The rate of a body with unequal moments of inertia
+changes without a torque, and its energy does not.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,21 +124,27 @@ def braking_dipole(costate: FloatArray, field: FloatArray, limit: float | FloatA
     return np.clip(-cross_product(field, costate), -limit, limit)
 
 
-def without_speed_up(
-    dipole: FloatArray, field: FloatArray, rate: FloatArray, inverse: FloatArray
-) -> FloatArray:
-    """Return the dipole moment (3,) without the part whose torque increases the rate.
+def without_growth(dipole: FloatArray, grows: Sequence[FloatArray]) -> FloatArray:
+    """Return the dipole moment (3,) without the part that increases a quantity.
 
-    The arguments `rate` (3,), rad/s, and `inverse` (3, 3) are the body rate and the inverse inertia tensor,
-    both in body axes. No component of the result is larger than the same component of the given dipole
-    moment.
+    Each element (3,) of `grows` is the derivative of the growth rate of one quantity with respect to the
+    dipole moment. At most two elements are possible. No component of the result is larger than the largest
+    component of the given dipole moment.
     """
-    # The vector `grows` is the derivative of d(|rate|^2 / 2)/dt with respect to the dipole moment.
-    grows = cross_product(field, inverse @ rate)
-    gained, square = float(dipole @ grows), float(grows @ grows)
-    if gained <= 0.0 or square == 0.0:
+    tried = [dipole, *(_orthogonal(dipole, vector) for vector in grows)]
+    for one in tried:
+        limits = [_ROUNDING * math.sqrt(float(one @ one) * float(vector @ vector)) for vector in grows]
+        if all(float(one @ vector) <= limit for vector, limit in zip(grows, limits, strict=True)):
+            return one
+    return _NO_DIPOLE
+
+
+def _orthogonal(dipole: FloatArray, vector: FloatArray) -> FloatArray:
+    """Return the part (3,) of a dipole moment orthogonal to a vector (3,), with no larger components."""
+    square = float(vector @ vector)
+    if square == 0.0:
         return dipole
-    left = dipole - grows * (gained / square)
+    left = dipole - vector * (float(dipole @ vector) / square)
     largest, before = float(np.abs(left).max()), float(np.abs(dipole).max())
     return left if largest <= before else left * (before / largest)
 
@@ -227,10 +238,12 @@ FEW, SOON = 4.0, 5.0
 """Ratio of the momentum to the residual momentum of a plan, and duration (s), that define the last phase of
 detumbling. A momentum below FEW times the residual momentum of a plan is removed within SOON seconds if the
 momentum along the field is small."""
-KNOWN = 2e-3
-"""Standard deviation (rad/s) of the least certain rate component below which the upper bound of the rate is
-set."""
+KNOWN, KNOWN_SHARE = 2e-3, 0.1
+"""The upper bounds of rate and energy are set once the standard deviation of the least certain rate component
+is below KNOWN rad/s, or below KNOWN_SHARE of the rate."""
 _SECOND = 1e-9
+_ROUNDING = 1e-9
+"""Relative rounding error of a product that should be zero."""
 _NO_DIPOLE: FloatArray = np.zeros(3)
 
 
@@ -302,7 +315,8 @@ class FieldDetumbler:
         self._bounded = False
         self._driven_ns = now_ns  # another flight mode may have driven the coils until now
         self._accepted_ns = now_ns
-        self._fastest = math.inf
+        self._fastest = self._most_energy = math.inf
+        self._initial_known = False
         self._filter.restart()
 
     def listens(self, time_ns: int) -> bool:
@@ -399,14 +413,23 @@ class FieldDetumbler:
 
     def _braking_dipole(self, now_ns: int) -> FloatArray:
         found, braking = self._filter, self._braking
-        dipole = braking_dipole(self._costate(now_ns), found.field, braking.limit)
-        rate = found.rate
-        speed = math.sqrt(float(rate @ rate))
-        if math.isinf(self._fastest) and self.rate_sigma < KNOWN:
-            self._fastest = speed * (braking.spin_up if speed > braking.gentle else 1.0)
-        return (
-            without_speed_up(dipole, found.field, rate, found.inverse) if speed >= self._fastest else dipole
-        )
+        field, rate, momentum = found.field, found.rate, found.momentum
+        dipole = braking_dipole(self._costate(now_ns), field, braking.limit)
+        speed, energy = math.sqrt(float(rate @ rate)), 0.5 * float(rate @ momentum)
+        sigma, works = self.rate_sigma, cross_product(field, rate)
+        if not self._initial_known:
+            if sigma >= max(KNOWN, KNOWN_SHARE * speed):
+                return without_growth(dipole, [works])
+            self._initial_known = True
+            multiple = braking.spin_up if speed > braking.gentle else 1.0
+            self._fastest = min(self._fastest, multiple * speed)
+            self._most_energy = min(self._most_energy, multiple * multiple * energy)
+        # Each bound is compared with a value that is one standard deviation of the rate above the estimate.
+        upper = speed + sigma
+        grows = [works] if energy * upper**2 >= self._most_energy * speed**2 else []
+        if upper >= self._fastest:
+            grows.append(cross_product(field, found.inverse @ rate))
+        return without_growth(dipole, grows)
 
     def _costate(self, now_ns: int) -> FloatArray:
         """Return the costate (3,) A m^2/T of the plan in the present body axes."""

@@ -43,7 +43,8 @@ SIZE = 15
 LARGEST_ROTATION = 0.15
 """Largest rotation (rad) of the body in one integration step."""
 _LINEARISED = 0.2
-"""Fraction of the inertia's standard deviation that is added as noise, because the filter is linearised."""
+"""Fraction of the inertia's standard deviation that is added as noise for a known rate, because the filter is
+linearised."""
 _AGREEING = 3
 """Number of consecutive consistent field samples that start the filter."""
 _EYE: FloatArray = np.eye(SIZE)
@@ -247,13 +248,12 @@ class FieldRate:
     def _update_unexplained(self) -> None:
         """Set the standard deviation of the gyroscopic torque, relative to its size, by the inertia's error.
 
-        Otherwise the covariance of the linearised filter would become too small while the inertia is poorly
-        known. The least certain combination of elements is omitted: it is the common scale of the tensor, on
-        which the gyroscopic acceleration does not depend.
+        Without noise of this size, the covariance of the linearised filter would become too small while the
+        inertia is poorly known. The least certain combination of elements is omitted: it is the common scale
+        of the tensor, on which the gyroscopic acceleration does not depend.
         """
         unknown = float(np.linalg.eigvalsh(self._covariance[INERTIA, INERTIA])[-2])
-        error = _LINEARISED * math.sqrt(max(unknown, 0.0))
-        self._unexplained = error * self._trace / np.diag(self._inertia)
+        self._unexplained = math.sqrt(max(unknown, 0.0)) * self._trace / np.diag(self._inertia)
 
     def _start(self, field: FloatArray) -> None:
         """Start with the rate across the field once three consecutive field samples agree."""
@@ -321,8 +321,12 @@ class FieldRate:
         # The error of the gyroscopic torque is correlated while the body rotates by less than about a radian.
         speed = math.sqrt(middle[0] ** 2 + middle[1] ** 2 + middle[2] ** 2)
         walks = covariance.reshape(-1)[:: SIZE + 1]
-        walks[RATE] += dt * (settings.torque_walk**2 + speed**3 * self._unexplained**2)
-        walks[CHANGE] += dt * settings.change_walk**2
+        # The filter is linearised, so products of the errors of rate, inertia and field change act as noise.
+        spread = float(walks[RATE].sum())
+        products = speed * (_LINEARISED**2 * speed**2 + spread)
+        change = min(float(walks[CHANGE].max()), settings.change_start**2)
+        walks[RATE] += dt * (settings.torque_walk**2 + products * self._unexplained**2)
+        walks[CHANGE] += dt * (settings.change_walk**2 + math.sqrt(spread) * change)
         walks[INERTIA] += dt * settings.inertia_walk**2
         self._covariance = covariance
 
