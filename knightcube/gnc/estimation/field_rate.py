@@ -324,9 +324,9 @@ class FieldRate:
         # The filter is linearised, so products of the errors of rate, inertia and field change act as noise.
         spread = float(walks[RATE].sum())
         products = speed * (_LINEARISED**2 * speed**2 + spread)
-        change = min(float(walks[CHANGE].max()), settings.change_start**2)
+        unknown_change = min(float(walks[CHANGE].max()), settings.change_start**2)
         walks[RATE] += dt * (settings.torque_walk**2 + products * self._unexplained**2)
-        walks[CHANGE] += dt * (settings.change_walk**2 + math.sqrt(spread) * change)
+        walks[CHANGE] += dt * (settings.change_walk**2 + math.sqrt(spread) * unknown_change)
         walks[INERTIA] += dt * settings.inertia_walk**2
         self._covariance = covariance
 
