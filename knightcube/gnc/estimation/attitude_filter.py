@@ -1,24 +1,24 @@
 """A multiplicative extended Kalman filter of attitude, rate and biases that accepts late measurements.
 
 Each measurement is applied at its own time. A late measurement is inserted at its own time, and all later
-measurements are applied again. The work is done at once, or in small steps while the filter continues without
-the late measurement (module `replay`). The rate from a streaked image is the mean rate during the exposure.
-The filter therefore keeps the attitude at the start of an exposure until the exposure ends. The filter can
-also estimate the age of the inertial unit's samples (module `mekf`). For a body that hangs on the testbed's
-thread, the filter uses only the component of each measurement about the thread. The torsion and the damping
-of the thread are known or estimated. They are distinguished from the estimated disturbance because their
-torques depend on the angle and the rate.
+measurements are applied again. These measurements are applied at once, or a few at a time while the filter
+continues without the late measurement (module `replay`). The rate from a streaked image is the mean rate
+during the exposure. The filter therefore keeps the attitude at the start of an exposure until the exposure
+ends. The filter can also estimate the age of the inertial unit's samples (module `mekf`). For a body that
+hangs on the testbed's thread, the filter uses only the component of each measurement about the thread. The
+torsion and the damping of the thread are known or estimated. They are distinguished from the estimated
+disturbance because their torques depend on the angle and the rate.
 
 The class `CommandCheck` checks with the gyro whether the coils carry the commanded currents. While a coil is
 broken, the model predicts an acceleration that does not occur. The innovations of the gyro then exceed their
-covariance within one to a few samples, which they do not in a healthy flight. The filter from then on treats
-the coil currents as unknown, also for the last half second, and follows the gyro. A change of the rate that
-no coil current can cause does not contradict the commands, because the gyro may be faulty. The commands are
-trusted again when the rate follows the commands. The model z = b + g c is fitted to the gyro samples z of the
-last second, where c is the change of the rate that the commands should cause. The response g must be
-determined well, be 1 within its uncertainty, and leave white residuals. A body whose coils are not driven
-therefore never restores the trust. If the gyro is noisier than assumed, the check widens its limits and does
-not raise an alarm.
+covariance within one to a few samples, which they do not in a healthy flight. From then on, the filter treats
+the coil currents as unknown and follows the gyro. The currents of the last half second are also treated as
+unknown. A change of the rate that no coil current can cause does not contradict the commands, because the
+gyro may be faulty. The commands are trusted again when the rate follows the commands. The model z = b + g c
+is fitted to the gyro samples z of the last second, where c is the change of the rate that the commands should
+cause. The response g must be determined well, be 1 within its uncertainty, and leave white residuals. The
+commands are therefore never trusted again while the coils are not driven. If the gyro is noisier than
+assumed, the check widens its limits and does not raise an alarm.
 """
 
 from __future__ import annotations
@@ -255,12 +255,12 @@ class FilterSettings:
 
 
 def free_axes(body: RigidBody) -> FloatArray:
-    """Return an array (3,) with 1 for each axis about which the body can rotate, and 0 for other axes."""
+    """Return an array (3,) with 1 for the axes about which the body can rotate, and 0 for the others."""
     return np.array([0.0, 1.0, 0.0]) if body.suspended else np.ones(3)
 
 
 def error_state(body: RigidBody, settings: FilterSettings, prior: SlowPrior) -> ErrorState:
-    """Return the declared error state of `body`. A block of zero variance is not estimated."""
+    """Return the declared error state of `body`. A block with a prior covariance of zero is not estimated."""
     free = free_axes(body)
     latency = np.array([[prior.latency_variance]])
     disturbance, walk = settings.disturbance_start * free, settings.disturbance_walk * free
@@ -414,7 +414,7 @@ class AttitudeFilter:
     def start(self, attitude: AttitudeMeasurement, rate: RateMeasurement) -> None:
         """Start from an attitude and a gyro rate.
 
-        For a suspended body, only their components about the thread are used.
+        For a suspended body, only the components of attitude and rate about the thread are used.
         """
         first = first_checkpoint(self._model, self._layout, self._prior, attitude, rate)
         self._history.restart(first)
@@ -429,7 +429,7 @@ class AttitudeFilter:
 
     @property
     def measured_ns(self) -> int:
-        """Time of the newest accepted measurement."""
+        """Time (ns) of the newest accepted measurement."""
         return self._history.newest_used.time_ns
 
     def measure(self, measurement: Measurement) -> bool:

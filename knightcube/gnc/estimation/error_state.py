@@ -1,7 +1,7 @@
-"""The error state of a Kalman filter as a declared list of blocks, and the steps of the filter.
+"""The error state of a Kalman filter as a declared list of blocks, with propagation and update.
 
 The filters of the testbed (`attitude_filter`) and of the satellite (`free_filter`) are two lists of blocks.
-Both filters use the start, the propagation and the update of this module.
+Both filters use the covariance propagation and the Kalman update of this module.
 
 Each block is a vector with a name, a prior covariance, a random walk and a role. An estimated block is
 corrected by measurements. A considered block (Schmidt 1966) is not corrected, but its uncertainty and its
@@ -40,7 +40,8 @@ class StateBlock:
     Attributes:
         name: name of the block, unique within the list.
         prior: standard deviations (n,) or covariance (n, n) at the start.
-        walk: standard deviations (n,) of the random walk per sqrt(s); a single number applies to all.
+        walk: standard deviations (n,) of the random walk per sqrt(s); a single number applies to all
+            elements.
         role: treatment of the block.
     """
 
@@ -51,7 +52,7 @@ class StateBlock:
 
 
 def slices(sizes: Mapping[str, int]) -> list[slice]:
-    """Return the indices of blocks with these sizes by name, one after the other."""
+    """Return the indices of consecutive blocks as slices. The sizes of the blocks are given by name."""
     ends = np.cumsum(list(sizes.values())).tolist()
     return [slice(end - size, end) for end, size in zip(ends, sizes.values(), strict=True)]
 
@@ -60,8 +61,8 @@ class ErrorState:
     """The layout of an error state.
 
     Attributes:
-        sizes: sizes of the blocks by name, in order.
-        size: number of elements.
+        sizes: number of elements of each block by name, in order.
+        size: number of elements of the error state.
         prior: covariance (size, size) at the start; zero for fixed blocks.
         walks: variances (size,) of the random walks per second; zero for fixed blocks.
         considered: flags (size,) of the elements of considered blocks, or None without such a block.
@@ -85,12 +86,12 @@ class ErrorState:
         self.considered = considered if considered.any() else None
 
     def estimated(self, gain: FloatArray) -> FloatArray:
-        """Return a gain (size, k) that does not correct the considered elements."""
+        """Return the gain (size, k) with zeros for the considered elements, which are not corrected."""
         return gain if self.considered is None else np.where(self.considered[:, None], 0.0, gain)
 
 
 class Weighed(NamedTuple):
-    """An innovation of k components, weighed against the covariance of n states.
+    """The optimal gain for an innovation of k components and n states, with intermediate results.
 
     Attributes:
         square: normalised square y' S^-1 y of the innovation y.
@@ -106,9 +107,10 @@ class Weighed(NamedTuple):
 
 
 def weigh(covariance: FloatArray, value: FloatArray, rows: FloatArray, noise: FloatArray) -> Weighed:
-    """Return the weight of an innovation `value` (k,) with Jacobian `rows` (k, n), k at most 3.
+    """Return the optimal gain for an innovation `value` (k,), where k is at most 3.
 
-    `covariance` (n, n) is that of the states, and `noise` (k, k) that of the measurement.
+    The innovation has the Jacobian `rows` (k, n). The states have the covariance `covariance` (n, n), and the
+    measurement has the covariance `noise` (k, k).
     """
     # For small matrices, ndarray.dot takes two thirds of the time of the @ operator.
     cross = covariance.dot(rows.T)
@@ -118,10 +120,10 @@ def weigh(covariance: FloatArray, value: FloatArray, rows: FloatArray, noise: Fl
 
 
 def updated(covariance: FloatArray, gain: FloatArray, cross: FloatArray, spread: FloatArray) -> FloatArray:
-    """Return the symmetric covariance (n, n) after a correction with any gain (n, k).
+    """Return the covariance (n, n) of the states after a correction with any gain (n, k).
 
-    `cross` and `spread` are those of `Weighed`. For a gain with zero rows, such as that of considered
-    elements, the result equals that of Joseph's form.
+    The arguments `cross` and `spread` are attributes of `Weighed`. The result equals Joseph's form, also for
+    a gain that is not optimal, such as one with zero rows for considered elements.
     """
     half = gain.dot((cross - 0.5 * gain.dot(spread)).T)
     covariance = covariance - half - half.T
@@ -131,12 +133,12 @@ def updated(covariance: FloatArray, gain: FloatArray, cross: FloatArray, spread:
 def propagated(
     covariance: FloatArray, flow: FloatArray, seconds: float, density: FloatArray, walks: FloatArray
 ) -> FloatArray:
-    """Return the covariance (n, n) after a step of `seconds`, in which only attitude and rate are driven.
+    """Return the covariance (n, n) after a step of `seconds`, for dynamics of attitude and rate.
 
-    The first six states are attitude and rate. `flow` (6, k) holds the derivatives of their time derivatives
-    with respect to the first k states, `density` (3, 3), rad^2/s^3, is the spectral density of the angular
-    acceleration, and `walks` (k,) are the variances per second of the random walks. Further states do not
-    change. The transition matrix is I + F dt + (F dt)^2 / 2.
+    The first six states are attitude and rate. The error dynamics F of attitude and rate are `flow` (6, k),
+    for the first k states. The spectral density of the angular acceleration is `density` (3, 3), rad^2/s^3.
+    The random walks of the first k states have the variances `walks` (k,) per second. States beyond the first
+    k do not change. The transition matrix is I + F dt + (F dt)^2 / 2.
     """
     size = flow.shape[1]
     flow = seconds * flow
@@ -162,10 +164,10 @@ _IDENTITY: FloatArray = np.eye(6)
 
 
 def joined(covariance: FloatArray, by_states: FloatArray, first: FloatArray) -> FloatArray:
-    """Return the covariance (n, n) at the start, in which attitude and rate depend on the other states.
+    """Return the covariance (n, n) at the start, if attitude and rate depend on the other states.
 
-    `by_states` (6, n) are the derivatives of the error of the first attitude and rate with respect to the
-    states, and `first` (6, 6) is the covariance of the first attitude and rate for exactly known states.
+    The derivatives of the errors of attitude and rate with respect to the states are `by_states` (6, n). The
+    covariance of attitude and rate for exactly known other states is `first` (6, 6).
     """
     whole = covariance.copy()
     whole[:6] = by_states @ covariance
@@ -175,9 +177,9 @@ def joined(covariance: FloatArray, by_states: FloatArray, first: FloatArray) -> 
 
 
 def gate_bounds(sigma: float) -> dict[int, float]:
-    """Return the bound of the normalised square for 1, 2 and 3 components.
+    """Return the largest accepted normalised square of an innovation with 1, 2 and 3 components.
 
-    A larger square is less likely than a deviation of `sigma` standard deviations in one component.
+    A larger square is less likely than a deviation of one component by `sigma` standard deviations.
     """
     chance = math.erfc(sigma / math.sqrt(2.0))
     return {components: chi_square.bound(chance, components) for components in (1, 2, 3)}
@@ -199,7 +201,10 @@ def _inverted(s: FloatArray) -> FloatArray:
 
 
 def with_role(blocks: Sequence[StateBlock], roles: Mapping[str, Role]) -> list[StateBlock]:
-    """Return the blocks with other roles by name. Raises UsageError for a name without a block."""
+    """Return the blocks with new roles.
+
+    The new roles are given by the name of the block. Raises UsageError for a name without a block.
+    """
     unknown = sorted(roles.keys() - {block.name for block in blocks})
     if unknown:
         raise UsageError(f"the error state has no block {', '.join(unknown)}")

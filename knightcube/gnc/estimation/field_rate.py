@@ -1,12 +1,12 @@
 """The body rate from the magnetometer: an extended Kalman filter of rate, field and field derivative.
 
 Relative to a rotating body, the field direction moves on a cone about the rate vector. The motion of the
-field direction therefore gives all three components of the rate, including the component along the field.
-Only a spin exactly along the field is not observable until the field direction has changed, which it does by
-about two revolutions per orbit. A gyro sample resolves a spin along the field at once. The states, in body
-axes, are the rate w, the field B, the inertial time derivative v of the field, and the errors j of the six
-elements of the inertia tensor. In a fast tumble, an inertia that is wrong by a few per cent causes the
-largest error of the torque model. The equations of motion are
+field direction therefore gives all three components of the rate, including the component along the field. A
+spin exactly along the field is observable only after the field direction has changed, which it does by about
+two revolutions per orbit. A gyro sample resolves a spin along the field at once. The states, in body axes,
+are the rate w, the field B, the inertial time derivative v of the field, and the errors j of the six elements
+of the inertia tensor. In a fast tumble, an inertia that is wrong by a few per cent causes the largest error
+of the torque model. The equations of motion are
 
     J(j) w' = m x B - w x J(j) w,    B' = v - w x B,    v' = -w x v,    j' = 0.
 
@@ -63,7 +63,8 @@ class FieldRateSettings:
         change_start: initial standard deviation of the field's inertial time derivative, T/s.
         change_walk: random walk of the field's inertial time derivative, T/s per sqrt(s).
         torque_walk: random walk of the rate per axis due to unmodelled torques, rad/s per sqrt(s).
-        errors: largest errors of the description of the body, of which those of the inertia are used.
+        errors: largest errors of the description of the body, of which only the errors of the inertia are
+            used.
         inertia_walk: random walk of the inertia, relative to its trace, per sqrt(s).
         gate_sigma: a measurement less likely than a deviation of this many sigma in one component is
             rejected.
@@ -91,8 +92,8 @@ class FieldRateSettings:
 def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatArray:
     """Return the body rate (3,) rad/s that rotated the field `before` into `after`, both (3,) T in body axes.
 
-    Only the rate across the field can be found. It is exact for a steady rotation of less than half a
-    revolution across the field, and zero without a field.
+    The component of the rate along the field is not observable. The rate across the field is exact for a
+    steady rotation of less than half a revolution, and zero without a field.
     """
     rotated = np.cross(after, before)  # the field rotates opposite to the body
     length = float(np.linalg.norm(rotated))
@@ -103,7 +104,7 @@ def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatA
 
 
 class FieldRate:
-    """The rate filter with its count `restarts` of restarts after failed predictions."""
+    """The filter of the rate. The attribute `restarts` counts the restarts after failed predictions."""
 
     def __init__(self, settings: FieldRateSettings) -> None:
         self._settings = settings
@@ -231,11 +232,14 @@ class FieldRate:
         self.restarts += 1
 
     def _weigh(self, innovation: FloatArray, measured: slice, sigma: float) -> Weighed:
-        """Return the weight of an innovation (3,) of the states `measured` with noise `sigma` per axis."""
+        """Return the optimal gain for an innovation (3,) of the states `measured`.
+
+        The noise of the measurement has the standard deviation `sigma` per axis.
+        """
         return weigh(self._covariance, innovation, _EYE[measured], sigma**2 * np.eye(3))
 
     def _correct(self, weighed: Weighed, innovation: FloatArray) -> None:
-        """Correct the state by an innovation (3,) and its weight."""
+        """Correct the state by an innovation (3,) with its optimal gain."""
         assert self._rate is not None
         change = (weighed.gain @ innovation).tolist()
         self._rate = added(self._rate, change[RATE])
@@ -246,17 +250,17 @@ class FieldRate:
         self._update_unexplained()
 
     def _update_unexplained(self) -> None:
-        """Set the standard deviation of the gyroscopic torque, relative to its size, by the inertia's error.
+        """Set the relative standard deviation of the gyroscopic torque from the uncertainty of the inertia.
 
         Without noise of this size, the covariance of the linearised filter would become too small while the
-        inertia is poorly known. The least certain combination of elements is omitted: it is the common scale
-        of the tensor, on which the gyroscopic acceleration does not depend.
+        inertia is poorly known. The least certain combination of the tensor's elements is omitted, because it
+        is the common scale, on which the gyroscopic acceleration does not depend.
         """
         unknown = float(np.linalg.eigvalsh(self._covariance[INERTIA, INERTIA])[-2])
         self._unexplained = math.sqrt(max(unknown, 0.0)) * self._trace / np.diag(self._inertia)
 
     def _start(self, field: FloatArray) -> None:
-        """Start with the rate across the field once three consecutive field samples agree."""
+        """Add a field sample, and start the filter if the last three samples agree."""
         settings = self._settings
         if self._since > settings.longest_gap:
             self._waiting.clear()
@@ -335,7 +339,7 @@ class FieldRate:
         return times(self._inverse_rows, _difference(cross(dipole, field), cross(rate, momentum)))
 
     def _flow(self, rate: Vector, field: Vector, change: Vector, dipole: Vector, dt: float) -> FloatArray:
-        """Return the Jacobian (15, 15) of the change of the states during dt with respect to the states."""
+        """Return the linearised change (15, 15) of the states during `dt`."""
         cross_rate = np.array(skew(rate))
         momentum = times(self._inertia_rows, rate)
         torque = _difference(cross(dipole, field), cross(rate, momentum))

@@ -1,29 +1,34 @@
 """The navigation filter of a free satellite whose body and sensors are not exactly known.
 
 A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
-gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. Unlike
-`attitude_filter`, which replays each late sample at its own time, a late attitude is propagated to the
-present with the present rate, and its innovation includes the error of that rate. This is accurate for some
-seconds, in which the rate of a body that is slow enough for star images is nearly constant.
+gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. The
+module `attitude_filter` replays each late sample at its own time. Here, a late attitude is propagated to the
+present with the present rate, and its innovation includes the error of that rate. This approximation is
+accurate for some seconds, in which the rate of a body that is slow enough for star images is nearly constant.
 
-Besides attitude and rate the error state (`error_state`) holds the errors of the satellite's description:
+Besides attitude and rate, the error state (`error_state`) holds the errors of the satellite's description in
+the following blocks.
 
-- inertia: the errors of the inertia tensor, relative to the trace. Euler's equation is linear in them. A
-  tumble about more than one axis shows the ratios of the moments and the principal axes (Psiaki 2005, JGCD
-  28(4)); the common scale is observable only against the dipole of the coils.
-- coils: the matrix of gains and misalignments of the coils, which adds to the commanded dipole.
-- gyro_matrix, field_matrix: scale factors and misalignments of gyro and magnetometer (Pittelkau 2001, JGCD
-  24(6)).
-- camera: the misalignment of the star camera. The attitude of the star camera is therefore known more
-  accurately than that of the body axes.
-- horizon: the misalignment of the horizon cameras that measure Sun and nadir. Other cameras are used when
-  the body has rotated, so this misalignment is a Gauss-Markov process with a long memory.
-- gyro and magnetometer bias, the residual dipole (a constant part and a part proportional to the sunlight),
-  and the sizes of the disturbance torques of `knightcube.astro.earth.disturbance`.
+The block `inertia` holds the errors of the inertia tensor, relative to the trace. Euler's equation is linear
+in these errors. A tumble about more than one axis shows the ratios of the moments and the principal axes
+(Psiaki 2005, JGCD 28(4)). The common scale of the inertia is observable only against the dipole of the coils.
 
-The error of the field model is a vector that keeps its sign for minutes: a Gauss-Markov process of first
-order in body axes. While the attitude is known accurately, the standard deviation of this error is estimated
-by expectation maximisation (Dempster, Laird & Rubin 1977), from the squared estimate and its variance.
+The block `coils` is the matrix of gains and misalignments of the coils. This matrix times the commanded
+dipole is added to the commanded dipole. The blocks `gyro_matrix` and `field_matrix` hold scale factors and
+misalignments of gyro and magnetometer (Pittelkau 2001, JGCD 24(6)).
+
+The block `camera` is the misalignment of the star camera. The attitude of the star camera is known more
+accurately than the attitude of the body, which has the uncertainty of this misalignment in addition. The
+block `horizon` is the misalignment of the horizon cameras that measure Sun and nadir. When the body rotates,
+other horizon cameras are used, so this misalignment is a Gauss-Markov process with a long memory.
+
+Further blocks are the biases of gyro and magnetometer, the residual dipole in shadow, its increase in
+sunlight, and the sizes of the disturbance torques of `knightcube.astro.earth.disturbance`.
+
+The block `field_error` is the error of the field model. This vector keeps its sign for minutes, and is
+modelled as a Gauss-Markov process of first order in body axes. While the attitude is known accurately, the
+standard deviation of this error is estimated by expectation maximisation (Dempster, Laird & Rubin 1977), from
+the squared estimate and its variance.
 """
 
 from __future__ import annotations
@@ -104,8 +109,8 @@ STATES = FIELD.stop
 class FilterEnvironment:
     """The environment of the satellite at one time, ICRS.
 
-    `field` (3,) T, `position` (3,) m, `pressures` of air and light, and the visible share `sunlit` of the
-    Sun.
+    The environment consists of the magnetic field `field` (3,) T, the `position` (3,) m, the `pressures` of
+    air and sunlight, and the visible fraction `sunlit` of the Sun.
     """
 
     field: FloatArray
@@ -115,10 +120,10 @@ class FilterEnvironment:
 
 
 class FreeMotion:
-    """Euler's equation of a satellite in orbit, whose inertia differs from the assumed one."""
+    """Euler's equation of a satellite in orbit, whose inertia differs from the assumed inertia."""
 
     def __init__(self, inertia: FloatArray) -> None:
-        """`inertia` (3, 3) kg m^2, body axes, is the assumed one."""
+        """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes."""
         self._assumed: FloatArray = np.asarray(inertia, dtype=float)
         self.trace = float(np.trace(self._assumed))
         """Trace of the assumed inertia, kg m^2."""
@@ -127,21 +132,24 @@ class FreeMotion:
         self.correct(np.zeros(6))
 
     def correct(self, error: FloatArray) -> None:
-        """Add to the assumed inertia the error (6,): xx, yy, zz, yz, zx, xy, relative to the trace."""
+        """Set the inertia to the assumed inertia plus an error.
+
+        The error (6,) holds the elements xx, yy, zz, yz, zx and xy of a tensor, relative to the trace.
+        """
         if np.array_equal(error, self._error):
             return
         self._error = error.copy()
         self.inertia: FloatArray = self._assumed + self.trace * tensor(error)
         self.inverse: FloatArray = np.asarray(np.linalg.inv(self.inertia), dtype=float)
         self.by_torque: FloatArray = self.inverse @ self.inverse
-        """Covariance (3, 3) of the acceleration per variance of the torque."""
+        """Covariance (3, 3) of the angular acceleration due to a torque of unit variance per axis."""
 
     def acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
         """Return the angular acceleration (3,) rad/s^2 at a rate (3,) rad/s under a torque (3,) N m."""
         return np.asarray(self.inverse @ (torque - cross_product(rate, self.inertia @ rate)))
 
     def stiffness(self, rate: FloatArray) -> FloatArray:
-        """Return the derivative (3, 3) of the acceleration by the rate (3,) rad/s."""
+        """Return the derivative (3, 3) of the angular acceleration with respect to the rate (3,) rad/s."""
         return np.asarray(
             self.inverse @ (cross_matrix(self.inertia @ rate) - cross_matrix(rate) @ self.inertia)
         )
@@ -154,11 +162,11 @@ class FreeMotion:
         sizes: FloatArray,
         around: FilterEnvironment,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the torque (3,) N m, and the error dynamics without the gyroscopic torque.
+        """Return the external torque (3,) N m, and the error dynamics without the gyroscopic torque.
 
-        `driven` (3,), A m^2, is the commanded dipole of the coils, and `dipole` (3,) that of coils and
-        residual dipole. `sizes` (9,), N m, are the sizes of the disturbance torques. The rows (6, STATES) of
-        the dynamics are those of attitude and rate.
+        The commanded dipole of the coils is `driven` (3,), A m^2. The sum of the estimated dipole of the
+        coils and the residual dipole is `dipole` (3,), A m^2. The sizes of the disturbance torques are
+        `sizes` (9,), N m. The error dynamics (6, STATES) are the rows for attitude and rate.
         """
         to_body = attitude_matrix(quaternion)
         field, position = to_body @ around.field, to_body @ around.position
@@ -180,13 +188,16 @@ class FreeMotion:
         return torque, flow
 
     def by_inertia(self, rate: FloatArray, acceleration: FloatArray) -> FloatArray:
-        """Return the derivative (3, 6) of the acceleration by the inertia's error, without gravity."""
+        """Return the derivative (3, 6) of the angular acceleration with respect to the inertia's error.
+
+        The gravity gradient is not included.
+        """
         changed = by_inertia(acceleration) + cross_matrix(rate) @ by_inertia(rate)
         return np.asarray(-self.trace * self.inverse @ changed)
 
 
 def by_matrix(vector: FloatArray) -> FloatArray:
-    """Return the derivative (3, 9) of M v by the elements of M (3, 3), row by row, for a vector (3,)."""
+    """Return the derivative (3, 9) of M v, for a vector v (3,), with respect to the rows of M (3, 3)."""
     rows = np.zeros((3, 3, 3))
     rows[_AXES, _AXES] = vector
     return rows.reshape(3, 9)
@@ -200,9 +211,9 @@ _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 LASTING = 20.0
 """Correlation time (s) of unmodelled errors of the coils, which scales the white noise that models them."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
-"""Expected sizes of the torques, relative to the size of the torque by air. The constant torque is small,
-because the inertia has its own states. At one attitude the torques cannot be
-distinguished, and a torque by air that is attributed to the constant torque is wrong at every other
+"""Expected sizes of the constant torque and of the torques by air and sunlight, relative to that by air. The
+constant torque is small, because the error of the inertia has its own states. At one attitude the torques
+cannot be distinguished, and a torque by air that is attributed to the constant torque is wrong at every other
 attitude."""
 PLAUSIBLE = 4.0
 """Largest plausible deviation of a slow state, in standard deviations at the start."""
@@ -212,29 +223,34 @@ PLAUSIBLE = 4.0
 class FreeFilterSettings:
     """Noise and limits of the filter.
 
-    A pair of values is the standard deviation at the start and the random walk per sqrt(s).
+    Each pair of values holds the standard deviation at the start and the random walk per sqrt(s).
 
     Attributes:
-        gyro: rad/s, gyro bias.
-        dipole, sunlit: A m^2, residual dipole: constant part, and part in sunlight.
-        magnet: T, magnetometer bias.
-        field: T per axis, error of the field model before it is learned.
-        field_memory: s, correlation time of the error of the field model.
-        torque: N m, size of the torque by air; the sizes of the other torques follow from the ratios of this
-            module.
-        torque_noise: N m sqrt(s), white noise of all other torques.
-        coil_error: relative error of the coils' dipole for tens of seconds, in any direction, in addition to
-            the constant matrix of the coils.
-        coil_noise: A m^2 sqrt(s), white noise of each coil while the coils are driven.
-        coil_walk: random walk of the matrix of the coils per sqrt(s), for example by their temperature.
-        inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s). It bounds the
-            accuracy that is claimed for the inertia, where flexible parts matter that Euler's equation of a
-            rigid body does not contain.
+        gyro: standard deviation and random walk of the gyro bias, rad/s.
+        dipole, sunlit: standard deviation and random walk of the residual dipole in shadow, and of its
+            increase in sunlight, A m^2.
+        magnet: standard deviation and random walk of the magnetometer bias, T.
+        field: standard deviation of the field model's error before it is learned, T per axis.
+        field_memory: correlation time of the field model's error, s.
+        torque: expected size and random walk of the torque by air, N m. The sizes of the other torques follow
+            from the ratios of this module.
+        torque_noise: density of the white noise of all other torques, N m sqrt(s).
+        coil_error: relative error of the coils' dipole in any direction that lasts for tens of seconds, in
+            addition to the constant matrix of the coils.
+        coil_noise: density of the white noise of each coil's dipole while the coils are driven, A m^2
+            sqrt(s).
+        coil_walk: random walk of the elements of the coils' matrix per sqrt(s), for example due to
+            temperature.
+        inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s). This random walk
+            limits the claimed accuracy of the inertia, because flexible parts are not contained in Euler's
+            equation of a rigid body.
         errors: largest errors of the description of body and sensors.
-        roles: roles of blocks of the error state, by name, that differ from the default.
-        rate_start: rad/s, error of the first rate.
-        fine, coarse: rad, largest sigma of the worst axis of a fine and of a coarse attitude.
-        gate_sigma: gate; a measurement less likely than this many sigma of one component is refused.
+        roles: roles of the blocks of the error state whose role differs from the default, by name of the
+            block.
+        rate_start: standard deviation of the first rate, rad/s.
+        fine, coarse: largest standard deviation about the worst axis of a fine and of a coarse attitude, rad.
+        gate_sigma: a measurement less likely than a deviation of this many sigma in one component is
+            rejected.
     """
 
     gyro: tuple[float, float] = (1e-3, 2e-6)
@@ -285,7 +301,7 @@ _UNIFORM = 1.0 / math.sqrt(3.0)
 
 
 def _matrix_errors(scale: float, alignment: float) -> FloatArray:
-    """Return the standard deviations (9,) of a matrix, from largest errors on and off the diagonal."""
+    """Return standard deviations (9,) from the largest errors on and off the diagonal of a matrix."""
     return _UNIFORM * np.where(np.eye(3, dtype=bool), scale, alignment).ravel()
 
 
@@ -294,12 +310,13 @@ LARGEST_ROTATION = 0.1
 FIELD_LEARNED = 2_000.0
 """Time (s) over which the size of the field model's error is averaged."""
 HORIZON_MEMORY = 3_000.0
-"""Correlation time (s) of the misalignment of the horizon cameras in use."""
+"""Correlation time (s) of the misalignment of the horizon cameras."""
 MINIMUM_FIELD_ERROR = 1e-8
-"""Minimum error (T per axis) of the field model, equal to the variation of the magnetometer's own errors."""
+"""Minimum standard deviation (T per axis) of the field model's error, which also represents slow variations
+of the magnetometer's errors."""
 CURRENTS = 1e-7
-"""Error (T per axis) of the field model due to auroral currents, which must not cause the rejection of a
-measurement."""
+"""Standard deviation (T per axis) of the field by auroral currents, which must not lead to rejected
+measurements."""
 AIR_WALK = 6e-3
 """Random walk of the air density, relative to the density, per sqrt(s): 15 % in ten minutes."""
 _EYE: FloatArray = np.eye(3)
@@ -309,7 +326,7 @@ _FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlowStates:
-    """The slow states: `values` (n,) and their covariance (n, n), in the order of `SLOW`."""
+    """The `values` (n,) and the covariance (n, n) of the slow states, in the order of the slice `SLOW`."""
 
     values: FloatArray
     covariance: FloatArray
@@ -317,7 +334,7 @@ class SlowStates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeMemory:
-    """A copy of the estimate: the attributes of the filter with the same names."""
+    """A copy of the filter's attributes that form the estimate."""
 
     quaternion: FloatArray
     rate: FloatArray
@@ -328,24 +345,25 @@ class FreeMemory:
 
 
 class FreeFilter:
-    """Owns the estimate. `refused` counts the measurements that did not pass the gate.
+    """The filter, with the present estimate.
 
     Attributes:
         layout: the declared error state.
-        quaternion: (4,) ICRS into body.
-        rate: (3,) rad/s, body axes.
-        acceleration: (3,) rad/s^2, body axes, of the last step.
-        covariance: (STATES, STATES) of the error state (ATTITUDE, RATE, ...).
-        field_error: T per axis, standard deviation of the field model's error.
-        changes: number of changes of the estimate.
+        quaternion: attitude (4,), from ICRS into body axes.
+        rate: body rate (3,) in body axes, rad/s.
+        acceleration: angular acceleration (3,) in body axes during the last step, rad/s^2.
+        covariance: covariance (STATES, STATES) of the error state.
+        field_error: standard deviation of the field model's error, T per axis.
+        changes: number of changes of the estimate so far. refused: number of measurements that did not pass
+            the gate.
     """
 
     def __init__(
         self, inertia: FloatArray, settings: FreeFilterSettings, slow: SlowStates | None = None
     ) -> None:
-        """Use `inertia` (3, 3) kg m^2, body axes.
+        """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes.
 
-        `slow` is the prior of the slow states, by default the settings.
+        The prior of the slow states is `slow`, and by default follows from the settings.
         """
         self.motion = FreeMotion(inertia)
         self.layout = settings.error_state(inertia)
@@ -353,8 +371,10 @@ class FreeFilter:
         self._gates = gate_bounds(settings.gate_sigma)
         self._constants: FloatArray = np.zeros(STATES)
         self.acceleration: FloatArray = np.zeros(3)
-        self._slope: FloatArray = np.zeros((3, STATES))  # derivative of the acceleration by the states
-        self._lag: FloatArray = np.zeros(3)  # integral (rad) of the present rate less the past rate
+        self._slope: FloatArray = np.zeros(
+            (3, STATES)
+        )  # derivative of the angular acceleration with respect to the states
+        self._lag: FloatArray = np.zeros(3)  # integral (rad) of the present rate minus the past rate
         self._since = 0.0  # time (s) over which `_lag` is integrated
         self.started = False
         self.refused = 0
@@ -378,9 +398,9 @@ class FreeFilter:
     ) -> None:
         """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro rate (3,) rad/s.
 
-        The attitude is that of the star camera if `by_stars`, else that of the horizon cameras. The slow
-        states are kept. If the estimate was contradicted (`doubted`), their covariance is reset to the values
-        of the settings, and implausible values are set to zero.
+        With `by_stars` the attitude was measured by the star camera, otherwise by the horizon cameras. The
+        slow states are kept. If the previous estimate was contradicted (`doubted`), the covariance of the
+        slow states is reset to that of the settings, and implausible values of slow states are set to zero.
         """
         self.changes += 1
         if doubted:
@@ -389,7 +409,7 @@ class FreeFilter:
             self.covariance[SLOW, SLOW] = prior
             self.field_error = max(self.field_error, self._settings.field)
             self._reset_field()
-        # The error of the first attitude and rate by the errors of the states that map them to readings.
+        # The first attitude and rate depend on misalignments, gyro bias and gyro matrix.
         first = np.zeros((6, STATES))
         misaligned = CAMERA if by_stars else HORIZON
         self.quaternion = multiply(from_rotation_vector(-self._constants[misaligned]), quaternion)
@@ -405,7 +425,7 @@ class FreeFilter:
 
     @property
     def knowledge(self) -> Knowledge:
-        """Accuracy with which the attitude is known."""
+        """Accuracy class of the attitude."""
         if not self.started or (sigma := self.worst_sigma) > self._settings.coarse:
             return Knowledge.LOST
         return Knowledge.FINE if sigma <= self._settings.fine else Knowledge.COARSE
@@ -418,7 +438,7 @@ class FreeFilter:
 
     @property
     def camera_covariance(self) -> FloatArray:
-        """Covariance (3, 3) rad^2 of the attitude of the star camera, body axes."""
+        """Covariance (3, 3) of the attitude of the star camera in body axes, rad^2."""
         return np.asarray(_CAMERA_ROWS @ self.covariance @ _CAMERA_ROWS.T)
 
     @property
@@ -443,11 +463,13 @@ class FreeFilter:
     def renew_coils(
         self, coils: Sequence[int], deviations: FloatArray, memories: Sequence[FreeMemory] = ()
     ) -> None:
-        """Reset the matrix of some coils to that of new coils, in the estimate and in its copies `memories`.
+        """Reset the learned matrix for the coils with the indices `coils`.
 
-        The dipoles of these coils were corrected, so that their learned matrix refers to other dipoles.
-        The columns of the matrix become zero, without correlations to other states. The standard deviation of
-        each element is that of the settings; on the diagonal it is at least `deviations` (3,).
+        The estimate and its copies `memories` are changed. This is necessary after the sign or the gain of a
+        coil was corrected, because the learned matrix refers to the dipole before the correction. The columns
+        of these coils become zero, and their correlations with other states are deleted. The standard
+        deviation of each element becomes that of the settings, and on the diagonal at least `deviations`
+        (3,).
         """
         self.changes += 1
         prior = self.layout.prior
@@ -485,14 +507,15 @@ class FreeFilter:
         return _EYE + self._matrix(COILS)
 
     def description(self) -> dict[str, FloatArray]:
-        """Return the estimated description of body and sensors, and its standard deviations.
+        """Return the estimated description of body and sensors with standard deviations, by name.
 
-        `inertia` (6,) kg m^2 holds xx, yy, zz, yz, zx and xy. `coils`, `gyro` and `field` (9,) are matrices,
-        row by row. `camera` (3,) rad is the rotation vector of the star camera, and `dipole` and
-        `sunlit_dipole` (3,) A m^2 are the parts of the residual dipole. The standard deviations have the same
-        names with `_sigma`. `camera_attitude_sigma` (3,) rad is that of the attitude of the star camera,
-        which is known more accurately than the attitude of the body. `inertia_ratio_sigma` and
-        `coils_ratio_sigma` are those of `per_trace`.
+        The inertia `inertia` (6,), kg m^2, holds the elements xx, yy, zz, yz, zx and xy of the tensor. The
+        entries `coils`, `gyro` and `field` (9,) are the matrices of coils, gyro and magnetometer, row by row.
+        `camera` (3,) rad is the rotation vector of the star camera, and `dipole` and `sunlit_dipole` (3,) A
+        m^2 are the parts of the residual dipole. The name of each standard deviation ends with `_sigma`. The
+        standard deviation of the attitude of the star camera is `camera_attitude_sigma` (3,), rad; it is
+        smaller than that of the attitude of the body. The standard deviations of inertia and coils relative
+        to the trace (`per_trace`) are `inertia_ratio_sigma` and `coils_ratio_sigma`.
         """
         self.motion.correct(self._constants[INERTIA])
         sigma = np.sqrt(self.covariance.diagonal())
@@ -512,7 +535,9 @@ class FreeFilter:
             found |= {name: self._constants[at].copy(), f"{name}_sigma": sigma[at]}
         rows = per_trace(found["inertia"] / self.motion.trace, found["coils"])
         variances = (rows @ self.covariance[_BODY, _BODY] @ rows.T).diagonal()
-        ratios = np.sqrt(np.maximum(variances, 0.0))  # rounding makes the variance of a known ratio negative
+        ratios = np.sqrt(
+            np.maximum(variances, 0.0)
+        )  # rounding can make the variance of a known ratio negative
         return found | {
             "camera_attitude_sigma": np.sqrt(self.camera_covariance.diagonal()),
             "inertia_ratio_sigma": ratios[:6],
@@ -520,15 +545,16 @@ class FreeFilter:
         }
 
     def residual_dipole(self, sunlit: float) -> FloatArray:
-        """Return the residual dipole (3,) A m^2, body axes, for the visible share `sunlit` of the Sun."""
+        """Return the residual dipole (3,) A m^2, body axes, for the visible fraction `sunlit` of the Sun."""
         return np.asarray(self._constants[DIPOLE] + sunlit * self._constants[SUNLIT])
 
     def advance(
         self, seconds: float, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0
     ) -> None:
-        """Propagate by `seconds`, a second or two, under the commanded dipole (3,) A m^2, body axes.
+        """Propagate by one or two `seconds` under the commanded dipole (3,) A m^2, body axes.
 
-        `doubt` A m^2 is the standard deviation per axis of the dipole, if it may differ from the command.
+        The value `doubt` (A m^2) is the standard deviation per axis of a dipole that may differ from the
+        command.
         """
         speed = math.sqrt(float(self.rate @ self.rate))
         steps = max(1, math.ceil(speed * seconds / LARGEST_ROTATION))
@@ -536,17 +562,17 @@ class FreeFilter:
             self._step(seconds / steps, dipole, around, doubt)
 
     def begin_mean(self) -> None:
-        """Begin the interval over which the next gyro rate is a mean."""
+        """Begin the interval over which gyro samples are averaged."""
         self._lag, self._since = np.zeros(3), 0.0
 
     def gyro(
         self, rate: FloatArray, covariance: FloatArray, change: FloatArray | None = None, since: float = 0.0
     ) -> bool:
-        """Apply a gyro rate (3,) rad/s with its covariance (3, 3); return whether it passed the gate.
+        """Apply a gyro rate (3,) rad/s with covariance (3, 3), and return whether the rate passed the gate.
 
-        For a mean over the past, `change` (3,) rad/s is the change of the rate since the middle of the mean,
-        `since` s ago, by the acceleration of the last step. The curvature of the rate since `begin_mean` is
-        added here.
+        If the gyro rate is an average over an interval, `change` (3,) rad/s is the change of the rate since
+        the middle of the interval, `since` s ago, due to the acceleration of the last step. This method adds
+        the effect of the changing acceleration since `begin_mean`.
         """
         matrix = _EYE + self._matrix(GYRO_MATRIX)
         then = self.rate
@@ -561,9 +587,9 @@ class FreeFilter:
         return self._update(rate - matrix @ then - self._constants[GYRO], rows, covariance)
 
     def mean_rate(self, rate: FloatArray, covariance: FloatArray, change: FloatArray) -> bool:
-        """Apply a rate (3,) rad/s by the star camera, free of gyro bias, with its covariance (3, 3).
+        """Apply a rate (3,) rad/s that the star camera measured, with its covariance (3, 3).
 
-        `change` (3,) rad/s is the change of the rate since then.
+        The change of the rate since the measurement is `change` (3,), rad/s.
         """
         rows = np.zeros((3, STATES))
         rows[:, RATE], rows[:, CAMERA] = _EYE, cross_matrix(self.rate)
@@ -573,9 +599,10 @@ class FreeFilter:
     def attitude(
         self, quaternion: FloatArray, covariance: FloatArray, age: float = 0.0, *, by_stars: bool = True
     ) -> bool:
-        """Apply an attitude (4,) of the star camera, or else of the horizon cameras, measured `age` s ago.
+        """Apply an attitude (4,) measured `age` s ago.
 
-        `covariance` (3, 3) rad^2 is in the present body axes.
+        With `by_stars` the attitude was measured by the star camera, otherwise by the horizon cameras. The
+        covariance (3, 3), rad^2, is given in the present body axes.
         """
         since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self.acceleration)
         rows = np.zeros((3, STATES))
@@ -588,7 +615,11 @@ class FreeFilter:
         return self._update(to_rotation_vector(error), rows, covariance)
 
     def direction(self, observed: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
-        """Apply a direction: unit vectors (3,) in body axes and ICRS, covariance (3, 3) rad^2, body axes."""
+        """Apply an observed direction.
+
+        The unit vector `observed` (3,) is given in body axes with a covariance (3, 3), rad^2. The unit vector
+        `reference` (3,) is the true direction in ICRS.
+        """
         expected = attitude_matrix(self.quaternion) @ reference
         across = tangent_basis(expected)
         rows = np.zeros((2, STATES))
@@ -597,7 +628,10 @@ class FreeFilter:
         return self._update(across @ observed - offset, rows, across @ covariance @ across.T)
 
     def field(self, measured: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
-        """Apply the field (3,) T, body axes, with its model (3,) T, ICRS, and covariance (3, 3) T^2."""
+        """Apply a measured magnetic field (3,) T in body axes, with its covariance (3, 3) T^2.
+
+        The field model gives the field `reference` (3,) T in ICRS.
+        """
         expected = attitude_matrix(self.quaternion) @ reference
         matrix = _EYE + self._matrix(FIELD_MATRIX)
         rows = np.zeros((3, STATES))
@@ -610,13 +644,13 @@ class FreeFilter:
         return self._constants[at].reshape(3, 3)
 
     def _reset_field(self) -> None:
-        """Forget the error of the field model except for its size."""
+        """Set the field model's error to zero, with its present standard deviation."""
         self._constants[FIELD] = 0.0
         self.covariance[FIELD] = self.covariance[:, FIELD] = 0.0
         self.covariance[FIELD, FIELD] = self.field_error**2 * _EYE
 
     def _propagate_field_error(self, dt: float) -> None:
-        """Let the error of the field model decay, and learn its size while the attitude is fine."""
+        """Let the field model's error decay, and learn its standard deviation while the attitude is fine."""
         covariance, error = self.covariance, self._constants[FIELD]
         if self.worst_sigma <= self._settings.fine:
             square = (float(error @ error) + float(covariance[FIELD, FIELD].trace())) / 3.0
@@ -629,7 +663,7 @@ class FreeFilter:
         covariance.reshape(-1)[_FIELD_DIAGONAL] += (1.0 - kept**2) * self.field_error**2
 
     def _propagate_horizon(self, dt: float) -> None:
-        """Let the misalignment of the horizon cameras change to that of other cameras."""
+        """Propagate the Gauss-Markov process of the horizon cameras' misalignment."""
         kept = math.exp(-dt / HORIZON_MEMORY)
         self._constants[HORIZON] *= kept
         self.covariance[HORIZON] *= kept
@@ -637,7 +671,7 @@ class FreeFilter:
         self.covariance[HORIZON, HORIZON] += (1.0 - kept**2) * self.layout.prior[HORIZON, HORIZON]
 
     def _step(self, dt: float, driven: FloatArray, around: FilterEnvironment, doubt: float) -> None:
-        """Take one step of the midpoint rule, with its covariance."""
+        """Propagate state and covariance by one step of the midpoint rule."""
         self.changes += 1
         motion, rate = self.motion, self.rate
         motion.correct(self._constants[INERTIA])
@@ -652,7 +686,7 @@ class FreeFilter:
         flow[3:6, INERTIA] += motion.by_inertia(half, acceleration)
         self._slope = flow[3:6].copy()
         after = rate + dt * acceleration
-        # The integral of a rate whose acceleration changes linearly from `first` over the middle.
+        # This is the integral of the rate for an acceleration that changes linearly during the step.
         swept = dt * (0.5 * (rate + after) - dt / 6.0 * (acceleration - first))
         # The rate changes its direction during the step (Bortz 1971, to second order).
         rotation = from_rotation_vector(swept + dt * dt / 12.0 * cross_product(rate, after))
@@ -668,7 +702,11 @@ class FreeFilter:
         self._propagate_horizon(dt)
 
     def rate_noise(self, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0) -> FloatArray:
-        """Return the noise density (3, 3) rad^2/s^3 of the acceleration for the coils' dipole (3,) A m^2."""
+        """Return the noise density (3, 3) of the angular acceleration, rad^2/s^3.
+
+        It depends on the coils' dipole (3,) A m^2, and on the standard deviation `doubt` (A m^2) of an
+        uncertain dipole.
+        """
         settings, motion, square = self._settings, self.motion, float(dipole @ dipole)
         coils = LASTING * (settings.coil_error**2 * square / 3.0 + doubt**2)
         coils += settings.coil_noise**2 if square else 0.0
@@ -680,7 +718,10 @@ class FreeFilter:
         return np.asarray(density)
 
     def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:
-        """Correct by an innovation (k,), rows (k, STATES) and noise (k, k); return whether it passed."""
+        """Apply an innovation (k,), and return whether it passed the gate.
+
+        The innovation has the Jacobian `rows` (k, STATES) and the noise covariance `noise` (k, k).
+        """
         square, gain, cross, spread = weigh(self.covariance, value, rows, noise)
         if not 0.0 <= square <= self._gates[len(value)]:  # a NaN does not pass
             self.refused += 1
@@ -700,11 +741,12 @@ _CAMERA_ROWS[:, ATTITUDE] = _CAMERA_ROWS[:, CAMERA] = _EYE
 
 
 def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
-    """Return the Jacobian (15, 15) of the inertia and the matrix of the coils, both divided by the trace.
+    """Return the Jacobian (15, 15) of inertia and coils, each divided by the trace of the inertia.
 
-    `inertia` (6,) holds the elements xx, yy, zz, yz, zx and xy, relative to the trace of the assumed inertia,
-    and `coils` (9,) the matrix row by row. The motion of a satellite shows these ratios only, because a body
-    of twice the inertia with coils of twice the dipole moves in the same way.
+    The array `inertia` (6,) holds the elements xx, yy, zz, yz, zx and xy, relative to the trace of the
+    assumed inertia. The array `coils` (9,) holds the matrix of the coils row by row. The motion of a
+    satellite shows only these ratios, because a body with twice the inertia and twice the dipole moves in the
+    same way.
     """
     trace = inertia[:3].sum()
     rows: FloatArray = np.eye(15) / trace
@@ -714,9 +756,9 @@ def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
 
 
 def density_walk(sizes: FloatArray) -> FloatArray:
-    """Return the covariance (9, 9) by which the sizes (9,) of the torques change in a second with the air.
+    """Return the increase (9, 9) per second of the covariance of the torque sizes (9,).
 
-    The random walk of the density is relative, so that it scales with the torque by air.
+    The random walk of the air density is relative, so its effect is proportional to the torque by air.
     """
     walk = np.zeros((SIZES, SIZES))
     walk[AIR, AIR] = AIR_WALK**2 * np.outer(sizes[AIR], sizes[AIR])
@@ -724,5 +766,5 @@ def density_walk(sizes: FloatArray) -> FloatArray:
 
 
 def plausible(values: FloatArray, variances: FloatArray) -> BoolArray:
-    """Return which `values` (k,) of slow states are plausible under their `variances` (k,) at the start."""
+    """Return flags (k,): whether each slow state is plausible for its variance at the start."""
     return np.asarray(np.abs(values) <= PLAUSIBLE * np.sqrt(variances))

@@ -82,10 +82,10 @@ class DirectionMeasurement(_AtOneTime):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldMeasurement(_AtOneTime):
-    """A field (3,) T measured by a magnetometer, with bias, in body axes, and the model's `reference` (3,) T.
+    """A magnetic field (3,) T measured in body axes, which contains the magnetometer's bias.
 
-    `covariance` (3, 3) T^2 is the covariance of the white noise in body axes; the filter estimates the
-    constant error.
+    The field model gives the field `reference` (3,), T, in reference axes. The white noise of the measurement
+    has the covariance `covariance` (3, 3), T^2, in body axes. The filter estimates the bias.
     """
 
     time_ns: int

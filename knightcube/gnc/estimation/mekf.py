@@ -101,7 +101,7 @@ def rate_change(
 
 
 def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[Vector, FloatArray]:
-    """Return innovation and Jacobian of a quantity that changes by `change` per second, corrected for age.
+    """Return innovation and Jacobian, corrected for age, of a quantity that changes by `change` per second.
 
     `more` (s) is the estimated age minus the assumed age that was subtracted from the time stamp.
     """
@@ -209,7 +209,7 @@ def _field(state: FilterState, measurement: FieldMeasurement, size: int) -> Inno
 
 @functools.cache
 def _rows(firsts: tuple[int, ...], size: int) -> FloatArray:
-    """Return the Jacobian (3, size) of the sum of the error components that begin at the indices `firsts`."""
+    """Return the Jacobian (3, size) of a sum of states, which begin at the indices `firsts`."""
     rows = np.zeros((3, size))
     for first in firsts:
         rows[:, first : first + 3] += _EYE
@@ -217,7 +217,7 @@ def _rows(firsts: tuple[int, ...], size: int) -> FloatArray:
 
 
 def weigh_innovation(found: Innovation, covariance: FloatArray) -> Weighed:
-    """Return the weight of an innovation against the covariance of the state."""
+    """Return the optimal gain for an innovation and the covariance of the state."""
     return weigh(covariance, np.array(found.value), found.rows, found.noise)
 
 

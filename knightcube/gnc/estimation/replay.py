@@ -71,7 +71,7 @@ class CommandHistory:
         self._torquings[first:] = [replace(torquing, known=False) for torquing in self._torquings[first:]]
 
     def at(self, time_ns: int) -> Torquing:
-        """Return the coil dipole, field and flags (`Torquing`) that apply at a time."""
+        """Return the coils' dipole and field at a time, as `Torquing`."""
         index = max(bisect.bisect_right(self._times, time_ns) - 1, 0)
         return self._torquings[index] if self._torquings else self.idle
 
@@ -171,7 +171,7 @@ class PropagationModel:
 
 
 class Replay:
-    """An application of measurements in order of time that collects its results in `checkpoints`."""
+    """A replay of measurements in order of time, with its results in `checkpoints`."""
 
     def __init__(
         self, model: PropagationModel, start: Checkpoint, measurements: Sequence[Measurement]

@@ -54,10 +54,10 @@ from knightcube.gnc.estimation.estimate import (
 
 @dataclass(frozen=True, slots=True)
 class Torquing:
-    """The coils' dipole moment (A m^2, body axes), the field (T, reference axes) and a flag per driven coil.
+    """The coils' dipole moment (A m^2, body axes) and the magnetic field (T, reference axes).
 
-    `known` is false while any coil may carry an unknown current, for example while the PWM chip does not
-    respond to commands.
+    The vector `driven` is 1 for each driven coil and 0 for other coils. The flag `known` is false while any
+    coil may carry an unknown current, for example while the PWM chip does not respond to commands.
     """
 
     dipole: Vector
@@ -67,7 +67,10 @@ class Torquing:
 
 
 class Accelerated(NamedTuple):
-    """Angular acceleration w' (rad/s^2) and its derivatives (3, 3) by torsion, damping and coil gain."""
+    """Angular acceleration w' (rad/s^2) and its derivatives (3, 3).
+
+    The derivatives are those with respect to torsion, damping and coil gain.
+    """
 
     acceleration: Vector
     by_parameters: Matrix
@@ -157,8 +160,8 @@ class RigidBody:
     ) -> Linearised:
         """Return the angular acceleration under `torquing` at attitude q, with its derivatives.
 
-        The gyroscopic torque is computed for the rate `ahead` seconds later. The midpoint step of a tumbling
-        body is then of second order.
+        The gyroscopic torque is computed for the rate `ahead` seconds later. The error of the midpoint rule
+        for a tumbling body is then of third order per step.
         """
         x, y, z = times(self._response, self._gyroscopic(rate))
         rate = (rate[0] + ahead * x, rate[1] + ahead * y, rate[2] + ahead * z)
@@ -325,7 +328,7 @@ class BodyErrors:
 
 
 def rate_products(rates: FloatArray) -> FloatArray:
-    """Return the products xx, yy, zz, yz, zx and xy (n, 6) of the components of rates (n, 3)."""
+    """Return the products xx, yy, zz, yz, zx and xy (n, 6) of the components of the rates (n, 3)."""
     return rates[:, _FIRST] * rates[:, _SECOND]
 
 
@@ -360,7 +363,10 @@ def tensor(elements: FloatArray) -> FloatArray:
 
 
 def by_inertia(vector: FloatArray) -> FloatArray:
-    """Return the derivative (3, 6) of J v by the elements xx, yy, zz, yz, zx, xy of J, for a vector (3,)."""
+    """Return the derivative (3, 6) of J v for a vector v (3,).
+
+    The derivative is that with respect to the elements xx, yy, zz, yz, zx and xy of J.
+    """
     x, y, z = vector.tolist()
     return np.array(((x, 0.0, 0.0, 0.0, z, y), (0.0, y, 0.0, z, 0.0, x), (0.0, 0.0, z, y, x, 0.0)))
 
@@ -368,7 +374,7 @@ def by_inertia(vector: FloatArray) -> FloatArray:
 def inertia_covariance(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
     """Return the covariance (6, 6) of the elements xx, yy, zz, yz, zx, xy of a tensor, relative to its trace.
 
-    It is that of random tensors near an assumed `inertia` (3, 3), drawn with a fixed seed.
+    The covariance is computed from random tensors near an assumed `inertia` (3, 3), drawn with a fixed seed.
     """
     tensors = _random_tensors(inertia, errors, np.random.default_rng(0))
     changes = (tensors - inertia)[:, _FIRST, _SECOND] / np.trace(inertia)
