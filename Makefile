@@ -89,7 +89,7 @@ fast: $(TOOLS)  ## the tests that are not slow, on all cores
 explore: $(TOOLS) ## the property tests with new random examples; `make test` draws the same ones each time
 	$(TESTS) --dist worksteal -m hypothesis --hypothesis-profile explore
 
-slow-list: $(TOOLS)  ## measure every test alone and write tests/slow.txt
+slow-list: $(TOOLS)  ## measure every test alone and write tests/slow.txt and tests/order.txt
 	$(RUN) -m pytest --write-slow-list
 
 pictures: $(TOOLS) ## the README's pictures

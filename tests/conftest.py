@@ -1,9 +1,9 @@
-"""Marks as slow the tests listed in tests/slow.txt, and collects the files with the longest tests first.
+"""Marks as slow the tests listed in tests/slow.txt, and collects the files in the order of tests/order.txt.
 
-`make slow-list` measures and writes the list. A test is listed with its processor time in seconds if all its
-cases together take more than `LIMIT_S`, fixtures included. `make quick` leaves slow tests out; a listed test
-that was renamed is not slow until the list is made again. With the longest files first, the cores that share
-the files of `make test` finish at nearly the same time.
+`make slow-list` measures and writes both lists. A test is slow if all its cases together take more than
+`LIMIT_S` of processor time, fixtures included. `make quick` leaves slow tests out; a listed test that was
+renamed is not slow until the list is made again. Files that take more than `LONG_S` come first, in falling
+order: then the workers that share the files of `make test` finish at nearly the same time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ settings.register_profile("explore", deadline=None)
 settings.load_profile("repeatable")
 
 LIMIT_S = 0.3
+LONG_S = 1.0
 LIST = Path(__file__).with_name("slow.txt")
+ORDER = Path(__file__).with_name("order.txt")
 _spent: dict[str, float] = {}
 
 
@@ -51,17 +53,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark what the list names, and order the files by their listed processor time."""
-    lines = LIST.read_text(encoding="utf-8").splitlines() if LIST.exists() else []
-    listed = {name: float(spent) for name, _, spent in (line.rpartition(" ") for line in lines)}
-    of_file: dict[str, float] = {}
-    for name, spent in listed.items():
-        file = name.partition("::")[0]
-        of_file[file] = of_file.get(file, 0.0) + spent
+    """Mark the listed tests as slow, and put the files that take longest first."""
+    listed, of_file = _seconds(LIST), _seconds(ORDER)
     for item in items:
         if _function(item) in listed:
             item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: -of_file.get(item.nodeid.partition("::")[0], 0.0))
+
+
+def _seconds(path: Path) -> dict[str, float]:
+    """Return the processor time (s) of each test or test file of a list."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return {name: float(spent) for name, _, spent in (line.rpartition(" ") for line in lines)}
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -74,10 +77,17 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Write the list when asked to."""
+    """Write both lists when asked to."""
     if session.config.getoption("--write-slow-list"):
         slow = sorted(f"{name} {spent:.1f}" for name, spent in _spent.items() if spent > LIMIT_S)
         LIST.write_text("\n".join(slow) + "\n", encoding="utf-8")
+        of_file: dict[str, float] = {}
+        for name, spent in _spent.items():
+            file = name.partition("::")[0]
+            of_file[file] = of_file.get(file, 0.0) + spent
+        longest = sorted(of_file.items(), key=lambda entry: -entry[1])
+        lines = [f"{file} {spent:.0f}\n" for file, spent in longest if spent > LONG_S]
+        ORDER.write_text("".join(lines), encoding="utf-8")
 
 
 def _function(item: pytest.Item) -> str:
