@@ -184,6 +184,14 @@ def test_a_file_is_replaced_only_with_force(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path], "no temporary file remains"
 
 
+def test_a_folder_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").mkdir()
+    done = command("new-satellite", *GIVEN, "--out", tmp_path / "mine.yaml", "--force")
+    assert done.returncode == 2
+    assert "mine.yaml: cannot be written: Is a directory" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
+
+
 def test_weak_coils_are_warned_of(tmp_path: Path) -> None:
     words = ("--mass", "12", "--size", "6u", "--altitude", "250", "--coil", _coil(0.02, 0.1, 40.0))
     facts = json.loads(command("new-satellite", *words, "--out", tmp_path / "m.yaml", "--json").stdout)
