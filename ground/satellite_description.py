@@ -1,8 +1,9 @@
 """Configuration file of a satellite that is described by mass, size, orbit, coils and cameras.
 
 The file extends the configuration `orbit` (a 1U CubeSat) and states the values that differ. Values that
-follow from the description are computed: the inertia is that of a homogeneous cuboid, and weights and limits
-are scaled between those of the configurations `orbit` and `orbit_3u`.
+follow from the description are computed: the inertia is that of a homogeneous cuboid, and limits are scaled
+between those of the configurations `orbit` and `orbit_3u`. Weights and noises that the flight application
+computes from craft and coils are omitted.
 """
 
 from __future__ import annotations
@@ -34,8 +35,6 @@ _CURRENT_ERROR, _CURRENT_SIGMA = 3.5e-3 / 0.148, 2.0e-3 / 0.148
 """Bound of the simulated current error, and assumed noise, relative to the limit [as in `orbit`]."""
 _STRAY_FIELD = 7.4e-5
 """Field (T) of a coil at the magnetometer at the current limit [as in `orbit`]."""
-_KNIGHTCUBE_INERTIA = 1.047e-3
-"""Mean moment of inertia of the configuration `orbit`, kg m^2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +96,7 @@ class Derived:
         slow_within: estimated limit of the time of detumbling, s.
         duration: duration of the flight, s.
         detumble_horizon: planning horizon of detumbling, s.
-        slew: duration of a slew, s.
-        pointing_dipole: dipole whose cost equals that of an attitude error of 1 deg, A m^2.
-        roll: roll error of the same cost, rad.
+        roll: roll error whose cost equals that of an error of 1 deg of the pointing axis, rad.
         sun_side: whether the Sun is on the side of body +y while +z points to nadir and +x along the flight.
         beta_deg: angle of the Sun from the plane of the orbit, deg.
     """
@@ -114,8 +111,6 @@ class Derived:
     slow_within: float
     duration: float
     detumble_horizon: float
-    slew: float
-    pointing_dipole: float
     roll: float
     sun_side: bool
     beta_deg: float
@@ -174,8 +169,6 @@ def derived(satellite: Satellite, julian_date: float) -> Derived:
         slow_within=slow_within,
         duration=_rounded_up(slow_within + 1.1 * period, 100.0),
         detumble_horizon=1500.0 if momentum_time < 375.0 else 3000.0,
-        slew=min(max(_rounded_up(16.0 * math.sqrt(max(inertia) / torque), 10.0), 60.0), 1500.0),
-        pointing_dipole=min(3.0e-4 * math.sqrt(float(np.mean(inertia)) / _KNIGHTCUBE_INERTIA), 0.02 * dipole),
         roll=0.524 if disturbance / max(inertia) > 3e-6 else 0.0524,
         sun_side=beta < 0.0,
         beta_deg=math.degrees(beta),
@@ -215,7 +208,8 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
         f"#   {command}",
         "# Values are in SI units, unless their name contains another unit. Values marked [given] are those",
         "# of the command, and values marked [computed] follow from them. All other values are those of the",
-        "# configuration `orbit`; `flight check FILE --merged NEW` writes all values into one file.",
+        "# configuration `orbit`, or computed in flight from craft and coils. The command `flight check FILE",
+        "# --merged NEW` writes all values into one file.",
         "",
         "extends: orbit",
         f"name: {satellite.name}",
@@ -249,16 +243,8 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
         "",
         ("pointing:", "body +z points to the goal, and +x along the flight if the roll is given"),
         (
-            f"  dipole: {values.pointing_dipole:.1e}",
-            "A m^2, dipole of the same cost as an attitude error of 1 deg [computed: scaled]",
-        ),
-        (
             f"  roll: {values.roll:g}",
-            f"rad, roll error ({math.degrees(values.roll):.0f} deg) of the same cost [computed]",
-        ),
-        (
-            f"  slew: {values.slew:g}",
-            "s, duration of a slew [computed: 16 sqrt(moment / torque of the coils)]",
+            f"rad, roll error ({math.degrees(values.roll):.0f} deg) of the same cost as 1 deg [computed]",
         ),
         *_cone_lines(satellite),
         "",

@@ -21,6 +21,7 @@ from flight.app.cli import PROGRAM
 from flight.app.devices import check_settings, check_simulated_elements
 from flight.app.run import RunRequest
 from flight.schema import reader as configuration
+from flight.schema.document import ConfigError
 from ground.commands.elements import elements_of
 from ground.commands.options import write_new
 from ground.commands.satellite_questions import (
@@ -54,7 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Write the configuration of a satellite, which `flight check` and `flight run` accept. On a "
         "terminal, the values that are not given are asked for, and an empty answer takes the value in "
         "brackets. The inertia is that of a homogeneous cuboid, two-line elements are fitted to the orbit, "
-        "and weights and limits are computed. The file extends the configuration `orbit` and states the "
+        "and mountings and limits are computed. The file extends the configuration `orbit` and states the "
         "source of each value."
     )
     parser.epilog = (
@@ -85,22 +86,33 @@ def run(options: argparse.Namespace) -> int:
     """Complete the description, write the configuration and print the computed values."""
     answers = Answers(options.out, options.force)
     answers.take_options(options)
-    if missing := answers.missing():
-        if options.json or not sys.stdin.isatty():
-            verb = "is" if len(missing) == 1 else "are"
-            raise UsageError(
-                f"{', '.join(missing)} {verb} missing; on a terminal the command asks for values"
-            )
+    missing = answers.missing()
+    if not missing:
+        answers.take_defaults()
+    elif options.json or not sys.stdin.isatty():
+        verb = "is" if len(missing) == 1 else "are"
+        raise UsageError(f"{', '.join(missing)} {verb} missing; on a terminal the command asks for values")
+    else:
         with _interruptible():
             answers.ask()
-    else:
-        answers.take_defaults()
+    try:
+        facts, text = _written(answers, options.force)
+    except UsageError:
+        if missing:
+            sys.stderr.write(f"flight: the answers as a command:\n  {answers.command()}\n")
+        raise
+    sys.stdout.write(json.dumps(facts) + "\n" if options.json else text)
+    return 0
+
+
+def _written(answers: Answers, force: bool) -> tuple[dict[str, Any], str]:
+    """Write the file, and return the result for the option `--json` and as text. Raises UsageError."""
     path, satellite = answers.path(), satellite_of(answers.values)
     date = julian_date(satellite.utc)
     values, made = derived(satellite, date), elements_of(satellite.orbit, date)
     text = configuration_text(satellite, values, made, answers.command())
     _check(text, path)
-    if options.force:
+    if force:
         _replace(path, text)
     else:
         write_new(path, text)
@@ -112,8 +124,7 @@ def run(options: argparse.Namespace) -> int:
         "derived": asdict(values),
         "warnings": warnings_of(values),
     }
-    sys.stdout.write(json.dumps(facts) + "\n" if options.json else _text(satellite, values, path))
-    return 0
+    return facts, _text(satellite, values, path)
 
 
 class Answers:
@@ -277,10 +288,13 @@ def satellite_of(values: Values) -> Satellite:
 
 
 def _check(text: str, path: Path) -> None:
-    """Check a configuration text as `flight check` does, without flying it. Raises ConfigError."""
-    config = configuration.parse(text, str(path))
-    check_settings(config)
-    check_simulated_elements(RunRequest(path, Path()), text, config)
+    """Check a configuration text as `flight check` does, without flying it. Raises UsageError."""
+    try:
+        config = configuration.parse(text, str(path))
+        check_settings(config)
+        check_simulated_elements(RunRequest(path, Path()), text, config)
+    except ConfigError as error:  # the line is of no use, because there is no file yet
+        raise UsageError(f"nothing was written: {error.problem}") from error
 
 
 def _replace(path: Path, text: str) -> None:

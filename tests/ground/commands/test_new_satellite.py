@@ -156,6 +156,10 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
         ),
         (("--coil", "axis=x,dipole=1,current=1,resistance=5"), "these coils control one axis only"),
         (("--coil", "axis=x,turns=9,current=1,resistance=5"), "give either `dipole`"),
+        (
+            ("--mass", "4", "--size", "3u", "--coil", "axis=xy,dipole=1,current=0.1,resistance=5"),
+            "nothing was written: `coils.windings` has 2 entries",
+        ),
         (("--star-camera", "90"), "--star-camera 90: give a number from 6 to 40 deg, or none"),
         (("--name", "my satellite"), "--name my satellite: give letters, digits and underscores"),
         (("--mass", "4"), "--size, --coil are missing; on a terminal the command asks for values"),
@@ -222,6 +226,20 @@ def test_on_a_terminal_the_values_are_asked_for(tmp_path: Path, monkeypatch: pyt
     assert other.returncode == 0, other.stderr
     given = (tmp_path / "other.yaml").read_text(encoding="utf-8")
     assert asked.split("\n", 2)[2] == given.split("\n", 2)[2], "answers and options mean the same"
+
+
+def test_the_answers_are_shown_when_the_file_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = ["", "4", "3u", "", "", "", "", "", "0.2", "0.1", "40", "", "", ""]
+    monkeypatch.setattr(sys, "stdin", Terminal("\n".join(answers) + "\n"))
+    done = command("new-satellite", "--out", tmp_path / "absent" / "mine.yaml")
+    assert done.returncode == 2
+    assert "mine.yaml: cannot be written: No such file or directory" in done.stderr
+    assert (
+        "the answers as a command:\n  python -m flight new-satellite --name my_satellite --mass 4"
+        in done.stderr
+    )
 
 
 def test_every_question_has_an_option_with_help() -> None:
