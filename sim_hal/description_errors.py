@@ -26,15 +26,16 @@ class DescriptionErrors:
     """The true values of a satellite relative to its description.
 
     Attributes:
-        moments: (3,) ratios of the true to the described principal moments of inertia.
-        axes: (3,) rotation vector of the principal axes, rad, body axes.
-        coils: (3, 3 g) for g groups of three coils. Column k is the dipole of coil k, relative to its
-            described size, in the axes of `sim_hal.worlds.free_body.coil_frames`.
-        gyro: (3, 3) from the true rate to the rate that the gyro measures, without its bias.
-        field: (3, 3) from the true to the measured magnetic field, without the bias.
-        field_bias: (3,) T.
-        camera: (3,) rotation vector of the star camera from its described mounting, rad, body axes.
-        horizon: (n, 3) rotation vectors of the horizon cameras, in the same way.
+        moments: ratios (3,) of the true to the described principal moments of inertia.
+        axes: rotation vector (3,) from the described to the true principal axes, rad, body axes.
+        coils: dipole of each coil divided by its described length, as the columns of a matrix (3, 3 g) for g
+            groups of three coils. The axes are those of `sim_hal.worlds.free_body.coil_frames`.
+        gyro: matrix (3, 3) from the true rate to the rate that the gyro measures, without the gyro's bias.
+        field: matrix (3, 3) from the true to the measured magnetic field, without the magnetometer's bias.
+        field_bias: bias (3,) of the magnetometer, T.
+        camera: rotation vector (3,) of the star camera from its described mounting, rad, body axes.
+        horizon: rotation vectors (n, 3) of the n horizon cameras from their described mountings, rad, body
+            axes.
     """
 
     moments: FloatArray
@@ -53,7 +54,10 @@ NO_ERRORS = DescriptionErrors(
 
 
 def description_errors(config: Config, section: Simulation) -> DescriptionErrors:
-    """Return the errors of the seed of `section`; a body that is not in orbit has none."""
+    """Return the errors that are drawn from the seed of `section`.
+
+    There are no errors for a body that is not in orbit.
+    """
     body = section.free_body
     if body is None or body.errors == 0.0 or not isinstance(config, OrbitConfig):
         return NO_ERRORS

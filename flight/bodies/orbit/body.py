@@ -74,7 +74,7 @@ NAVIGATION_EVERY = 40
 DESCRIPTION_EVERY = 400
 """Number of control cycles from one description packet to the next."""
 LEVELS = (Knowledge.LOST, Knowledge.COARSE, Knowledge.FINE)
-"""Knowledge of the attitude, in the order of the numbers in the navigation packet."""
+"""Classes of attitude knowledge, in the order of their numbers in the navigation packet."""
 _NAN3 = [math.nan] * 3
 
 
@@ -218,7 +218,7 @@ class SatelliteEstimation(BodyEstimation):
         return {**learned_of(self.orbit_filter.slow, _utc(self._services)), COIL_FACTORS: factors}
 
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Pass a correction of the coils to the filter, which forgets their matrix."""
+        """Pass a correction of the coils to the filter, which resets the learned matrix of these coils."""
         self.orbit_filter.correct_coils(change, deviations)
 
     def knowledge(self) -> Knowledge:
@@ -287,7 +287,7 @@ class SatelliteControl(BodyControl):
 
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
-    """Return the satellite of a configuration, started with the states that an earlier boot learned."""
+    """Return the satellite that a configuration describes, with the states that an earlier boot learned."""
     config = as_orbit(config)
     estimation = SatelliteEstimation(config, services, learned)
     control = SatelliteControl(config, estimation, services)
@@ -301,7 +301,10 @@ ORBIT = BodyKind(pointing_job.run, make)
 
 
 def _pauses(config: OrbitConfig) -> WindowSchedule:
-    """Return the windows of pointing: pauses as in detumbling, but a longer time with current."""
+    """Return the control windows of pointing.
+
+    The pauses are those of detumbling, but the time with current is longer.
+    """
     settle, measure, act = config.detumble.settle, config.detumble.measure, config.pointing.act
     return WindowSchedule(*(round(seconds * SECOND_NS) for seconds in (settle, measure, act)))
 
@@ -376,7 +379,7 @@ def description_errors(config: OrbitConfig) -> BodyErrors:
 
 
 def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
-    """Return the configured noises of the filter's states."""
+    """Return the filter's settings that follow from the configuration."""
     section, coils = config.estimation, config.coils.map()
     strength = float(np.linalg.norm(coils.dipoles, axis=1).max())
     return FreeFilterSettings(

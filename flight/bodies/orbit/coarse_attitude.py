@@ -3,8 +3,8 @@
 The measured directions start the filter without a star fix, and update it until the attitude is fine.
 
 The covariance of an attitude from magnetic field and solar cells (`FieldAndStrings`) includes every rotation
-that is possible if any one cell has failed. Errors of solar cells and cameras (lens, height of the limb) may
-last for minutes. A measurement is therefore used only if it is more accurate than the estimate, so that
+that is possible if any one cell has failed. Errors of solar cells, lenses and the assumed height of the limb
+may last for minutes. A measurement is therefore used only if it is more accurate than the estimate, so that
 repeated measurements do not make the filter overconfident. If several measurements in a row contradict an
 estimate that star fixes have not made fine, the filter is restarted.
 """
@@ -45,7 +45,7 @@ from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCamera
 from knightcube.vision.solar_cells import FieldAndStrings, KnownDirections, SolarStringModel, StringFix
 
 PERIOD_NS = 5 * SECOND_NS
-"""Interval (ns) between the solar cell readings that are checked.
+"""Shortest interval (ns) between the solar cell readings that are checked.
 
 Readings at shorter intervals have correlated errors.
 """
@@ -81,7 +81,7 @@ class CoarseSunFeed:
         filter_: OrbitFilter,
         environment: EstimatedEnvironment,
     ) -> None:
-        """`period_ns` is the time (ns) in which all cells are read, one after another."""
+        """All cells are read one after another within `period_ns` ns."""
         self.strings = strings
         self.newest: StringReading | None = None
         self._turns = FieldAndStrings(strings)
@@ -184,11 +184,11 @@ class HorizonCameraFeed:
         sun: CoarseSunFeed | None,
         response: LogarithmicResponse | None,
     ) -> None:
-        """`lens_error` is the residual lens error (rad, per axis) after calibration.
+        """Update `filter_` from frames of the given cameras.
 
-        `sun` holds the newest reading of the solar cells.
-
-        `response` is the response of all cameras to light, or None for a linear response.
+        The residual lens error after calibration is `lens_error` (rad per axis). The object `sun` holds the
+        newest reading of the solar cells. The intensity response of all cameras is `response`, or linear if
+        None is given.
         """
         self._cameras = tuple(cameras)
         self._lens = lens_error**2 * np.eye(3)
@@ -200,7 +200,7 @@ class HorizonCameraFeed:
 
     @property
     def needed(self) -> bool:
-        """Whether horizon frames are needed to improve the attitude; in eclipse only for a lost attitude."""
+        """Whether horizon frames can improve the attitude. In eclipse they only serve a lost attitude."""
         if self._filter.worst_sigma <= NEEDED_SIGMA:
             return False
         around = self._environment.at(self._filter.measured_ns)
@@ -217,7 +217,10 @@ class HorizonCameraFeed:
         )
 
     def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
-        """Start or update the filter; return whether the Sun was used, and whether the nadir was used."""
+        """Start the filter with the measured directions, or update it.
+
+        Return whether the direction of the Sun was used, and whether nadir was used.
+        """
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
         if around is None or sun is None:
             return False, False

@@ -56,7 +56,7 @@ class _MagneticLaw:
             self._law.sample(time_ns, field, rate)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the present command, which is zero if the magnetometer is stuck."""
+        """Return the present command for the coils, which is zero if the magnetometer is stuck."""
         dipole = self._law.dipole(now_ns)
         if self._field_check.stuck:
             dipole = np.zeros(3)
@@ -64,7 +64,7 @@ class _MagneticLaw:
         return CoilCommand(dipole, self._coils.currents(dipole))
 
     def sent(self, currents: FloatArray) -> None:
-        """Propagate the rate with the currents (3,), A, that flow, which are zero in excluded coils."""
+        """Propagate the estimated rate with the present currents (3,), A, of the coils."""
         self._law.acts(self._coils.dipole(currents))
 
     def field(self, now_ns: int) -> FloatArray | None:

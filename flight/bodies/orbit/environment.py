@@ -24,11 +24,12 @@ from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_velocity
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
-"""Spans (s) of the short prediction, after and before the requested time."""
+"""Time spans (s) after and before the requested time that the short prediction covers."""
 GPS_DELAY_NS = 100_000_000
 """Delay (ns) from the time of a GPS fix to the first byte of the receiver's report; at most 0.2 s."""
 GATE, LEAST_GATE = 5.0, 5e3
-"""Gates for a GPS fix: deviation from the known orbit in sigmas, and deviation (m) that is always accepted.
+"""Largest accepted deviation of a GPS fix from the known orbit in standard deviations, and deviation (m) that
+is always accepted.
 """
 CONTRADICTED = 30
 """Number of rejected GPS fixes in a row after which the last accepted fix is considered wrong."""
@@ -57,7 +58,10 @@ class EstimatedEnvironment:
         return self._near is not None
 
     def julian_date(self, now_ns: int) -> float:
-        """Return the Julian date (UTC) by the receiver's time; before the first fix, by the host's clock."""
+        """Return the Julian date (UTC) at a time of the host's clock.
+
+        The date is that of the GPS receiver, or before the first fix that of the host's clock.
+        """
         offset_ns = self._utc_offset_ns
         if offset_ns is None:
             offset_ns = self._clock.utc_ns() - self._clock.now_ns()
@@ -101,7 +105,7 @@ class EstimatedEnvironment:
         )
 
     def sun(self, now_ns: int) -> FloatArray | None:
-        """Return the Sun direction (3,), ICRS, neglecting aberration (21"), or None for an unknown orbit."""
+        """Return the Sun direction (3,), ICRS, without aberration (21"), or None for an unknown orbit."""
         near, times = self._prediction(now_ns)
         return None if near is None else np.asarray(near.sun_at(times)[0])
 

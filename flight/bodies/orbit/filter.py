@@ -4,17 +4,18 @@ A step holds the coil commands and the measurements between two times. A step en
 switched on or off, so that the dipole is nearly constant during a step. When a step has ended, the filter
 processes it with the mean commanded dipole and the mean of the gyro samples. Magnetometer samples are used
 only while the coils are off and their field has decayed. Within the step under way, the estimate is
-propagated by the model. A measurement of a past time, such as a star fix, is applied at its own time: the
-filter returns to the beginning of the step with this time, and repeats all steps since then.
+propagated by the model. A measurement of a past time, such as a star fix, is applied at its own time. For
+this, the filter returns to the beginning of the step that contains this time, and repeats all steps since
+then.
 
-The learned states are stored for the next boot in three parts, without their cross-covariance:
-`attitude-errors` holds the biases and matrices of gyro and magnetometer and the misalignment of the star
-camera, `attitude-torques` the residual dipole in shadow and in sunlight and the torques, and `body` the
-inertia and the matrix of the coils. The matrix of the coils refers to the dipoles that the coil monitor has
-corrected. Signs and gains of the coils are therefore stored too, in the entry `coil-factors`. Another entry,
-`learned-at`, is the time (UTC, s) for which the learned states were estimated. At the next boot, the
-covariance of each state grows by its random walk over the elapsed time, and by a fraction of its initial
-covariance, because switching a sensor off and on changes its bias.
+The learned states are stored for the next boot in three parts, without the cross-covariance of different
+parts. The part `attitude-errors` holds the biases and matrices of gyro and magnetometer and the misalignment
+of the star camera. The part `attitude-torques` holds the residual dipole in shadow and in sunlight and the
+torques. The part `body` holds the inertia and the matrix of the coils. The matrix of the coils refers to the
+dipoles that the coil monitor has corrected. Signs and gains of the coils are therefore stored too, in the
+entry `coil-factors`. Another entry, `learned-at`, is the time (UTC, s) for which the learned states were
+estimated. At the next boot, the covariance of each state grows by its random walk over the elapsed time, and
+by a fraction of its initial covariance, because switching a sensor off and on changes its bias.
 """
 
 from __future__ import annotations
@@ -128,10 +129,10 @@ class FilterStep:
 
     Attributes:
         dipole: mean commanded dipole (3,), A m^2.
-        doubt: largest possible deviation of the dipole from `dipole`, A m^2 per axis; zero for known dipoles.
+        doubt: standard deviation of the true dipole from `dipole`, A m^2 per axis; zero for known dipoles.
         gyro: mean angular rate (3,), rad/s, of `samples` gyro readings, whose mean time is `gyro_ns`.
-        impulse: time integral (3,), A m^2 s, of the dipole from a gyro reading to the end, averaged over
-            readings.
+        impulse: time integral (3,), A m^2 s, of the dipole from a gyro reading to the end of the step,
+            averaged over the readings.
         field: mean magnetic field (3,), T, of `fields` readings around `field_ns`, or None without a reading.
         late: measurements whose time lies in the step, oldest first.
         before: the estimate at the beginning of the step, or None without an estimate.
@@ -162,7 +163,7 @@ class OpenStep:
     """Collects the readings of the step under way."""
 
     def __init__(self, begin_ns: int, acts: bool) -> None:
-        """Start a step at a time; `acts` states whether the coils carry current during the step."""
+        """Start a step at a time; The flag `acts` states whether the coils carry current during the step."""
         self.begin_ns = self.end_ns = begin_ns
         self._acts = acts
         self._rates: list[FloatArray] = []
@@ -171,9 +172,9 @@ class OpenStep:
         self._rates_ns = self._fields_ns = 0
 
     def add(self, reading: ImuReading, total: FloatArray, listens: bool) -> None:
-        """Add a reading and the dipole's integral `total` (3,).
+        """Add a reading, with the integral `total` (3,), A m^2 s, of the dipole up to the reading.
 
-        `listens` states whether the field of the reading is valid.
+        The flag `listens` states whether the magnetic field of the reading is valid.
         """
         since = reading.time_ns - self.begin_ns
         self.end_ns = reading.time_ns
@@ -219,7 +220,7 @@ class OrbitFilterSettings:
 
     Attributes:
         inertia: inertia matrix (3, 3), kg m^2.
-        coils: the coils of the satellite.
+        coils: map between the dipole and the currents of the coils.
         gyro_noise, field_noise: standard deviations per axis of a gyro sample (rad/s) and of a magnetometer
             sample (T).
         unknown_psd: power spectral density of the angular acceleration while there is no estimate, rad^2/s^3.
@@ -247,7 +248,7 @@ class OrbitFilterSettings:
 
 
 class StepReplay:
-    """The filter and its recent steps, which can be processed again.
+    """The filter, with a history of recent steps that can be processed again.
 
     Attributes:
         free: the filter, with the estimate at the end of the newest step.
@@ -275,9 +276,9 @@ class StepReplay:
             self.take_on(len(self.steps) - 1)
 
     def follow_gyro(self) -> None:
-        """Process the last steps again with unknown dipoles if the gyro contradicts the commanded dipoles.
+        """Process the last two steps again with unknown dipoles if the gyro contradicts the dipoles.
 
-        The step before is included, because the deviation may have begun within it, where the mean rate shows
+        The second step is included, because the deviation may have begun within it, where the mean rate shows
         only half of the deviation.
         """
         steps, refused = self.steps, self.refused_gyros > 0
@@ -301,10 +302,10 @@ class StepReplay:
         return self.take_again(first)
 
     def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Multiply the dipoles of the coils by `change` (3,), and process the steps again with new coils.
+        """Multiply the assumed dipoles of the coils by `change` (3,), and process the steps again.
 
-        The steps in which a corrected coil was driven have unknown dipoles, because the coil may have changed
-        during these steps.
+        The learned matrix of the corrected coils is reset. The steps in which a corrected coil was driven
+        have unknown dipoles, because the coil may have changed during these steps.
         """
         coils = np.flatnonzero(change != 1.0)
         for step in self.steps:
@@ -316,7 +317,7 @@ class StepReplay:
         self.take_again(0)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
-        """Treat the dipoles since a time as unknown, if a rejected attitude passes as a result.
+        """Treat the dipoles since a time as unknown, if the gate then accepts a rejected attitude.
 
         Dipole errors that are too small for the gyro accumulate in the attitude.
         """
@@ -331,7 +332,7 @@ class StepReplay:
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
         """Start from an attitude in the step with index `place`, and discard all earlier estimates.
 
-        `doubted` states whether the earlier estimates were contradicted.
+        The flag `doubted` states whether the earlier estimates were contradicted.
         """
         first = self.steps[place]
         self.free.start(
@@ -358,8 +359,8 @@ class StepReplay:
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
         """Return the newest field with the mean gyro rate (3,), rad/s, of its step, or None without a field.
 
-        The covariance of the field includes the unknown magnetometer bias, because it is used to start an
-        estimate.
+        The covariance of the field includes the unknown magnetometer bias, because the field is used to start
+        an estimate.
         """
         step = next((step for step in reversed(self.steps) if step.field is not None), None)
         if step is None or step.field is None:
@@ -454,7 +455,7 @@ class StepReplay:
 
 
 STUCK, CONTRADICTED = 20, 4
-"""Numbers of fields in a row that indicate a fault: equal fields, and fields that contradict the estimate."""
+"""Number of equal magnetic fields in a row, and of contradicting fields in a row, that indicate a fault."""
 
 
 class StuckFieldCheck:
@@ -476,9 +477,9 @@ class StuckFieldCheck:
         return not self.stuck
 
     def text(self, refused: int) -> str:
-        """Return why the magnetometer is rejected, or "".
+        """Return why the magnetometer is rejected, or an empty text.
 
-        `refused` counts the magnetic fields in a row that contradict the estimate.
+        The number `refused` counts the magnetic fields in a row that contradict the estimate.
         """
         if self.stuck:
             return "the magnetometer gives the same field in every reading"
@@ -598,7 +599,11 @@ class OrbitFilter:
     def __init__(
         self, settings: OrbitFilterSettings, around: Callable[[int], FilterEnvironment | None]
     ) -> None:
-        """`around` returns the orbit environment at a time of the clock, or None while it is unknown."""
+        """Create a filter without an estimate.
+
+        The function `around` returns the orbit environment at a time of the clock, or None while the orbit is
+        unknown.
+        """
         self._settings = settings
         self._around = around
         self._replay = StepReplay(settings)
@@ -628,7 +633,7 @@ class OrbitFilter:
 
     @property
     def runs(self) -> bool:
-        """Whether the filter accepts measurements; it does so also while the attitude is lost."""
+        """Whether the filter accepts measurements, which it does also while the attitude is lost."""
         return self._free.started
 
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
@@ -687,7 +692,10 @@ class OrbitFilter:
         return self._free.magnet_bias
 
     def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
-        """Record the coil currents (3,), A, in force from `time_ns` on; `known` means they are certain."""
+        """Record the coil currents (3,), A, that flow from `time_ns` on.
+
+        The flag `known` states whether the coils certainly carry these currents.
+        """
         x, y, z = self._settings.coils.dipole(currents).tolist()
         self._dipoles.record(time_ns, (x, y, z), known)
 
@@ -696,10 +704,10 @@ class OrbitFilter:
         self._replay.doubt_since(since_ns)
 
     def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Forget the matrix of the coils whose described dipole was multiplied by `change` (3,).
+        """Reset the learned matrix of the coils whose assumed dipole was multiplied by `change` (3,).
 
-        `deviations` (3,) are the relative standard deviations of the corrected dipoles. The filter otherwise
-        would apply a correction twice: once in the currents, and once in the matrix learned before.
+        The relative standard deviations of the corrected dipoles are `deviations` (3,). Without this reset,
+        the filter would apply a correction twice, in the dipole and in the matrix that it learned before.
         """
         self._close()
         self._replay.correct_coils(change, deviations)
@@ -721,9 +729,10 @@ class OrbitFilter:
         return self.started and not self.doubts_commands
 
     def begin(self, attitude: AttitudeMeasurement, *, doubted: bool = False) -> bool:
-        """Start from an attitude, and return whether it was used: it must be finite, and within the history.
+        """Start from an attitude, and return whether the attitude was used.
 
-        `doubted` states whether the estimate was contradicted, so that its learned states are less accurate.
+        The attitude must be finite, and its time must be within the history. The flag `doubted` states
+        whether the previous estimate was contradicted, so that its learned states are less accurate.
         """
         self._close()
         place = self._replay.place(attitude.time_ns)
@@ -735,7 +744,10 @@ class OrbitFilter:
         return True
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of past times, and call `applied` with a flag for each that passed its gate."""
+        """Apply measurements of past times.
+
+        The callback `applied` receives, for each measurement, whether the measurement passed the gate.
+        """
         self._close()
         places = [self._replay.place(m.time_ns) for m in late]
         inside = [k for k in places if k is not None and self._steps[k].before is not None]
@@ -847,7 +859,7 @@ class OrbitFeed:
 ERRORS, SOURCES, BODY, LEARNED_AT = "attitude-errors", "attitude-torques", "body", "learned-at"
 COIL_FACTORS = "coil-factors"
 UNKNOWN_AGE = 86_400.0
-"""Largest assumed age (s) of learned states, also assumed if the clock was set back."""
+"""Largest assumed age (s) of learned states, which is also assumed after the clock was set back."""
 
 
 def _places(*parts: slice) -> IntArray:
@@ -875,7 +887,8 @@ def start_from(
 ) -> tuple[SlowStates, list[str]]:
     """Return the prior of the slow states at a time (UTC, s), and why learned states were rejected.
 
-    Switching off and on may have changed a state by the fraction `changed` of its initial deviation.
+    Between two boots, each state may have changed by the fraction `changed` of its initial standard
+    deviation.
     """
     initial, walks = layout.prior[SLOW, SLOW], layout.walks[SLOW]
     prior = SlowStates(np.zeros(len(initial)), initial.copy())

@@ -1,13 +1,13 @@
 """Guidance of a satellite: targets, the flown path, and plans from the planner worker.
 
 A path is a table of feedback gains and reference motion for the pointing law. A path is planned when a target
-is set, when the attitude becomes known again, when the body leaves its path, and periodically, because the
-orbit prediction ages and a free roll angle follows the body.
+is set, when the attitude becomes known again, and when the body leaves its path. Paths are also planned
+periodically, because the orbit prediction ages and a free roll angle follows the body.
 
 A satellite that follows an object points to the search direction first, then to the track of the object.
 Without a track, the boresight stays at the search direction. If there are several tracks, the satellite
-follows the brightest object until its track ends. The satellite is steered by the prediction of the track, so
-it follows the object also between detections.
+follows the brightest object until its track ends. The satellite follows the predicted direction of the track,
+so it follows the object also between detections.
 """
 
 from __future__ import annotations
@@ -76,9 +76,10 @@ class PointingPaths:
     """
 
     def __init__(self, limit: float | FloatArray, fastest: float) -> None:
-        """`limit` is the largest mean dipole (A m^2) over a window, of all body axes or of each (3,).
+        """Start without a path.
 
-        `fastest` is the largest rate (rad/s) of a path.
+        The value `limit` is the largest mean dipole (A m^2) over a control window, either one value for all
+        body axes or one per axis (3,). The value `fastest` is the largest permitted rate (rad/s) of a path.
         """
         self._limit, self._fastest = limit, fastest
         self._law: PointingLaw | None = None
@@ -89,7 +90,10 @@ class PointingPaths:
         self.astray = PathRecovery()
 
     def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
-        """Follow a new path table, or its part with permitted rates; return why it is rejected, or ""."""
+        """Follow the part of a new path table that has permitted rates.
+
+        Return why the path is rejected, or an empty text if the path is followed.
+        """
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
             return "it holds values that are not finite"
@@ -106,7 +110,10 @@ class PointingPaths:
         return ""
 
     def led(self, turn: FloatArray, rate: FloatArray, now_ns: int) -> bool:
-        """Accept the rotation (3,) between path and body and the rate (3,); return whether to go on."""
+        """Accept the rotation (3,) between path and body and the rate (3,) of the body.
+
+        Return whether the path is followed further.
+        """
         self.off = float(np.linalg.norm(turn))
         self.astray.update(self.off, float(np.linalg.norm(rate)), now_ns / SECOND_NS)
         return self.astray.since is None
@@ -181,7 +188,7 @@ class PointingTargets:
     def __init__(
         self, timed: Sequence[tuple[float, PointingTarget]], paths: PointingPaths, looks_for_objects: bool
     ) -> None:
-        """Accept the configured targets in order of their mission times (s), the first of which is 0."""
+        """Accept the configured targets in order of their mission times (s), which begin at 0."""
         self._looks_for_objects = looks_for_objects
         self._paths = paths
         self._times = [round(at * 1e9) for at, _ in timed]
@@ -192,7 +199,7 @@ class PointingTargets:
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target that command `number` sets.
+        """Return the target that the command with the number `number` sets.
 
         Raises UsageError if the command gives a q2, as for the testbed.
         """
@@ -228,11 +235,12 @@ class PointingTargets:
 EFFORT = 0.25
 """Dipole of unit cost, as a fraction of the coils' limit, while following an object."""
 ROLL = math.radians(20.0)
-"""Roll error (rad) of unit cost about the boresight; it is large, because roll hardly moves the object."""
+"""Roll error (rad) of unit cost about the boresight; the value is large, because roll hardly moves the object
+in the image."""
 RATE = math.radians(1.0)
-"""Rate error (rad/s) of unit cost: a body that rolls fast blurs the stars at the edge of the image."""
+"""Rate error (rad/s) of unit cost, chosen because a fast roll blurs the stars at the edge of the image."""
 FORESIGHT = 30.0
-"""Longest time (s) for which the report about an object leaving the field of view predicts its track."""
+"""Time (s) over which a track is predicted to report that its object will leave the field of view."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,9 +260,10 @@ class ObjectAim:
     """
 
     def __init__(self, sensor: Sensor | None, limit: float, log: EventLog) -> None:
-        """`limit` is the mean of the axes' largest dipoles, A m^2.
+        """Start without an object.
 
-        `sensor` is None if no objects are searched for.
+        The value `limit` (A m^2) is the mean over the body axes of the largest dipole. The argument `sensor`
+        is None for a satellite that does not search for objects.
         """
         self._sensor, self._limit, self._events = sensor, limit, log
         self._target: PointingTarget | None = None
@@ -285,12 +294,15 @@ class ObjectAim:
                 text = f"object {found.number}, V {found.magnitude:.1f} +- {found.magnitude_sigma:.1f}"
                 self._events.report(events.OBJECT_FOLLOWED, now_ns, text)
             elif before:
-                # Search again, in the commanded direction or in the direction of the camera.
+                # Search in the commanded direction, or without one in the camera's direction.
                 self._place = None
         self.moved = self.moved or before > 0 or self._followed > 0
 
     def directed(self, job: PointingJob) -> PointingJob:
-        """Return a job for the body's target; for an object, point to the search direction or the track."""
+        """Return the planner's job for a target.
+
+        If the target is an object, the job points to the search direction or the track.
+        """
         sensor = self._sensor
         self.moved = False
         if not self.seeks or sensor is None:
@@ -300,7 +312,7 @@ class ObjectAim:
         track = self._track()
         if track is None:
             place = self._searched(job.quaternion)
-            # Weights about another axis would make rotations of the boresight cheap.
+            # The weights refer to the boresight, so that rotations of the boresight are not cheap.
             weights = replace(job.weights, roll=ROLL, axis=boresight)
             return replace(
                 job, axes=axes, weights=weights, slew=None, sight=ObjectDirection(place, np.zeros(3), 0.0)
@@ -365,9 +377,9 @@ AGAIN_NS = 10_000_000_000
 class PlannedCraft:
     """The planner's model of the satellite.
 
-    `inertia` is the inertia matrix (3, 3), kg m^2, in body axes. `limit` (A m^2) is the largest mean dipole
-    over a window with its pause, of all body axes or of each (3,). `slew` holds the constraints and heat
-    coefficients that every slew request uses.
+    The inertia tensor is `inertia` (3, 3), kg m^2, in body axes. The value `limit` (A m^2) is the largest
+    mean dipole over a control window including its pause, either one value for all body axes or one per axis
+    (3,). The request `slew` holds the constraints and heat coefficients of every slew.
     """
 
     inertia: FloatArray
@@ -389,7 +401,11 @@ class PointingPlanner:
         objects: ObjectAim,
         services: Services,
     ) -> None:
-        """`disturbed` returns the estimated torques (9,), N m, and the residual dipole (3,), A m^2."""
+        """Start without a plan.
+
+        The function `disturbed` returns the estimated torque sizes (9,), N m, and the residual dipole (3,), A
+        m^2.
+        """
         self._craft, self._paths, self._environment = craft, paths, environment
         self._disturbed, self._objects = disturbed, objects
         self._jobs, self._events = services.jobs, services.events
@@ -399,7 +415,7 @@ class PointingPlanner:
         self._count = self._accepted = self._refused = 0
 
     def busy_since_ns(self) -> int | None:
-        """Return when the worker began its plan (ns), or None while it is idle."""
+        """Return the time (ns) at which the worker began its plan, or None while the worker is idle."""
         return None if self._job is None else self._job.origin_ns
 
     def aim(self, target: Target, now_ns: int) -> None:
