@@ -761,7 +761,7 @@ class CoilMonitor:
                 self._tell(axis, f"{response.text(axis)} while the body is slow, which confirms its sign")
         known = self._verdicts.keys() | self._rests.keys()
         # An uncommanded current also makes a torque, which could be mistaken for that of a reversed coil.
-        if not (self._leg.suspicion or self._strangeness):
+        if not self._leg.suspicion and (not self._strangeness or self._prime is not None):
             for axis in response.axes(Finding.REVERSED):
                 if axis not in known:
                     self._reverse(axis, response, now_ns, in_tumble=not slow)
@@ -799,6 +799,8 @@ class CoilMonitor:
         """Report a change of the correction, and judge the motion again without the earlier evidence."""
         self._tell(axis, seen)
         self._weak = ""
+        if self._prime is not None:
+            self._reset()
         self._adopt_correction()
         for response in self._responses:
             response.interrupted(now_ns)

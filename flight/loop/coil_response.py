@@ -575,15 +575,37 @@ class CoilResponse:
         return True
 
     def _fit(self, span: float) -> None:
-        """Fit all gains freely, and fit each gain with the other two coils assumed healthy."""
+        """Fit the gains over all bins, and look for a reversed coil over the newest bins as well.
+
+        Bins from before a fault would hide the fault from a fit over all bins.
+        """
+        whole = self._solved(list(self._rows), span)
+        self.fastest = max(self._speeds)
+        self.gain, self.sigma, self._weights = whole.gain, whole.sigma, whole.weights
+        fits, count = [whole], len(self._rows) // 2
+        while count >= self._settings.least_bins:
+            fits.append(self._solved(list(self._rows)[-count:], span))
+            count //= 2
+        for axis in range(3):
+            shown = [fit for fit in fits if fit.possible and fit.is_reversed[axis]]
+            shown = [fit for fit in shown if fit.gain[axis] < self._settings.highest_reversed]
+            if shown:
+                self.gain[axis], self.sigma[axis] = shown[0].gain[axis], shown[0].sigma[axis]
+            self._count(axis, whole.possible, alone=bool(whole.alone[axis]), is_reversed=bool(shown))
+
+    def _solved(self, rows: Sequence[FloatArray], span: float) -> MotionFit:
+        """Fit all gains freely, and fit each gain with the other two coils assumed healthy.
+
+        `rows` (n, f, 6 + k) are those of neighbouring bins, and `span` is the time (s) from bin to bin.
+        """
         count = len(self._free)
-        rows = self._whitened(span)
-        inputs = np.zeros((len(rows), count, len(self._prior)))
-        inputs[:, :, :3], inputs[:, :, 3 + 2 * count :] = rows[:, :, :3], rows[:, :, 6:]
+        white = self._whitened(rows, span)
+        inputs = np.zeros((len(white), count, len(self._prior)))
+        inputs[:, :, :3], inputs[:, :, 3 + 2 * count :] = white[:, :, :3], white[:, :, 6:]
         for place in range(count):
-            inputs[:, place, 3 + place] = -rows[:, place, 5]
-            inputs[:, place, 3 + count + place] = -rows[:, place, 4]
-        matrix, outputs = inputs.reshape(-1, len(self._prior)), rows[:, :, 3].reshape(-1)
+            inputs[:, place, 3 + place] = -white[:, place, 5]
+            inputs[:, place, 3 + count + place] = -white[:, place, 4]
+        matrix, outputs = inputs.reshape(-1, len(self._prior)), white[:, :, 3].reshape(-1)
         normal, right = matrix.T @ matrix + np.diag(self._prior), matrix.T @ outputs
         # Eliminate the nuisance parameters, which leaves three equations for the gains.
         others = np.linalg.inv(normal[3:, 3:])
@@ -595,24 +617,29 @@ class CoilResponse:
         )
         freely = gains.solve(self._prior[:3])
         spread = max(1.0, freely.cost / max(len(outputs) - count - 3, 1))
-        self.fastest = max(self._speeds)
-        self._weights = (others @ right[3:] - coupling @ freely.gains)[2 * count :]
         # If a gain is impossible even within its uncertainty, the model is wrong.
         sigmas = np.sqrt(spread * freely.variances)
         possible = bool((np.abs(freely.gains) - 3.0 * sigmas < self.largest).all())
         healthy = np.full(3, self._healthy)
         one_free = [gains.solve(np.where(axis == _EACH, self._prior[:3], healthy)) for axis in range(3)]
-        self.gain = np.array([fit.gains[axis] for axis, fit in enumerate(one_free)])
-        self.sigma = np.sqrt(spread * np.array([fit.variances[axis] for axis, fit in enumerate(one_free)]))
         costs = [fit.cost / spread for fit in one_free]
         sound_cost = gains.solve(healthy).cost / spread
+        alone, is_reversed = [], []
         for axis in range(3):
             # Limit of the sum of squares of a hypothesis that only this axis is broken.
             limit = min(costs[other] for other in range(3) if other != axis) - _CLEARLY
             limit = min(limit, freely.cost / spread + _WORSE)
             reversed_cost = gains.solve(healthy, np.where(axis == _EACH, -1.0, 1.0)).cost / spread
-            is_reversed = reversed_cost < min(limit, sound_cost - _CERTAINLY)
-            self._count(axis, possible, alone=costs[axis] < limit, is_reversed=is_reversed)
+            alone.append(costs[axis] < limit)
+            is_reversed.append(reversed_cost < min(limit, sound_cost - _CERTAINLY))
+        return MotionFit(
+            np.array([fit.gains[axis] for axis, fit in enumerate(one_free)]),
+            np.sqrt(spread * np.array([fit.variances[axis] for axis, fit in enumerate(one_free)])),
+            (others @ right[3:] - coupling @ freely.gains)[2 * count :],
+            possible,
+            tuple(alone),
+            tuple(is_reversed),
+        )
 
     def _count(self, axis: int, possible: bool, *, alone: bool, is_reversed: bool) -> None:
         """Count the fits in a row that agree on an axis.
@@ -621,13 +648,13 @@ class CoilResponse:
             axis: index of the axis.
             possible: whether the gains of all axes are physically possible.
             alone: whether a fault of this axis explains the motion, clearly better than that of another axis.
-            is_reversed: the same for a reversed coil on this axis, which is also far more likely than that
-                all coils are healthy.
+            is_reversed: whether a reversed coil on this axis explains the motion clearly better than a fault
+                of another axis, and far better than healthy coils.
         """
         settings, gain, sigma = self._settings, float(self.gain[axis]), float(self.sigma[axis])
         judged = possible and abs(gain) <= float(self.largest[axis])
         sure = judged and sigma < settings.sure
-        wrong = possible and is_reversed and gain < settings.highest_reversed
+        wrong = is_reversed
         weak = alone and gain + _SIGMAS * sigma < _WEAK_GAIN and gain < settings.highest_feeble
         exact = judged and alone and sigma < _EXACT
         findings = {
@@ -641,12 +668,12 @@ class CoilResponse:
             counts = self._in_a_row[finding]
             counts[axis] = counts[axis] + 1 if holds else 0
 
-    def _whitened(self, span: float) -> FloatArray:
-        """Return the rows (n, f, 6 + k) of all bins, with noise of variance 1 and without a constant part.
+    def _whitened(self, bins: Sequence[FloatArray], span: float) -> FloatArray:
+        """Return the rows (n, f, 6 + k) of bins, with noise of variance 1 and without a constant part.
 
         The noise of the mean rate of a bin enters two differences of neighbouring bins with opposite signs.
         """
-        settings, rows = self._settings, np.array(self._rows)
+        settings, rows = self._settings, np.array(bins)
         variance = (settings.rate_noise / span) ** 2 / settings.bin_samples
         count = len(rows)
         covariance = (settings.model_error**2 + 2.0 * variance) * np.eye(count)
@@ -666,6 +693,25 @@ class Finding(Enum):
     SOUND = auto()
     WEAK = auto()
     STRONG = auto()
+
+
+class MotionFit(NamedTuple):
+    """Fit of the gains over some bins.
+
+    Attributes:
+        gain, sigma: gain (3,) of each coil with the others assumed healthy, and its standard deviation (3,).
+        weights: weights (k,) of the error modes.
+        possible: whether the gains of all axes are physically possible.
+        alone: whether a fault of one axis explains the motion clearly better than that of another axis.
+        is_reversed: whether a coil is reversed, which is also far more likely than healthy coils.
+    """
+
+    gain: FloatArray
+    sigma: FloatArray
+    weights: FloatArray
+    possible: bool
+    alone: tuple[bool, ...]
+    is_reversed: tuple[bool, ...]
 
 
 class GainFit(NamedTuple):

@@ -211,6 +211,8 @@ class OpenStep:
 FORGOTTEN_NS = 10_000_000_000
 """Time (ns) without a contradicting gyro after which the commanded dipoles are trusted again."""
 _LONGEST = 2.0
+_NEGLIGIBLE = 1e-9
+"""Current (A) below which a coil is not driven."""
 _EYE: FloatArray = np.eye(3)
 
 
@@ -307,13 +309,19 @@ class StepReplay:
         The learned matrix of the corrected coils is reset. The steps in which a corrected coil was driven
         have unknown dipoles, because the coil may have changed during these steps.
         """
-        coils = np.flatnonzero(change != 1.0)
+        coils, changed = self._settings.coils, np.flatnonzero(change != 1.0)
         for step in self.steps:
-            if step.dipole[coils].any():
+            currents = coils.currents(step.dipole)
+            if (np.abs(currents[changed]) > _NEGLIGIBLE).any():
                 step.doubt = self._settings.dipole_limit
-            step.dipole, step.impulse = change * step.dipole, change * step.impulse
+            step.dipole = coils.dipole(change * currents)
+            step.impulse = coils.dipole(change * coils.currents(step.impulse))
         memories = [step.before for step in self.steps if step.before is not None]
-        self.free.renew_coils(coils.tolist(), deviations, memories)
+        inverse = coils.per_dipole(np.eye(len(change)))
+        for coil in changed.tolist():
+            direction = coils.dipoles[:, coil] / np.linalg.norm(coils.dipoles[:, coil])
+            dual = inverse[coil] / float(inverse[coil] @ direction)
+            self.free.renew_coil(direction, dual, float(deviations[coil]), memories)
         self.take_again(0)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:

@@ -460,31 +460,43 @@ class FreeFilter:
         self._constants, self.covariance = then.constants.copy(), then.covariance.copy()
         self.field_error = then.field_error
 
-    def renew_coils(
-        self, coils: Sequence[int], deviations: FloatArray, memories: Sequence[FreeMemory] = ()
+    def renew_coil(
+        self,
+        direction: FloatArray,
+        dual: FloatArray,
+        deviation: float,
+        memories: Sequence[FreeMemory] = (),
     ) -> None:
-        """Reset the learned matrix for the coils with the indices `coils`.
+        """Reset the learned matrix of the coils for one coil.
 
-        The estimate and its copies `memories` are changed. This is necessary after the sign or the gain of a
-        coil was corrected, because the learned matrix refers to the dipole before the correction. The columns
-        of these coils become zero, and their correlations with other states are deleted. The standard
-        deviation of each element becomes that of the settings, and on the diagonal at least `deviations`
-        (3,).
+        The estimate and its copies `memories` are changed. This is necessary after the sign or the gain of
+        the coil was corrected, because the learned matrix refers to the dipole before the correction. The
+        error of the corrected dipole becomes zero, and its correlations with other states are deleted. Its
+        standard deviation becomes that of the settings, and along the coil at least `deviation`.
+
+        Args:
+            direction: unit vector (3,) of the coil, body axes.
+            dual: vector (3,) normal to the other coils, whose scalar product with `direction` is 1.
+            deviation: relative standard deviation of the corrected dipole.
+            memories: copies of earlier estimates.
         """
         self.changes += 1
-        prior = self.layout.prior
+        kept = np.eye(STATES)
+        kept[COILS, COILS] = np.kron(_EYE, (_EYE - np.outer(direction, dual)).T)
+        along = np.kron(_EYE, direction)
+        error = along @ self.layout.prior[COILS, COILS] @ along.T
+        least = deviation**2 - float(direction @ error @ direction)
+        if error.any() and least > 0.0:
+            error = error + least * np.outer(direction, direction)
+        spread = np.kron(_EYE, dual[:, None])
+        fresh = spread @ error @ spread.T
         for constants, covariance in (
             (self._constants, self.covariance),
             *((memory.constants, memory.covariance) for memory in memories),
         ):
-            for coil in coils:
-                column = np.arange(COILS.start + coil, COILS.stop, 3)
-                constants[column] = 0.0
-                covariance[column] = covariance[:, column] = 0.0
-                covariance[np.ix_(column, column)] = prior[np.ix_(column, column)]
-                own = column[coil]
-                if prior[own, own] > 0.0:
-                    covariance[own, own] = max(prior[own, own], deviations[coil] ** 2)
+            constants[COILS] = kept[COILS, COILS] @ constants[COILS]
+            covariance[:] = kept @ covariance @ kept.T
+            covariance[COILS, COILS] += fresh
 
     @property
     def gyro_bias(self) -> FloatArray:

@@ -96,11 +96,13 @@ class Orbiting:
         )
         self.moments = MOMENTS
         self._noise = np.random.default_rng(4)
+        self._cycles = 0
         self._field: FloatArray = np.array([1e-5, -2e-5, 3e-5])
 
     def fly(self, seconds: float, weak: bool = False) -> None:
         """Fly with coils that pause for 0.2 s of each second; `weak`: currents that no monitor can judge."""
-        for cycle in range(round(40 * seconds)):
+        begun, self._cycles = self._cycles, self._cycles + round(40 * seconds)
+        for cycle in range(begun, self._cycles):
             now_ns, within, time = cycle * TICK_NS, cycle % 40, cycle / 40
             wanted = 0.14 * np.sign([math.sin(0.7 * time), math.cos(0.5 * time), 1.0])
             if weak:
@@ -198,6 +200,15 @@ def test_a_coil_reversed_in_a_tumble_is_used_with_its_sign_changed_and_reviewed_
     assert watch.correction.factors.tolist() == signs.tolist()
     assert watch.correction.unreviewed == frozenset()
     assert "confirms its sign" in watch.news()[0]
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_coil_that_becomes_reversed_is_found_though_earlier_bins_show_it_healthy(axis: int) -> None:
+    body = Orbiting(np.ones(3), tumble_rate=0.01)
+    body.fly(45.0)
+    body.signs[axis] = -1.0
+    body.fly(16.0)
+    assert body.watch.correction.factors.tolist() == body.signs.tolist()
 
 
 def test_a_sign_changed_wrongly_in_a_tumble_is_changed_back() -> None:

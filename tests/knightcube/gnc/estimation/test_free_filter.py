@@ -175,7 +175,7 @@ def test_a_corrected_coil_is_a_new_coil_and_the_other_coils_keep_what_was_learne
     found.covariance[:] = 0.25 * prior + 1e-9
     found._constants[COILS] = np.arange(1.0, 10.0)
     then = found.memory()
-    found.renew_coils([1], np.array([0.0, 0.3, 0.0]), [then])
+    found.renew_coil(np.eye(3)[1], np.eye(3)[1], 0.3, [then])
     column = np.arange(COILS.start + 1, COILS.stop, 3)
     others = np.setdiff1d(np.arange(STATES), column)
     for constants, covariance in ((found._constants, found.covariance), (then.constants, then.covariance)):
@@ -190,7 +190,25 @@ def test_a_corrected_coil_is_a_new_coil_and_the_other_coils_keep_what_was_learne
     assert (found.coil_matrix[:, 1] == [0.0, 1.0, 0.0]).all()
 
 
+def test_the_error_of_a_tilted_coil_is_reset_and_that_of_the_others_is_kept() -> None:
+    rng = np.random.default_rng(2)
+    coils = np.array([[1.0, 0.6, 0.0], [0.0, 0.8, 0.6], [0.0, 0.0, 0.8]])  # unit vectors as columns
+    found = FreeFilter(INERTIA, FreeFilterSettings())
+    found._constants[COILS] = 0.1 * rng.standard_normal(9)
+    matrix, prior = found.coil_matrix - np.eye(3), found.layout.prior[COILS, COILS]
+    found.covariance[COILS, COILS] = 0.01 * prior
+    dual = np.linalg.inv(coils)[1]
+    found.renew_coil(coils[:, 1], dual, 0.0)
+    after = found.coil_matrix - np.eye(3)
+    assert after @ coils[:, 1] == pytest.approx(np.zeros(3), abs=1e-12)
+    assert after @ coils[:, [0, 2]] == pytest.approx(matrix @ coils[:, [0, 2]])
+    for coil, scale in ((0, 0.01), (1, 1.0), (2, 0.01)):
+        along = np.kron(np.eye(3), coils[:, coil])
+        spread = along @ found.covariance[COILS, COILS] @ along.T
+        assert spread == pytest.approx(scale * along @ prior @ along.T)
+
+
 def test_a_coil_that_is_known_exactly_stays_known() -> None:
     found = FreeFilter(INERTIA, EXACT)
-    found.renew_coils([0, 1, 2], np.full(3, 0.3))
+    found.renew_coil(np.eye(3)[0], np.eye(3)[0], 0.3)
     assert not found.covariance[COILS, COILS].any()
