@@ -19,7 +19,7 @@ from ground.report.panels import RunSignals
 from ground.report.signals import seconds
 from ground.telemetry import Run
 
-if TYPE_CHECKING:  # only for types, because these modules import the optimiser
+if TYPE_CHECKING:  # imported for types only, because these modules import the optimiser
     from ground.identification.fit import PlantFit
     from ground.identification.record import Record
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
@@ -34,7 +34,7 @@ PATH_WINDOW_S = 20.0
 _MIN_FIELD_ROTATION = np.radians(20.0)
 """Smallest rotation (rad) of the field in a run for which the picture of the cage is drawn."""
 _FIELD_STRIDE = 40
-"""Number of magnetometer readings per drawn reading, one second."""
+"""Number of magnetometer readings in one second, of which one is drawn."""
 
 
 def save(figure: Figure, file: Path) -> None:
@@ -206,8 +206,8 @@ def cage_figure(signals: RunSignals) -> Figure | None:
 
 
 def path_figure(plan: StepPlan, plant: SingleAxisPlant) -> Figure:
-    """Return the picture of a planned path: q2, rate and current, with its nodes (Sease, Fig. 5.4 to 5.6)."""
-    last = plan.horizon * (1.0 - 1e-12)  # just before the horizon, from which on the target is held
+    """Return the picture of a planned path with q2, rate, current and nodes (Sease 2013, Fig. 5.4 to 5.6)."""
+    last = plan.horizon * (1.0 - 1e-12)  # just before the end of the path, after which the target is held
     time, nodes = np.linspace(0.0, last, 401), np.minimum(plan.node_times, last)
     figure = Figure(figsize=(OVERVIEW[0], 0.75 * OVERVIEW[1]), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)

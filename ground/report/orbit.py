@@ -29,7 +29,7 @@ SUNLIT = 0.99
 JUDGED = 600
 """Number of navigation packets, one per second, over which the residual dipole is judged."""
 MIN_DIPOLE = 1e-9
-"""Smallest residual dipole (A m^2) by which the dipole's error is divided."""
+"""Lower bound (A m^2) of the residual dipole by which the dipole's error is divided."""
 SETTLED_AFTER_S = 600.0
 """Time after the start of pointing at a target before its pointing error is judged (s)."""
 
@@ -100,9 +100,9 @@ class AttitudeErrors:
 
     Attributes:
         times: mission times (n,), s.
-        error: rotations (n, 3), rad, from the reference to the other attitude.
-        sigma: standard deviations (n, 3), rad, of the attitude estimate.
-        source: "truth" or "estimate".
+        error: rotation vectors (n, 3), rad, from the reference attitude to the compared attitude.
+        sigma: standard deviations (n, 3) of the attitude estimate, rad.
+        source: origin of the flown attitude, "truth" or "estimate".
     """
 
     times: FloatArray
@@ -159,7 +159,10 @@ def knowledge(run: Run) -> Object | None:
 
 
 def stars_age(run: Run, times: FloatArray) -> FloatArray:
-    """Return the age (n,) s of the newest accepted star attitude at `times` (n,) s; infinite before one."""
+    """Return the ages (n,), s, of the newest accepted star attitude at `times` (n,), s.
+
+    An age is infinite before the first accepted star attitude.
+    """
     stars = run["stars"]
     accepted = np.concatenate([[-math.inf], seconds(stars[stars["accepted"] == 1])])
     return np.asarray(times - accepted[np.searchsorted(accepted, times, side="right") - 1])
@@ -168,13 +171,13 @@ def stars_age(run: Run, times: FloatArray) -> FloatArray:
 def camera_errors(run: Run) -> AttitudeErrors:
     """Return the errors of the estimated attitude of the star camera, about the body axes.
 
-    They do not contain the misalignment of the star camera, to which the attitude of the body is uncertain.
-    The result is empty without description packets of the estimate and of the truth.
+    These errors do not contain the misalignment of the star camera, which is part of the errors of the body's
+    attitude. The result is empty without description packets of the estimate and of the truth.
     """
     errors, packets, true = attitude_errors(run), run["description"], run["true_description"]
     if not len(packets) or not len(true) or not len(errors.times):
         return AttitudeErrors(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-    # The misalignment changes slowly; the attitude of the same cycle is compared.
+    # The misalignment changes slowly, so it is combined with the attitude of the same control cycle.
     at = np.searchsorted(errors.times, seconds(packets))
     inside = at < len(errors.times)
     packets, at = packets[inside], at[inside]
@@ -184,7 +187,7 @@ def camera_errors(run: Run) -> AttitudeErrors:
 
 
 def star_camera_knowledge(run: Run) -> Object | None:
-    """Return the rms error with stars and the NEES of an axis of the star camera's attitude.
+    """Return the rms error with stars and the NEES per axis of the star camera's attitude.
 
     Returns None without description packets of the estimate and of the truth.
     """
@@ -201,10 +204,10 @@ def star_camera_knowledge(run: Run) -> Object | None:
 def learned_description(run: Run) -> list[Object]:
     """Return the errors of the learned inertia, coils and sensors, with the rms of their uncertainty.
 
-    `first_error` is the rms error of the first estimate, `error` that of the last one.
+    The rms error of the first estimate is `first_error`, and that of the last estimate is `error`.
 
-    The inertia is judged by its elements divided by the trace, because the coils alone show the scale. The
-    result is empty without description packets of the estimate and of the truth.
+    The elements of the inertia are divided by the trace, because the scale of the inertia is observable only
+    against the coils. The result is empty without description packets of the estimate and of the truth.
     """
     packets, true = run["description"], run["true_description"]
     if not len(packets) or not len(true):
@@ -271,7 +274,7 @@ def pointing(run: Run, axis: npt.ArrayLike, power: PowerHistory | None) -> Objec
     """Return the figures of each target, or None for a run without pointing.
 
     A target's error is judged from `SETTLED_AFTER_S` s after the target's first pointing cycle, or from the
-    end of its first slew if that is later. `axis` (3,) is the pointing axis in the body frame.
+    end of its first slew if that is later. The pointing axis in body axes is `axis` (3,).
     """
     found = pointing_errors(run)
     if not len(found.times):
@@ -350,7 +353,7 @@ def requirements(
         slowed_at = [one["begin_s"] + one["duration_s"] for one in periods if one["slowed"]]
         fine_at = known["fine_after_s"]
         fine = [math.inf if math.isnan(fine_at) else max(0.0, fine_at - at) for at in slowed_at]
-        # Stars show the attitude of the star camera; that of the body is known to the camera's mounting.
+        # The body's attitude would include the mounting error, so the star camera's attitude is judged.
         camera = known.get("star_camera") or known
         error = [math.degrees(camera["with_stars_error_rms_rad"])]
         rows.append(("time from detumbling to fine attitude", fine, limits.fine_within, "s"))

@@ -47,7 +47,10 @@ _OBJECT_COLOURS = (panels.BLUE, panels.ORANGE, panels.GREEN, panels.PURPLE)
 
 
 def spin_figure(signals: RunSignals) -> Figure | None:
-    """Return the picture of detumbling: rate, field and dipole; None for a run without spin packets."""
+    """Return the picture of detumbling with rate, field and dipole.
+
+    Returns None for a run without spin packets.
+    """
     spin = signals.run["spin"]
     if not len(spin):
         return None
@@ -218,7 +221,10 @@ def _shade(ax: Axes, packets: PacketArray) -> None:
 
 
 def track_figure(signals: RunSignals) -> Figure | None:
-    """Return the picture of the ground track in light and shadow; None if the true position is not known."""
+    """Return the picture of the ground track in sunlight and shadow.
+
+    Returns None for an unknown true position.
+    """
     packets = signals.run["orbit_truth"]
     if not len(packets):
         return None
@@ -294,7 +300,7 @@ def slew_figure(made: OrderedSlew, order: SlewOrder) -> Figure:
     _slew_sky(sky, made, order, times)
     dipoles, limit = 1e3 * made.plan.path.dipoles(times), 1e3 * float(made.task.craft.limit.min())
     panels.vectors(dipole, times, dipoles)
-    # A limit line far above the curves would flatten the curves.
+    # The limit is drawn only near the curves, because a distant line would flatten the curves.
     if np.abs(dipoles).max() > 0.3 * limit:
         panels.level(dipole, -limit, "")
         panels.level(dipole, limit, "limit")

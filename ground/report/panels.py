@@ -39,7 +39,8 @@ PATH_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
 AXIS_COLOURS = {"x": BLUE, "y": ORANGE, "z": GREEN}
 DASHED = (0, (5, 2))
 _MAX_ERROR = 1e9
-"""Rate error (mrad/s) that only a damaged log can contain and that does not affect the scale."""
+"""Largest plausible rate error (mrad/s); a larger one comes from a damaged log and does not affect the
+scale."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class RunSignals:
 
     @cached_property
     def current_limit(self) -> float:
-        """Configured limit (A) of a coil current, or that of the thesis without a configuration."""
+        """Configured limit (A) of a coil current, or without a configuration the limit of the thesis."""
         run = self.run["run"]
         return float(run["current_limit"][0]) if len(run) else limits.CURRENT_LIMIT_A
 

@@ -61,7 +61,7 @@ class PowerHistory:
         return np.diff(np.append(self.time, self.end))
 
     def energy(self, power: FloatArray) -> float:
-        """Return the integral of `supply` or `heat` (n,), J."""
+        """Return the integral of the power `supply` or `heat` (n,) over the run, J."""
         return float(power @ self.spans)
 
     def average(self, power: FloatArray, begin: float = -np.inf, end: float = np.inf) -> float:
@@ -195,7 +195,8 @@ def streaks(run: Run) -> Object:
 def star_attitudes(run: Run) -> Object:
     """Return the number of frames and attitudes of the star tracker, and the errors of the attitudes.
 
-    `rms_error` (rad) is about the body axes, and `normalised` is defined as in `streaks`.
+    The value `rms_error` (rad) is the rms error about the body axes. The value `normalised` is the mean of e'
+    P^-1 e / 3 as in `streaks`.
     """
     packets, truth = run["stars"], run["truth"]
     solved = packets[np.all(np.isfinite(packets["quaternion"]), axis=1)]
@@ -239,8 +240,8 @@ def failed_frames(run: Run) -> list[Object]:
 def estimate_errors(run: Run) -> Object | None:
     """Return the rms errors of the estimated angle and rate about the thread, or None without a truth.
 
-    `*_normalised` is the rms of the error divided by the estimated standard deviation. The ratio is 1 if the
-    standard deviations are correct.
+    A name that ends with `_normalised` is the rms of the error divided by the estimated standard deviation.
+    The ratio is 1 if the standard deviations are correct.
     """
     control, truth = run["control"], run["truth"]
     control = control[np.isfinite(control["angle"]) & np.isfinite(control["rate"])]

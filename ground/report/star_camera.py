@@ -1,4 +1,4 @@
-"""Availability of the star camera in orbit: the share of unobstructed instants that gave a measurement."""
+"""Availability of the star camera in orbit: the fraction of unobstructed instants that gave a measurement."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
 
     The instants are those of the camera's schedule: every `camera.period` s, and every `camera.fine_period` s
     while the attitude is fine. An instant is unobstructed if the true body rate is below `camera.max_rate`
-    and the true boresight is outside `pointing.cones` of Sun and Earth. It gave a measurement if the frame
-    exposed before the next instant contains an attitude or a rate. The longest gap is the longest time of
-    consecutive unobstructed instants without a measurement. Returns None without a star camera or a truth
-    log.
+    and the true boresight is outside `pointing.cones` of Sun and Earth. An instant gave a measurement if the
+    frame that was exposed before the next instant shows an attitude or a rate. The longest gap is the longest
+    time of consecutive unobstructed instants without a measurement. Returns None without a star camera or a
+    truth log.
     """
     camera = config.camera
     if camera is None or not len(run["truth"]) or not len(run["orbit_truth"]):
@@ -53,9 +53,10 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
 
 
 def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the scheduled times (n,) of exposures, s, the times (n,) of the next ones, and which are slow.
+    """Return the times (n,), s, of the camera's schedule, the next times (n,), s, and flags (n,).
 
-    As in flight, an instant at which the body is too fast does not delay the next one.
+    A flag states whether the body is slower than `camera.max_rate`. As in flight, an instant at which the
+    body is too fast does not delay the next instant.
     """
     last = min(float(seconds(run[name])[-1]) for name in ("truth", "orbit_truth"))
     ticks = np.arange(0.0, last + camera.period, camera.period)
@@ -76,7 +77,7 @@ def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArr
 def _outside_cones(
     run: Run, instants: FloatArray, boresight: FloatArray, cones: dict[str, float]
 ) -> BoolArray:
-    """Return whether (n,) the boresight (3,), body axes, is outside the cones of Sun and Earth."""
+    """Return flags (n,): whether the boresight (3,), body axes, is outside the cones of Sun and Earth."""
     body, around = run["truth"], run["orbit_truth"]
     to_body = attitude_matrix(body["quaternion"][_rows(body, instants)].astype(float))
     shown = np.einsum("nij,i->nj", to_body, boresight)
@@ -94,7 +95,7 @@ def _angles(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def _rows(packets: PacketArray, instants: FloatArray) -> IntArray:
-    """Return the indices (n,) of the packets nearest before the instants."""
+    """Return the indices (n,) of the last packets before the instants."""
     return np.maximum(np.searchsorted(seconds(packets), instants, side="right") - 1, 0)
 
 

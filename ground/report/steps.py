@@ -1,11 +1,11 @@
 """Figures of merit of each attitude step of the testbed (Sease 2013, Table 5.3).
 
-Time zero is the time of the step's command. The step runs to its target from the previous target if the body
-held that target, otherwise from the attitude of the body. Rise time is from 10 to 90 % of the step. Overshoot
-is the excursion beyond the target, in % of the step. Settling time is the time of the last entry into +-5 %
-of the step around the target. Steady-state error is the largest error over the last 30 s, in degrees of theta
-= 2 asin q2, for targets held for a minute or more. Crossings are interpolated between samples. A step that
-ends within 30 s without settling is interrupted and is not judged.
+Time zero is the time of the step's command. A step begins at the previous target if the body held that
+target, otherwise at the attitude of the body. Rise time is from 10 to 90 % of the step. Overshoot is the
+excursion beyond the target, in % of the step. Settling time is the time of the last entry into +-5 % of the
+step around the target. Steady-state error is the largest error over the last 30 s, in degrees of theta = 2
+asin q2, for targets held for a minute or more. Crossings are interpolated between samples. A step that ends
+within 30 s without settling is interrupted and is not judged.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class StepCommand:
 
     @property
     def rise_is_judged(self) -> bool:
-        """Whether the thesis limits the rise time, which is so only for steps between targets."""
+        """Whether the thesis limits the rise time, as it does only for steps between targets."""
         return self.index > 0 and self.from_target
 
 
@@ -272,7 +272,7 @@ def judge(quantity: str, values: Sequence[float], limit: float, unit: str) -> Ob
 def against_thesis(steps: list[tuple[StepCommand, StepResponse | None]], power: Object) -> list[Object]:
     """Return the worst value of each figure with the thesis's limit.
 
-    `power` is the report's power section.
+    The section of the report about power is `power`.
     """
     judged = [(command, found) for command, found in steps if found is not None]
     rise = [found.rise_s for command, found in judged if command.rise_is_judged]

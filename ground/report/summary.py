@@ -266,7 +266,10 @@ def _health(packets: PacketArray) -> Object | None:
 
 
 def _events(packets: PacketArray) -> list[Object]:
-    """Return the events by name in order of first appearance. `count` includes the throttled events."""
+    """Return the events by name in order of first appearance.
+
+    The value `count` includes the events whose packets were suppressed by throttling.
+    """
     found: dict[str, Object] = {}
     for row, time in zip(packets, seconds(packets), strict=True):
         name, text = to_text(row["name"]), to_text(row["text"])
