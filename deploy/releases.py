@@ -28,7 +28,7 @@ DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, 
 """Exceptions that reading a damaged JSON record can raise."""
 LARGEST_RECORD, LARGEST_MANIFEST = 1 << 16, 1 << 24
 """Maximum sizes (bytes) of a record and of a manifest."""
-_OURS = re.compile(r"(?!venv/)|venv/lib/python[^/]*/site-packages/(flight|hal|sim_hal)/")
+_OURS = re.compile(r"(?!venv/)|venv/lib/python[^/]*/site-packages/(flight|hal|knightcube|sim_hal)/")
 
 
 def files_of(release: Path) -> Iterator[Path]:

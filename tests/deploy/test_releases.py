@@ -90,6 +90,18 @@ def test_a_damaged_release_gives_way_to_a_whole_one_but_flies_where_there_is_non
     assert "0.1.0+1: venv/lib/python3/site-packages/flight/label is damaged; 0.1.0+2 flies" in complaint
 
 
+@pytest.mark.parametrize("package", ["flight", "hal", "knightcube", "sim_hal"])
+def test_the_content_of_each_of_our_packages_is_compared_at_a_start(board: FakeBoard, package: str) -> None:
+    current = releases.linked(board.prefix, "current")
+    path = current / "venv/lib/python3/site-packages" / package / "module.py"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("sound", encoding="ascii")
+    (current / releases.MANIFEST).write_text(releases.manifest_text(current), encoding="ascii")
+    assert releases.damage(current) == ""
+    path.write_text("sOund", encoding="ascii")
+    assert f"{package}/module.py is damaged" in releases.damage(current)
+
+
 def test_of_libraries_the_size_is_compared_at_a_start_and_the_content_on_request(board: FakeBoard) -> None:
     library = board.prefix / "current/venv/lib/python3/site-packages/numpy/numpy.py"
     library.write_text("NUMPY\n", encoding="ascii")
