@@ -28,7 +28,7 @@ from knightcube.vision.camera.lens import Lens, Pinhole
 from sim_hal.clock import EmulatedDevice, FaultTimeline, SerialEnd, TimedSimulation
 from sim_hal.description_errors import NO_ERRORS, description_errors
 from sim_hal.emulators.camera import EmulatedCamera, Expose, no_objects
-from sim_hal.emulators.coil_circuit import CoilCircuit, EmulatedIna219
+from sim_hal.emulators.coil_circuit import CoilCircuit, CoilCondition, EmulatedIna219
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
@@ -199,6 +199,8 @@ def assemble_coils(
     supply = truth.supply_voltage or coils.supply_voltage
     settings = CoilSettings(wired, supply, max(coils.limits), coils.stale_after)
     circuit = CoilCircuit(pwm, settings, generator, now_ns, section.current_noise, BUS_VOLTAGE)
+    for axis in coils.absent:
+        circuit.become(axis, CoilCondition.OPEN)
     monitor, fitted = None, config.power_monitor
     if fitted is not None:
         monitor = EmulatedIna219(fitted.address, now_ns, circuit.mean_supply, fitted.shunt)

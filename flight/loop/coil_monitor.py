@@ -313,6 +313,7 @@ class CoilMonitorSettings:
         tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
         trial_after_ns: time (ns) from the verdict on a coil to its next trial.
         trials: largest number of trials of each coil.
+        absent: axes without a coil.
     """
 
     full_current: tuple[float, float, float]
@@ -330,6 +331,7 @@ class CoilMonitorSettings:
     tumble_rate: float = math.inf
     trial_after_ns: int = 600_000_000_000
     trials: int = 3
+    absent: frozenset[int] = frozenset()
 
 
 _UNSEEN_NS = 600_000_000
@@ -654,8 +656,9 @@ class CoilMonitor:
 
     @property
     def available(self) -> BoolArray:
-        """Flags (3,) of the axes that are not broken, for `knightcube.gnc.control.allocation`."""
-        return np.array([axis not in self._verdicts for axis in range(3)])
+        """Flags (3,) of the axes with a coil that is not broken, for `knightcube.gnc.control.allocation`."""
+        broken = self._verdicts.keys() | self._settings.absent
+        return np.array([axis not in broken for axis in range(3)])
 
     @property
     def resting(self) -> BoolArray:
@@ -759,7 +762,7 @@ class CoilMonitor:
             if slow and response.is_healthy(axis):
                 self.correction.confirm(axis)
                 self._tell(axis, f"{response.text(axis)} while the body is slow, which confirms its sign")
-        known = self._verdicts.keys() | self._rests.keys()
+        known = self._verdicts.keys() | self._rests.keys() | self._settings.absent
         # An uncommanded current also makes a torque, which could be mistaken for that of a reversed coil.
         if not self._leg.suspicion and (not self._strangeness or self._prime is not None):
             for axis in response.axes(Finding.REVERSED):
@@ -883,7 +886,7 @@ class CoilMonitor:
     @property
     def _known(self) -> dict[int, CoilFault]:
         """The fault of each broken axis, as it affects the supply current; a braked axis draws no current."""
-        return {
+        return dict.fromkeys(self._settings.absent, CoilFault.OPEN) | {
             axis: CoilFault.OPEN if verdict.fault in _BRAKED else verdict.fault
             for axis, verdict in self._verdicts.items()
         }

@@ -5,6 +5,7 @@ The devices are opened and closed, and the tasks composed, by `flight.app`.
 
 from __future__ import annotations
 
+import math
 import time
 import zlib
 from collections.abc import Callable, Mapping
@@ -196,7 +197,7 @@ class FlightLoop:
     def _begin(self, epoch_ns: int, label: RunLabel) -> None:
         """Start all tasks at mission time zero, and record the properties of the run."""
         config, services, tasks, supervisors = self._config, self._services, self._tasks, self._supervisors
-        recorder, clock = services.recorder, services.clock
+        recorder, clock, coils = services.recorder, services.clock, config.coils
         recorder.epoch_ns = epoch_ns
         tasks.navigation.begin(epoch_ns)
         if tasks.imaging is not None:
@@ -219,9 +220,11 @@ class FlightLoop:
             realtime=int(label.realtime),
             control_period_ns=self._groups[0].period_ns,
             duration=config.duration,
-            coil_resistance=list(config.coils.resistance),
-            supply_voltage=config.coils.supply_voltage,
-            current_limit=max(config.coils.limits),
+            coil_resistance=[
+                math.nan if k in coils.absent else ohm for k, ohm in enumerate(coils.resistance)
+            ],
+            supply_voltage=coils.supply_voltage,
+            current_limit=max(coils.limits),
         )
         tasks.modes.begin(epoch_ns, supervisors.keeper.record.unclean_recent if supervisors.keeper else 0)
         services.events.report(events.STARTED, epoch_ns, f"{config.name}, {config.duration:g} s")

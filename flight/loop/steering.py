@@ -70,7 +70,7 @@ class CoilDrive:
         self._events = services.events
         self._reported: set[int] = set()  # axes whose verdict was reported
         self._braked = NO_AXES
-        self.available = np.ones(3, dtype=bool)
+        self.available = watch.available
         self.command: FloatArray = np.zeros(3)
 
     def state(self) -> CoilState:
@@ -144,7 +144,7 @@ class CoilDrive:
             self._watch.forget(axis)
         self._reported.clear()
         self.isolate()
-        self._events.report(events.COIL_TRUSTED, now_ns, "all three axes are in use again")
+        self._events.report(events.COIL_TRUSTED, now_ns, "all coils are in use again")
 
     def _report_verdicts(self, now_ns: int) -> None:
         for verdict in self._watch.verdicts:

@@ -98,6 +98,10 @@ class Winding(Section, frozen=True, kw_only=True):
     channels: tuple[Channel, Channel] | None = None
     sign: Sign = 1
 
+    def pins(self, index: int) -> tuple[int, int]:
+        """Return the PWM channels of the coil with this index in `Coils.windings`."""
+        return self.channels or (2 * index, 2 * index + 1)
+
     def strength(self) -> float:
         """Return the dipole moment per ampere, m^2. Raises ConfigError if it is given twice or not at all."""
         if (self.turns is None) != (self.area is None):
@@ -115,7 +119,9 @@ class Winding(Section, frozen=True, kw_only=True):
 class Coils(Section, frozen=True, kw_only=True):
     """The PWM chip, the H-bridges and the coils; `bus` is the number or device file of the I2C bus.
 
-    The list `windings` has one entry per coil.
+    The list `windings` has one entry per coil. A satellite has two or three coils. With two coils, the flight
+    application treats the axis across both like that of a broken coil (`slots`). A dipole moment along the
+    magnetic field makes no torque, and is therefore added so that the missing coil needs no current.
     """
 
     bus: Bus = 1
@@ -126,32 +132,66 @@ class Coils(Section, frozen=True, kw_only=True):
     stale_after: Annotated[float, Meta(gt=0.0, le=0.4)] = 0.25
 
     @property
+    def absent(self) -> frozenset[int]:
+        """Indices of the entries of `slots` that have no coil."""
+        return frozenset({2}) if len(self.windings) == 2 else frozenset()
+
+    @property
+    def slots(self) -> tuple[Winding, ...]:
+        """The three coils as the flight application numbers them, where a third coil may not be fitted.
+
+        The coil that is not fitted lies along the normal of the other two. It has half the dipole moment of
+        the weaker one, so that plans are careful about this axis, and two free PWM channels.
+        """
+        if len(self.windings) != 2:
+            return self.windings
+        first, second = self.windings
+        x, y, z = np.cross(*(np.array(coil.axis) / math.hypot(*coil.axis) for coil in self.windings)).tolist()
+        used = {channel for k, coil in enumerate(self.windings) for channel in coil.pins(k)}
+        a, b = [channel for channel in range(16) if channel not in used][:2]
+        weaker = min(
+            self.windings, key=lambda one: one.strength() * (one.current_limit or self.current_limit)
+        )
+        half = 0.5 * weaker.strength()
+        return (
+            first,
+            second,
+            Winding(
+                axis=(x, y, z),
+                dipole_per_ampere=half,
+                resistance=weaker.resistance,
+                current_limit=weaker.current_limit,
+                channels=(a, b),
+            ),
+        )
+
+    @property
     def channels(self) -> tuple[tuple[int, int], ...]:
         """PWM channels of the bridge inputs A and B of each coil."""
-        return tuple(coil.channels or (2 * k, 2 * k + 1) for k, coil in enumerate(self.windings))
+        return tuple(coil.pins(k) for k, coil in enumerate(self.slots))
 
     @property
     def signs(self) -> tuple[int, ...]:
         """+1 for each coil, or -1 for a coil whose leads are swapped."""
-        return tuple(coil.sign for coil in self.windings)
+        return tuple(coil.sign for coil in self.slots)
 
     @property
     def resistance(self) -> tuple[float, ...]:
         """Resistance of each coil, ohm."""
-        return tuple(coil.resistance for coil in self.windings)
+        return tuple(coil.resistance for coil in self.slots)
 
     @property
     def limits(self) -> tuple[float, ...]:
         """Largest current of each coil, A."""
-        return tuple(coil.current_limit or self.current_limit for coil in self.windings)
+        return tuple(coil.current_limit or self.current_limit for coil in self.slots)
 
     def map(self) -> CoilMap:
         """Return the map from dipole moments to currents of a satellite's coils.
 
-        Raises ConfigError for a coil without dipole moment, and if the coils lie in a plane.
+        Raises ConfigError for a coil without dipole moment, and UsageError if the coils lie in a plane.
         """
-        axes = np.array([coil.axis for coil in self.windings], dtype=float).T
-        strength = np.array([coil.strength() for coil in self.windings])
+        axes = np.array([coil.axis for coil in self.slots], dtype=float).T
+        strength = np.array([coil.strength() for coil in self.slots])
         dipoles = axes / np.linalg.norm(axes, axis=0) * strength
         return CoilMap(dipoles, np.array(self.limits), np.array(self.resistance))
 

@@ -21,8 +21,10 @@ from flight.schema.orbit import Craft, ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
 from flight.schema.values import Quaternion, Vector, check_aim
+from knightcube.astro.arrays import FloatArray
 from knightcube.astro.inertia import inertia_problem
 from knightcube.errors import UsageError
+from knightcube.gnc.control.coil_map import LEAST_SPREAD
 
 Refuse = Callable[[str, str], None]
 """Function that raises the error about a value; its arguments are the value's dotted name and the problem."""
@@ -104,6 +106,8 @@ def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
 
 
 def _check_testbed_coils(coils: Coils, refuse: Refuse) -> None:
+    if len(coils.windings) != 3:
+        refuse("coils.windings", f"has {len(coils.windings)} entries: the testbed has three coils")
     for index, coil in enumerate(coils.windings):
         place, own = f"coils.windings[{index}]", tuple(float(index == axis) for axis in range(3))
         if coil.axis != own:
@@ -120,15 +124,21 @@ def _check_satellite_coils(coils: Coils, refuse: Refuse) -> None:
             coil.strength()
         except ConfigError as error:
             refuse(f"{place}.{error.where}", error.problem)
-        limit, reached = coils.limits[index], coils.supply_voltage / coil.resistance
+        limit, reached = coil.current_limit or coils.current_limit, coils.supply_voltage / coil.resistance
         if limit > _BEYOND * reached:
             key = "coils.current_limit" if coil.current_limit is None else f"{place}.current_limit"
             problem = f"is {limit:g}: the supply drives {reached:.3g} A through {coil.resistance:g} ohm"
             refuse(key, problem)
+    if len(coils.windings) == 2 and np.linalg.norm(np.cross(*_directions(coils))) < LEAST_SPREAD:
+        refuse("coils.windings", "are two parallel coils: give one of them another axis")
     try:
         coils.map()
     except UsageError as error:
         refuse("coils.windings", str(error))
+
+
+def _directions(coils: Coils) -> list[FloatArray]:
+    return [np.array(coil.axis) / math.hypot(*coil.axis) for coil in coils.windings]
 
 
 def _check_craft(craft: Craft, refuse: Refuse) -> None:
@@ -186,14 +196,14 @@ def _check_order(section: str, times: list[float], refuse: Refuse) -> None:
 
 def _check_coils(config: Config, refuse: Refuse) -> None:
     coils = config.coils
-    used = [c for pair in coils.channels for c in pair]
-    if len(set(used)) != len(used):
-        refuse("coils.windings", f"use a channel of the PWM chip twice: {used}")
     for index, coil in enumerate(coils.windings):
         if not any(coil.axis):
             refuse(f"coils.windings[{index}].axis", "is zero: give the direction of the coil's dipole moment")
-    if len(coils.windings) != 3:
-        refuse("coils.windings", f"has {len(coils.windings)} entries: this version flies three coils")
+    if not 2 <= len(coils.windings) <= 3:
+        refuse("coils.windings", f"has {len(coils.windings)} entries: two or three coils are flown")
+    used = [channel for index, coil in enumerate(coils.windings) for channel in coil.pins(index)]
+    if len(set(used)) != len(used):
+        refuse("coils.windings", f"use a channel of the PWM chip twice: {used}")
     if config.power_monitor is not None and config.power_monitor.address == config.coils.address:
         refuse(
             "power_monitor.address",

@@ -492,4 +492,7 @@ def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
     )
     slow = replace(response, bin_samples=40, least_bins=8, model_error=3.0e-5)
     tumble = config.modes.tumble_rate
-    return CoilMonitor(CoilMonitorSettings((x, y, z), response=response, slow=slow, tumble_rate=tumble))
+    settings = CoilMonitorSettings(
+        (x, y, z), response=response, slow=slow, tumble_rate=tumble, absent=config.coils.absent
+    )
+    return CoilMonitor(settings)

@@ -34,6 +34,7 @@ def _drive(resting: list[bool]) -> tuple[CoilDrive, Coils, SimpleNamespace]:
     coils = Coils()
     watch = SimpleNamespace(
         resting=np.array(resting),
+        available=np.ones(3, dtype=bool),
         at_rest=False,
         probe=None,
         suspicion="",

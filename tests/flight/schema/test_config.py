@@ -285,7 +285,7 @@ COIL = "{axis: [0.0, 0.0, 1.0], dipole_per_ampere: 0.648, resistance: 23.0, chan
             COIL.replace("23.0", "23.0, current_limit: 0.2"),
             r"\[2\].current_limit` is 0.2: the supply",
         ),
-        ("", "has 2 entries: this version flies three coils"),
+        (f"{COIL}\n    - {COIL}".replace("[4, 5]", "[6, 7]", 1), "has 4 entries: two or three coils"),
     ],
 )
 def test_a_mistake_in_the_coils_gets_one_line(wrong: str, complaint: str) -> None:
@@ -347,3 +347,15 @@ def test_given_values_replace_the_computed_ones() -> None:
     config = reader.replace(config, **changes)
     assert (config.torque_noise(), config.torque_sizes()) == (1e-6, (2e-9, 3e-12))
     assert (config.dipole_weight(), config.slew_duration()) == (4e-4, 500.0)
+
+
+def test_two_coils_leave_the_third_axis_without_a_coil() -> None:
+    text = ORBIT.replace(f"    - {COIL}\n", "", 1)
+    coils = as_orbit(reader.parse(text)).coils
+    assert (coils.absent, coils.channels) == (frozenset({2}), ((0, 1), (2, 3), (4, 5)))
+    np.testing.assert_allclose(coils.map().dipoles, np.diag([0.648, 0.648, 0.324]))
+    parallel = text.replace("axis: [0.0, 1.0, 0.0], dip", "axis: [2.0, 0.0, 0.0], dip", 1)
+    with pytest.raises(ConfigError, match="are two parallel coils"):
+        reader.parse(parallel)
+    with pytest.raises(ConfigError, match="has 2 entries: the testbed has three coils"):
+        reader.parse(re.sub(r"\n    - \{axis: \[0.0, 0.0, 1.0\].*", "", DEMO, count=1))
