@@ -25,6 +25,7 @@ from flight.schema.values import (
     Sign,
     Vector,
 )
+from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
@@ -98,6 +99,10 @@ class Winding(Section, frozen=True, kw_only=True):
     channels: tuple[Channel, Channel] | None = None
     sign: Sign = 1
 
+    def direction(self) -> FloatArray:
+        """Return the unit vector (3,) along the dipole moment, body axes."""
+        return np.asarray(np.array(self.axis) / np.linalg.norm(self.axis))
+
     def pins(self, index: int) -> tuple[int, int]:
         """Return the PWM channels of the coil with this index in `Coils.windings`."""
         return self.channels or (2 * index, 2 * index + 1)
@@ -146,7 +151,7 @@ class Coils(Section, frozen=True, kw_only=True):
         if len(self.windings) != 2:
             return self.windings
         first, second = self.windings
-        x, y, z = np.cross(*(np.array(coil.axis) / math.hypot(*coil.axis) for coil in self.windings)).tolist()
+        x, y, z = np.cross(first.direction(), second.direction()).tolist()
         used = {channel for k, coil in enumerate(self.windings) for channel in coil.pins(k)}
         a, b = [channel for channel in range(16) if channel not in used][:2]
         weaker = min(
@@ -190,9 +195,8 @@ class Coils(Section, frozen=True, kw_only=True):
 
         Raises ConfigError for a coil without dipole moment, and UsageError if the coils lie in a plane.
         """
-        axes = np.array([coil.axis for coil in self.slots], dtype=float).T
         strength = np.array([coil.strength() for coil in self.slots])
-        dipoles = axes / np.linalg.norm(axes, axis=0) * strength
+        dipoles = np.array([coil.direction() for coil in self.slots]).T * strength
         return CoilMap(dipoles, np.array(self.limits), np.array(self.resistance))
 
 

@@ -21,7 +21,6 @@ from flight.schema.orbit import Craft, ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
 from flight.schema.values import Quaternion, Vector, check_aim
-from knightcube.astro.arrays import FloatArray
 from knightcube.astro.inertia import inertia_problem
 from knightcube.errors import UsageError
 from knightcube.gnc.control.coil_map import LEAST_SPREAD
@@ -129,16 +128,14 @@ def _check_satellite_coils(coils: Coils, refuse: Refuse) -> None:
             key = "coils.current_limit" if coil.current_limit is None else f"{place}.current_limit"
             problem = f"is {limit:g}: the supply drives {reached:.3g} A through {coil.resistance:g} ohm"
             refuse(key, problem)
-    if len(coils.windings) == 2 and np.linalg.norm(np.cross(*_directions(coils))) < LEAST_SPREAD:
-        refuse("coils.windings", "are two parallel coils: give one of them another axis")
+    if len(coils.windings) == 2:
+        first, second = (coil.direction() for coil in coils.windings)
+        if np.linalg.norm(np.cross(first, second)) < LEAST_SPREAD:
+            refuse("coils.windings", "are two parallel coils: give one of them another axis")
     try:
         coils.map()
     except UsageError as error:
         refuse("coils.windings", str(error))
-
-
-def _directions(coils: Coils) -> list[FloatArray]:
-    return [np.array(coil.axis) / math.hypot(*coil.axis) for coil in coils.windings]
 
 
 def _check_craft(craft: Craft, refuse: Refuse) -> None:
