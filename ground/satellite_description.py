@@ -61,7 +61,7 @@ class Satellite:
         mass: kg.
         size: lengths of the sides along the body axes, m.
         orbit: orbit at `utc`.
-        utc: begin of the flight, UTC, ISO 8601.
+        utc: start of the flight, UTC, ISO 8601.
         coils: coils and rods.
         supply_voltage: voltage across a coil that is fully on, V.
         field_of_view_deg: field of view of the star camera, deg, or None without a star camera.
@@ -90,10 +90,10 @@ class Derived:
         dipole: dipole of the coils in a typical direction, A m^2.
         field: root mean square of the magnetic field along the orbit, T.
         coil_torque: torque of this dipole in this field, N m.
-        disturbance: torque of air and sunlight on the largest face at the worst mass offset, N m.
+        disturbance: torque of air and sunlight on the largest face, with a mass offset of 2 cm, N m.
         momentum_time: time (s) in which this coil torque removes the rate at the release.
         period: orbital period, s.
-        slow_within: estimated limit of the time of detumbling, s.
+        slow_within: estimate of the longest time of detumbling, s.
         duration: duration of the flight, s.
         detumble_horizon: planning horizon of detumbling, s.
         roll: roll error whose cost equals that of an error of 1 deg of the pointing axis, rad.
@@ -141,7 +141,7 @@ def largest_dipole(coils: tuple[Coil, ...]) -> float:
 
 
 def derived(satellite: Satellite, julian_date: float) -> Derived:
-    """Return the values that follow from the description; the flight begins at `julian_date`, UTC."""
+    """Return the values that follow from the description; the flight starts at `julian_date`, UTC."""
     orbit, size = satellite.orbit, satellite.size
     x, y, z = np.diag(box_inertia(satellite.mass, size)).tolist()
     inertia = (x, y, z)
@@ -176,7 +176,7 @@ def derived(satellite: Satellite, julian_date: float) -> Derived:
 
 
 def _worst_pressure(altitude: float) -> float:
-    """Return the pressure of air and sunlight on a face, Pa, at an altitude in m."""
+    """Return the pressure (Pa) of air and sunlight on a face at an altitude (m)."""
     axis = EARTH_RADIUS + altitude
     density = math.exp(float(log_density(np.array([[axis, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]]), 0.0)[0]))
     return 0.5 * _DRAG_COEFFICIENT * density * GRAVITATIONAL_PARAMETER / axis + 2.0 * _SUN_PRESSURE
@@ -262,7 +262,7 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
         (f"duration: {values.duration:g}", "s, detumbling and more than one revolution [computed]"),
         "",
         ("simulation:", "the simulated satellite; other values equal those above"),
-        (f"  utc: '{satellite.utc}'", "begin of the flight [given]"),
+        (f"  utc: '{satellite.utc}'", "start of the flight [given]"),
         "  free_body:",
         (f"    orbit: {{{place}}}", "m, deg, h [given]"),
         (
@@ -323,7 +323,7 @@ def _camera_lines(satellite: Satellite, values: Derived) -> list[Line]:
     return [
         ("camera:", "star camera; its other values are those of a camera with 512 x 512 px"),
         f"  # The boresight is body {side}, turned by {TILT_DEG:g} deg to -z, the zenith if +z points down.",
-        f"  # At the begin {sun} [computed].",
+        f"  # At the start, {sun} [computed].",
         f"  mounting: [{sine * math.sin(half):.8f}, 0.0, 0.0, {math.cos(half):.8f}]",
         (f"  field_of_view_deg: {_text(satellite.field_of_view_deg)}", "deg [given]"),
         "",
@@ -352,7 +352,7 @@ def _text(value: float) -> str:
 
 
 def _laid_out(*lines: Line) -> str:
-    """Return lines of text, where a pair is a value and its comment."""
+    """Return the text of lines; a pair becomes a line with a comment."""
     texts = []
     for line in lines:
         if isinstance(line, str):

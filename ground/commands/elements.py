@@ -34,7 +34,7 @@ _SPAN, _STEP = 86_400.0, 600.0
 _ECCENTRICITY = OrbitSection().eccentricity
 """Default eccentricity of an orbit."""
 _COLUMNS, _VELOCITY = ("utc", "x", "y", "z"), ("vx", "vy", "vz")
-"""Columns of a CSV file of fixes: the required ones, and those of the velocity."""
+"""Required columns of a CSV file of fixes, and its optional columns of the velocity."""
 _ORBIT = ("inclination", "eccentricity", "node", "local_time", "perigee", "anomaly", "epoch")
 
 
@@ -194,7 +194,7 @@ def read_fixes(path: Path) -> Fixes:
 
 
 def _celestial(dates: FloatArray, states: FloatArray) -> Fixes:
-    """Return fixes of states (n, 3 or 6): position and velocity with respect to the ground, ITRS."""
+    """Return the fixes of states (n, 3 or 6), ITRS: positions, and velocities with respect to the ground."""
     turns = np.array([celestial_to_terrestrial(float(date)) for date in dates]).reshape(-1, 3, 3)
     positions = np.einsum("nji,nj->ni", turns, states[:, :3])
     if states.shape[1] == 3:

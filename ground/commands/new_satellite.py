@@ -46,7 +46,7 @@ from sim_hal.settings import OrbitSection
 from sim_hal.worlds.orbit import julian_date
 
 _WEAK = 3.0
-"""Ratio of the coils' torque to the worst disturbance torque below which a warning is given."""
+"""Smallest ratio of the coils' torque to the worst disturbance torque for which no warning is printed."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -128,7 +128,7 @@ def _written(answers: Answers, force: bool) -> tuple[dict[str, Any], str]:
 
 
 class Answers:
-    """The texts of options and answers, and their values."""
+    """The values of the satellite's description, and the texts by which the user gave them."""
 
     def __init__(self, out: Path | None, force: bool) -> None:
         """`out` is the file to write, if it is given; `force` states whether it may be replaced."""
@@ -146,17 +146,23 @@ class Answers:
             self.path()
 
     def missing(self) -> list[str]:
-        """Return the required options that are not given."""
+        """Return the required options that the user has not given."""
         return [f"--{one.name}" for one in QUESTIONS if one.default is None and one.name not in self.values]
 
     def take_defaults(self) -> None:
-        """Take the default of each value that is not given. Raises UsageError for a contradiction."""
+        """Take the default of each value that the user has not given.
+
+        Raises UsageError if a default contradicts a given value.
+        """
         for question in self._open():
             if question.default is not None:
                 self._take(question, [question.default])
 
     def path(self) -> Path:
-        """Return the file to write. Raises UsageError if it exists, unless it may be replaced."""
+        """Return the file to write.
+
+        Raises UsageError if the file exists and may not be replaced.
+        """
         path = self._out or Path(f"{self.values.get('name', QUESTIONS[0].default)}.yaml")
         if not self._force and os.path.lexists(path):
             raise UsageError(f"{path}: this file exists: give another --out, or --force to replace it")
@@ -171,7 +177,7 @@ class Answers:
         return " ".join([*words, *(["--out", shlex.quote(str(self._out))] if self._out is not None else [])])
 
     def ask(self) -> None:
-        """Ask for the values that are not given.
+        """Ask for the values that the user has not given as options.
 
         If the questions end early, the command with the answers so far is shown. Raises KeyboardInterrupt
         after Ctrl-C, and UsageError at the end of the input.
@@ -189,7 +195,7 @@ class Answers:
             raise UsageError(f"the input has ended; to continue: {self.command()}") from None
 
     def _open(self) -> Iterator[Question]:
-        """Yield the questions without a value, in order."""
+        """Yield the questions whose values are still unknown, in order."""
         yield from (question for question in QUESTIONS if question.name not in self.values)
 
     def _taker(self, question: Question) -> Callable[[str], None]:
@@ -233,7 +239,7 @@ class Answers:
                 sys.stderr.write(f"  {error}\n")
 
     def _take(self, question: Question, texts: list[str]) -> None:
-        """Take the texts of a value. Raises UsageError if it is impossible."""
+        """Read the texts of a value, and keep it. Raises UsageError for an impossible value."""
         name = question.name
         for text in texts:
             value = read_value(name, text)
@@ -248,7 +254,7 @@ class Answers:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Let Ctrl-C raise KeyboardInterrupt; elsewhere it ends a command at once."""
+    """Make Ctrl-C raise KeyboardInterrupt instead of ending the process at once."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield
@@ -293,7 +299,7 @@ def _check(text: str, path: Path) -> None:
         config = configuration.parse(text, str(path))
         check_settings(config)
         check_simulated_elements(RunRequest(path, Path()), text, config)
-    except ConfigError as error:  # the line is of no use, because there is no file yet
+    except ConfigError as error:  # the line number is left out, because the file does not exist yet
         raise UsageError(f"nothing was written: {error.problem}") from error
 
 
@@ -309,7 +315,7 @@ def _replace(path: Path, text: str) -> None:
 
 
 def warnings_of(values: Derived) -> list[str]:
-    """Return what is questionable about a satellite."""
+    """Return warnings about weak coils."""
     found = []
     ratio = values.coil_torque / values.disturbance
     if ratio < _WEAK:

@@ -1,4 +1,4 @@
-"""The questions of `flight new-satellite`, the values of their answers, and checks of these values."""
+"""Questions of the command `flight new-satellite`, and functions that read and check the answers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _DENSITIES = (20.0, 20_000.0)
 """Range of the mean density, kg/m^3: from an empty box of thin sheet to solid tungsten."""
 _LOWEST_PERIGEE = 150.0
-"""Lowest perigee that is flown, km above the equatorial radius."""
+"""Lowest permitted perigee, km above the equatorial radius."""
 _HIGHEST_VOLTAGE = 36.0
 """Largest voltage across a coil, V."""
 _COIL_RANGES = {
@@ -48,7 +48,7 @@ class Question:
 
     Attributes:
         name: name of the option without dashes.
-        metavar: kind or unit of its texts in the help.
+        metavar: unit or form of the value, as the help shows it.
         text: the question, with the unit.
         read: function that returns the value of a text; it raises ValueError with the permitted values.
         default: text of the default value; None for a value that must be given.
@@ -77,7 +77,7 @@ def number(low: float, high: float, unit: str) -> Callable[[str], float]:
 
 
 def coil_number(key: str, text: str) -> float:
-    """Return a number that describes a coil. Raises ValueError with the range."""
+    """Return the number of a text that describes a coil. Raises ValueError with the permitted range."""
     try:
         return number(*_COIL_RANGES[key])(text)
     except ValueError as error:
@@ -134,7 +134,7 @@ def _read_name(text: str) -> str:
 
 
 def _read_size(text: str) -> Vector:
-    """Return the size of a box such as 0.3x0.1x0.1, or of the CubeSat of a name such as 3u."""
+    """Return the size of a box such as 0.3x0.1x0.1, or the size of a CubeSat such as 3u."""
     if text.lower() in _FORMS:
         return _FORMS[text.lower()]
     parts = text.lower().split("x")
@@ -190,11 +190,11 @@ QUESTIONS = (
     Question(
         "local-time",
         "H",
-        "mean local time of the ascending node at the begin, h",
+        "mean local time of the ascending node at the start, h",
         number(0.0, 24.0, "h"),
         "10.5",
     ),
-    Question("utc", "UTC", "begin of the flight, UTC", _read_utc, "2026-03-20T12:00:00"),
+    Question("utc", "UTC", "start of the flight, UTC", _read_utc, "2026-03-20T12:00:00"),
     Question(
         "coil",
         "KEY=VALUE,...",
@@ -218,7 +218,7 @@ COIL_QUESTIONS = (
 
 
 def read_value(name: str, text: str) -> Any:
-    """Return the value of a text for the question `name`. Raises UsageError with value and cure."""
+    """Return the value of a text for the question `name`. Raises UsageError with the permitted values."""
     (question,) = (one for one in QUESTIONS if one.name == name)
     try:
         return question.read(text)
@@ -229,7 +229,7 @@ def read_value(name: str, text: str) -> Any:
 def check_values(name: str, values: Values) -> None:
     """Check the value of the question `name` against the values that are known so far.
 
-    Raises UsageError with the contradiction and the cure.
+    Raises UsageError if they contradict each other.
     """
     problem = ""
     if name in {"mass", "size"} and {"mass", "size"} <= set(values):
@@ -252,7 +252,7 @@ def _density_problem(mass: float, size: Vector) -> str:
     if low <= mass / volume <= high:
         return ""
     bounds = f"{low * volume:.2g} to {high * volume:.3g} kg"
-    return f"{mass:g} kg in this size is {mass / volume:,.3g} kg/m^3: a size in m like this needs {bounds}"
+    return f"{mass:g} kg in this size is {mass / volume:,.3g} kg/m^3: give {bounds}, or another size in m"
 
 
 def _perigee_problem(altitude: float, eccentricity: float) -> str:

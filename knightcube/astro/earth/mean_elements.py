@@ -3,7 +3,7 @@
 The fitted parameters are the mean motion, the eccentricity vector, the inclination, the node and the mean
 argument of latitude, which remain well defined for circular orbits. The drag term is zero. The fit
 begins with the first positions, and the span is extended step by step, so that no revolution is lost between
-distant positions. Positions far outside the residuals of the others are rejected.
+distant positions. Positions whose residuals are far above the median are rejected.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _FIRST_SPAN, _GROWTH = 2_500.0, 3.0
 _VELOCITY_TIME = 100.0
 """Ratio (s) of the standard deviations of positions and velocities that is assumed in the fit."""
 _FAR, _NEAREST, _ROUNDS = 6.0, 300.0, 4
-"""Multiple of the median residual and distance (m) beyond which positions are rejected; number of fits."""
+"""Positions are rejected beyond _FAR median residuals and _NEAREST m, in at most _ROUNDS fits."""
 _FIRST_ECCENTRICITY, _DIFFERENCE = 1e-3, 1e-6
 """Eccentricity of the first guess, and relative step of the numerical derivatives.
 
@@ -136,7 +136,7 @@ class _Fit:
         return _first_guess(np.array([first, second]))
 
     def solve(self, parameters: FloatArray, used: BoolArray) -> Any:
-        """Return the solution of SciPy for the used states, beginning with `parameters`."""
+        """Return the least-squares solution for the used states; the iteration starts at `parameters`."""
 
         def residuals(values: FloatArray) -> FloatArray:
             made = _satellite(values, self.epoch)
