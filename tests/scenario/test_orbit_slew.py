@@ -98,7 +98,7 @@ def test_a_slew_is_handed_over_to_pointing_without_a_jump(slewed: Run) -> None:
     arrived, there = (
         np.degrees(angle_between(found["quaternion"], found["target"])) for found in (last, over)
     )
-    assert arrived < 1.0
+    assert arrived < 0.3
     assert there.max() < 2.0
 
 

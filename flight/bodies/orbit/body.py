@@ -24,6 +24,7 @@ from flight.bodies.orbit.filter import (
     start_from,
 )
 from flight.bodies.orbit.guidance import (
+    LearnedBody,
     ObjectAim,
     PlannedCraft,
     PointingPaths,
@@ -263,7 +264,7 @@ class SatelliteControl(BodyControl):
             _planned(config),
             paths,
             environment,
-            lambda: (filter_.torque_sizes, filter_.residual_dipole),
+            lambda: LearnedBody(filter_.inertia, filter_.torque_sizes, filter_.residual_dipole),
             self._objects,
             services,
         )

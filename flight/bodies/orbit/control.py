@@ -132,6 +132,17 @@ class SunAcquisitionLaw(_MagneticLaw):
 
 
 _NOTHING: FloatArray = np.zeros(3)
+_LARGEST_COIL_ERROR = 0.3
+"""Largest compensated error of an element of the coils' matrix. The matrix is then always invertible."""
+
+
+def commanded(dipole: FloatArray, coils: FloatArray) -> FloatArray:
+    """Return the command (3,), A m^2, with which the coils cause a dipole (3,), A m^2.
+
+    `coils` (3, 3) is the estimated matrix from the commanded to the true dipole.
+    """
+    errors = np.clip(coils - np.eye(3), -_LARGEST_COIL_ERROR, _LARGEST_COIL_ERROR)
+    return np.asarray(np.linalg.solve(np.eye(3) + errors, dipole))
 
 
 class PointingTracker:
@@ -180,6 +191,7 @@ class PointingTracker:
         dipole = found.dipole
         if not reference.paths.led(found.rotation, rate, reference.time_ns):
             dipole = damping_dipole(self._inertia, rate, field) - residual
+        dipole = commanded(dipole, self._filter.coil_matrix)
         # The factor makes the mean dipole over the window equal to the required dipole.
         dipole = dipole * (self._pauses.period_ns / self._pauses.act_ns)
         held = limited(dipole, self._coils.limits)

@@ -680,6 +680,16 @@ class OrbitFilter:
         return self._free.torque_sizes
 
     @property
+    def inertia(self) -> FloatArray:
+        """The estimated inertia tensor (3, 3), kg m^2, in body axes."""
+        return self._free.inertia
+
+    @property
+    def coil_matrix(self) -> FloatArray:
+        """Matrix (3, 3) from the commanded to the estimated dipole of the coils."""
+        return self._free.coil_matrix
+
+    @property
     def residual_dipole(self) -> FloatArray:
         """The residual dipole (3,), A m^2, in body axes, for the present sunlight."""
         lit = self._steps[-1].around.sunlit if self._steps else 0.0

@@ -4,6 +4,10 @@ A path is a table of feedback gains and reference motion for the pointing law. A
 is set, when the attitude becomes known again, and when the body leaves its path. Paths are also planned
 periodically, because the orbit prediction ages and a free roll angle follows the body.
 
+During a slew, the rest of the slew is planned again every few seconds from the newest estimate, with the
+estimated inertia, residual dipole and torques. The running path is followed until the new path begins. A new
+path that arrives late is followed from its point for the present time on.
+
 A satellite that follows an object points to the search direction first, then to the track of the object.
 Without a track, the boresight stays at the search direction. If there are several tracks, the satellite
 follows the brightest object until its track ends. The satellite follows the predicted direction of the track,
@@ -26,12 +30,14 @@ from flight.loop.executive import Cycle, JobResult
 from flight.loop.facts import EventLog, Services
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import box_areas
 from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.gnc.control.pointing_job import (
     STEADY,
     ObjectDirection,
     PointingJob,
+    RunningSlew,
     SlewRequest,
 )
 from knightcube.gnc.control.pointing_law import PathRecovery, PointingLaw
@@ -39,6 +45,7 @@ from knightcube.gnc.control.pointing_table import PointingTable, PointingWeights
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference, BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.slew_model import SlewPath
 from knightcube.gnc.tracker import Track
 
 
@@ -67,6 +74,21 @@ class PathPoint:
         return self.motion.rate
 
 
+REST = 0.3
+"""Fraction of a slew before its end in which the slew is not planned again. A new plan would lead back small
+errors in a time that is too short for it; the feedback gains correct them instead."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Followed:
+    """A path from the time `begin_ns` on, with the origin of its times and its slew, if it has one."""
+
+    law: PointingLaw
+    origin_ns: int
+    begin_ns: int
+    slew: SlewPath | None
+
+
 class PointingPaths:
     """The path that the satellite follows; implements `flight.loop.body.FlownPaths`.
 
@@ -82,17 +104,21 @@ class PointingPaths:
         body axes or one per axis (3,). The value `fastest` is the largest permitted rate (rad/s) of a path.
         """
         self._limit, self._fastest = limit, fastest
-        self._law: PointingLaw | None = None
+        self._followed: _Followed | None = None
+        self._next: _Followed | None = None
         self._target: PointingTarget | None = None
-        self._origin_ns = 0
+        self._slew_ns = 0
         self._arrival_ns: int | None = None
         self.off = 0.0
         self.astray = PathRecovery()
 
-    def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
+    def offer(
+        self, table: PointingTable, target: PointingTarget, origin_ns: int, *, continues: bool = False
+    ) -> str:
         """Follow the part of a new path table that has permitted rates.
 
-        Return why the path is rejected, or an empty text if the path is followed.
+        Return why the path is rejected, or an empty text if the path is followed. A table that continues a
+        running slew (`continues`) is followed from its begin on, and other tables are followed at once.
         """
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
@@ -102,11 +128,18 @@ class PointingPaths:
             turn, most = np.rad2deg([table.fastest, self._fastest])
             limit = f"above {most:.2f} it is detumbled or the camera pauses"
             return f"it turns the body at {turn:.2f} deg/s, and {limit}"
-        self._law, self._target, self._origin_ns = PointingLaw(flown, self._limit), target, origin_ns
+        law = PointingLaw(flown, self._limit)
+        begin_ns = origin_ns + round(law.span[0] * SECOND_NS)
+        found = _Followed(law, origin_ns, begin_ns, table.slew)
+        if continues:
+            self._next = found
+            return ""
+        self._followed, self._next, self._target = found, None, target
         self.off, self._arrival_ns = 0.0, None
         self.astray.planned()
         if table.slew is not None:
-            self._arrival_ns = origin_ns + round((self._law.span[0] + table.slew.horizon) * SECOND_NS)
+            self._slew_ns = begin_ns
+            self._arrival_ns = begin_ns + round(table.slew.horizon * SECOND_NS)
         return ""
 
     def led(self, turn: FloatArray, rate: FloatArray, now_ns: int) -> bool:
@@ -122,6 +155,20 @@ class PointingPaths:
         """Return whether a slew to a target is under way."""
         return self._arrival_ns is not None and now_ns < self._arrival_ns and target == self._target
 
+    def running(self, now_ns: int) -> RunningSlew | None:
+        """Return the slew whose rest may be planned again, or None.
+
+        It is None before the slew begins, near its end, and while the last new plan has not begun.
+        """
+        point, followed = self.sample(now_ns), self._followed
+        if point is None or followed is None or followed.slew is None or self._next is not None:
+            return None
+        if self._arrival_ns is None or now_ns < followed.begin_ns:
+            return None
+        if self._arrival_ns - now_ns < REST * (self._arrival_ns - self._slew_ns):
+            return None
+        return RunningSlew(followed.slew, (now_ns - followed.begin_ns) / SECOND_NS)
+
     def has_arrived(self, now_ns: int) -> bool:
         """Return whether a slew has ended since the last call."""
         over = self._arrival_ns is not None and now_ns >= self._arrival_ns
@@ -131,10 +178,13 @@ class PointingPaths:
 
     def sample(self, now_ns: int) -> PathPoint | None:
         """Return the planned motion now, or None without a path or after its end."""
-        if self._law is None:
+        if self._next is not None and now_ns >= self._next.begin_ns:
+            self._followed, self._next, self.off = self._next, None, 0.0
+        followed = self._followed
+        if followed is None:
             return None
-        seconds = (now_ns - self._origin_ns) / SECOND_NS
-        return PathPoint(self, self._law, now_ns, seconds) if seconds <= self._law.span[1] else None
+        seconds, law = (now_ns - followed.origin_ns) / SECOND_NS, followed.law
+        return PathPoint(self, law, now_ns, seconds) if seconds <= law.span[1] else None
 
     def attitude(self, target: PointingTarget, now_ns: int) -> FloatArray | None:
         """Return the planned attitude (4,) of a target, or None while no path to this target is followed."""
@@ -153,7 +203,7 @@ class PointingPaths:
 
     def release(self) -> None:
         """Discard the path."""
-        self._law = self._target = self._arrival_ns = None
+        self._followed = self._next = self._target = self._arrival_ns = None
         self.astray.planned()
 
 
@@ -371,6 +421,25 @@ class ObjectAim:
 
 AGAIN_NS = 10_000_000_000
 """Time (ns) until the next planning request after a failed plan, or while the orbit is unknown."""
+REST_AGAIN_NS = 5_000_000_000
+"""Shortest time (ns) between two plans for the rest of a slew."""
+_SMALLEST = 0.5
+"""Smallest plausible principal moment of inertia, relative to the smallest described one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearnedBody:
+    """The estimates of the filter that the planner uses.
+
+    Attributes:
+        inertia: inertia tensor (3, 3) in body axes, kg m^2.
+        sizes: sizes (9,) of the disturbance torques, N m.
+        residual: residual dipole (3,), A m^2.
+    """
+
+    inertia: FloatArray
+    sizes: FloatArray
+    residual: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -397,17 +466,18 @@ class PointingPlanner:
         craft: PlannedCraft,
         paths: PointingPaths,
         environment: EstimatedEnvironment,
-        disturbed: Callable[[], tuple[FloatArray, FloatArray]],
+        learned: Callable[[], LearnedBody],
         objects: ObjectAim,
         services: Services,
     ) -> None:
         """Start without a plan.
 
-        The function `disturbed` returns the estimated torque sizes (9,), N m, and the residual dipole (3,), A
-        m^2.
+        The function `learned` returns the present estimates of body and torques.
         """
         self._craft, self._paths, self._environment = craft, paths, environment
-        self._disturbed, self._objects = disturbed, objects
+        self._learned, self._objects = learned, objects
+        self._areas = box_areas(craft.inertia)
+        self._smallest = _SMALLEST * float(np.linalg.eigvalsh(craft.inertia)[0])
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
         self._wanted = self._held = False
@@ -446,7 +516,9 @@ class PointingPlanner:
             if not astray.ready:
                 return
         elif self._paths.is_slewing(now_ns, goal):
-            return  # a new plan for the rest of a slew would dissipate far more heat
+            if estimate is not None and self._job is None and now_ns >= self._after_ns:
+                self._plan_rest(estimate, goal, now_ns)
+            return
         if self._paths.has_arrived(now_ns):
             text = f"{math.degrees(self._paths.off):.2f} deg off its path"
             self._events.report(events.SLEW_ENDED, now_ns, text)
@@ -454,38 +526,49 @@ class PointingPlanner:
         wanted = self._wanted or astray.ready or astray.leaving or self._objects.moved
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
-        orbit, craft = self._environment.state(now_ns), self._craft
-        if orbit is None:
+        job = self._new_job(estimate, goal, now_ns)
+        if job is None:
             self._fail("no plan: the orbit is not known", now_ns)
             return
-        sizes, residual = self._disturbed()
-        job = PointingJob(
-            self._count + 1,
-            now_ns,
-            orbit,
-            craft.inertia,
-            craft.axes,
-            craft.weights,
-            goal,
-            estimate.quaternion,
-            estimate.rate,
-            sizes,
-            craft.limit,
-            self._slew(goal, residual, now_ns),
-        )
+        # Disturbance torques along the field may move the body off its goal for a while, without a slew.
+        if self._paths.astray.since is None and self._paths.attitude(goal, now_ns) is not None:
+            job = replace(job, slew=None)
         job = self._objects.directed(job)
         if self._jobs.submit(PLANNER, job):
             self._wanted, self._job, self._count = False, job, job.number
             self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
 
-    def _slew(self, goal: PointingTarget, residual: FloatArray, now_ns: int) -> SlewRequest | None:
-        """Return the request of a slew to a goal, or None if the body is already on a path to this goal.
+    def _plan_rest(self, estimate: Estimate, goal: PointingTarget, now_ns: int) -> None:
+        """Submit the job that plans the rest of the running slew again, if it is not near its end."""
+        running = self._paths.running(now_ns)
+        job = None if running is None else self._new_job(estimate, goal, now_ns)
+        if job is not None and self._jobs.submit(PLANNER, job := replace(job, running=running)):
+            self._job, self._count = job, job.number
+            self._after_ns = now_ns + REST_AGAIN_NS
 
-        Disturbance torques along the field may move the body off its goal for a while, which requires no
-        slew.
-        """
-        on_path = self._paths.astray.since is None and self._paths.attitude(goal, now_ns) is not None
-        return None if on_path else replace(self._craft.slew, residual=residual)
+    def _new_job(self, estimate: Estimate, goal: PointingTarget, now_ns: int) -> PointingJob | None:
+        """Return the job of a slew to a goal from an estimate, or None while the orbit is unknown."""
+        orbit, craft = self._environment.state(now_ns), self._craft
+        if orbit is None:
+            return None
+        learned = self._learned()
+        # A tensor that no body can have is not used.
+        is_plausible = float(np.linalg.eigvalsh(learned.inertia)[0]) > self._smallest
+        return PointingJob(
+            self._count + 1,
+            now_ns,
+            orbit,
+            learned.inertia if is_plausible else craft.inertia,
+            craft.axes,
+            craft.weights,
+            goal,
+            estimate.quaternion,
+            estimate.rate,
+            learned.sizes,
+            craft.limit,
+            self._areas,
+            replace(craft.slew, residual=learned.residual),
+        )
 
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Fly the worker's plan."""
@@ -494,6 +577,8 @@ class PointingPlanner:
             return
         if result.outcome != "done":
             self._fail(f"plan {job.number}: {result.outcome}: {result.error}", now_ns)
+        elif job.running is not None:
+            self._continue(job, result.value, now_ns)
         elif self._paths.astray.since is not None and not self._paths.astray.ready:
             self._wanted = True  # requested before the damping; a new plan follows later
         elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
@@ -505,6 +590,16 @@ class PointingPlanner:
                 fastest = math.degrees(float(np.linalg.norm(slew.rate, axis=1).max()))
                 text = f"to {job.target.text} in {slew.horizon:.0f} s, {fastest:.2f} deg/s at most"
                 self._events.report(events.SLEW_BEGUN, now_ns, text)
+
+    def _continue(self, job: PointingJob, table: PointingTable | None, now_ns: int) -> None:
+        """Follow a plan for the rest of the running slew; without one, the running plan is kept."""
+        paths = self._paths
+        if table is None or paths.astray.since is not None or not paths.is_slewing(now_ns, job.target):
+            return
+        if reason := paths.offer(table, job.target, job.origin_ns, continues=True):
+            self._fail(f"plan {job.number}: {reason}", now_ns)
+        else:
+            self._accepted += 1
 
     def counts(self) -> tuple[int, int]:
         """Return how many plans were accepted, and how many were rejected, since the start."""

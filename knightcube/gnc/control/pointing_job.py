@@ -7,8 +7,10 @@ recomputed after each sighting.
 
 From a distant attitude, the body can approach the commanded attitude by a slew of minimum heat. The module
 `slew_plan` plans the slew with the disturbance torques that the attitude filter estimates. The planned dipole
-moments of the slew are used as feedforward. The gains come from linear-quadratic tracking along the slew and
-the following attitude law, and errors at the end of the slew have the highest cost. The pointing table also
+moments of the slew are used as feedforward. During the slew, the rest of the slew is planned again from the
+newest estimate of motion, body and torques, with the running path as the initial guess (`rest_table`). The
+gains come from linear-quadratic tracking along the slew and the following attitude law, and errors at the end
+of the slew have the highest cost. The pointing table also
 contains the change of the dipole moment per change of the estimated torques.
 """
 
@@ -20,10 +22,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.disturbance import Pressures, box_areas, pressures, shapes
+from knightcube.astro.earth.disturbance import Pressures, pressures, shapes
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
-from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
+from knightcube.astro.quaternion import (
+    angle_between,
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
 from knightcube.errors import PlanningError
 from knightcube.gnc.control.pointing_path import (
     CostToGo,
@@ -47,8 +56,17 @@ from knightcube.gnc.guidance.three_axes.attitude_law import (
     references,
 )
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft, SlewPath, SlewTask, along, cones
-from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_task
+from knightcube.gnc.guidance.three_axes.slew_model import (
+    NODES,
+    Cone,
+    EnvironmentAt,
+    SlewCraft,
+    SlewPath,
+    SlewTask,
+    along,
+    cones,
+)
+from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_near, plan_task
 
 RESERVE = 0.8
 """Fraction of the coils' limit that a planned slew may use; the remainder is for the correction of errors."""
@@ -65,6 +83,11 @@ END = 2_000.0
 """Weight (s) of errors at the end of a slew: an error at the end costs as much as the same error that lasts
 for this time. The weight is high because disturbance torques are poorly known before the slew, and the errors
 that they cause should be corrected by the end of the slew."""
+HOTTER = 1.1
+"""Largest ratio of the heat of a new plan to the heat of the running plan for the rest of a slew. A hotter
+plan would lead back a deviation for which the remaining time is too short."""
+_INSIDE = 1e-6
+"""Angle (rad) by which a cone that a running path violates is made narrower than the violation."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
 """Additional factor by which a slew that rotates too fast is lengthened, largest total factor, and largest
 number of trials."""
@@ -100,6 +123,7 @@ class SlewStart:
         inertia: (3, 3) kg m^2.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
         sizes: estimated sizes (9,) of the disturbance torques, N m.
+        areas: relative areas (3,) of the faces on which air and sunlight act.
     """
 
     quaternion: FloatArray
@@ -109,6 +133,20 @@ class SlewStart:
     inertia: FloatArray
     limit: float | FloatArray
     sizes: FloatArray
+    areas: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunningSlew:
+    """A slew that the body follows while the rest of it is planned again.
+
+    Attributes:
+        path: path of the slew as last planned.
+        since: time (s) from the start of `path` to the origin of the job.
+    """
+
+    path: SlewPath
+    since: float
 
 
 def slew(
@@ -125,19 +163,13 @@ def slew(
     found.
     """
     first = float(begin.times[0])
-    craft = SlewCraft(begin.inertia, np.full(3, RESERVE * begin.limit), wish.heat, wish.residual)
     start = begin.quaternion[None]
-    avoided = cones(ahead, first, wish.camera, **wish.angles)
-    task = SlewTask(
-        craft.facing(begin.sizes),
-        along(ahead, first),
-        begin.quaternion,
-        begin.rate,
-        end_law(target, axes, ahead, first),
-        wish.seconds,
-        LONGEST,
-        cones=tuple(cone for cone in avoided if float(cone.clearance(start, np.zeros(1))[0]) >= 0.0),
+    avoided = tuple(
+        cone
+        for cone in cones(ahead, first, wish.camera, **wish.angles)
+        if float(cone.clearance(start, np.zeros(1))[0]) >= 0.0
     )
+    task = _task(begin, wish, target, axes, ahead, along(ahead, first), wish.seconds, avoided)
     found = _slow_enough(task, fastest)
     if found is None and task.cones:
         task = replace(task, cones=())
@@ -145,8 +177,26 @@ def slew(
     if found is None or not begin.sizes.any():
         return found
     # The areas on which air and sunlight act depend on the path, so the slew is planned again.
-    pressed = along(ahead, first, box_areas(begin.inertia), found)
+    pressed = along(ahead, first, begin.areas, found)
     return _slow_enough(replace(task, along=pressed, horizon=found.horizon), fastest, found) or found
+
+
+def _task(
+    begin: SlewStart,
+    wish: SlewRequest,
+    target: PointingTarget,
+    axes: BodyAxes,
+    ahead: Ephemeris,
+    around: EnvironmentAt,
+    seconds: float,
+    avoided: tuple[Cone, ...],
+) -> SlewTask:
+    """Return the task of a slew of `seconds` s into the attitude law of a target."""
+    craft = SlewCraft(begin.inertia, np.full(3, RESERVE * begin.limit), wish.heat, wish.residual)
+    law = end_law(target, axes, ahead, float(begin.times[0]))
+    return SlewTask(
+        craft.facing(begin.sizes), around, begin.quaternion, begin.rate, law, seconds, LONGEST, cones=avoided
+    )
 
 
 def _slow_enough(task: SlewTask, fastest: float, near: SlewPath | None = None) -> SlewPath | None:
@@ -207,7 +257,7 @@ def slew_table(
     dipole = path.dipoles(times[:count] + 0.5 * step - first) + residual
     stop = count + round(TAIL / step)
     tracked = _joined(flown, wanted.until(stop + 1))
-    gain, torque_part = _tracking(tracked, ahead, dipole, begin, weights)
+    gain, torque_part = (part[:count] for part in _tracking(tracked, ahead, dipole, begin, weights))
     dipoles, gains, torque_parts = (
         np.concatenate([slewed, np.repeat(kept, FINE, axis=0)])
         for slewed, kept in (
@@ -250,7 +300,10 @@ def _tracking(
     begin: SlewStart,
     weights: PointingWeights,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the tracking gains (n, 3, 6), and the dipole moments per torque size (n, 3, sizes)."""
+    """Return the tracking gains (n, 3, 6), and the dipole moments per torque size (n, 3, sizes).
+
+    The motion `tracked` (n + 1,) contains the slew, for which `dipole` is planned, and the time after it.
+    """
     count, steps = len(dipole), len(tracked.times) - 1
     times, step = tracked.times[:steps], float(tracked.times[1] - tracked.times[0])
     planned = np.concatenate([dipole, np.zeros((steps - count, 3))])
@@ -258,7 +311,7 @@ def _tracking(
         tracked.until(steps), begin.inertia, ahead.field_at(times), ahead.position_at(times), planned
     )
     to_body = attitude_matrix(tracked.quaternion[:steps])
-    shape = shapes(pressures(ahead, times).facing(box_areas(begin.inertia), to_body), to_body)
+    shape = shapes(pressures(ahead, times).facing(begin.areas, to_body), to_body)
     affine = linear.by_torque @ shape
     state, dipole_cost = step_costs(replace(weights, roll=None), step)
     control = np.full((steps, 3), dipole_cost / STIFFER**2)
@@ -266,7 +319,69 @@ def _tracking(
     states[count] *= END / step
     cost = SweepCost(states, control, nothing, nothing[:, :3])
     gain, steady, _ = sweep(linear, affine, cost, CostToGo(state, nothing[0]))
-    return gain[:count], steady[:count]
+    return gain, steady
+
+
+def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> PointingTable | None:
+    """Return the table for the rest of a running slew, or None if the running plan should be kept.
+
+    The rest is planned from the newest estimate, with the arrival time of the running plan. The new path is
+    the optimum to which the running path converges. The running plan is kept if no such path is found, or if
+    the new path rotates too fast or is hotter than the running path by more than the factor `HOTTER`. The
+    table ends TAIL s after the slew.
+    """
+    near = running.path.since(running.since + LEAD, NODES)
+    ahead = predict(job.orbit, LEAD + near.horizon + TAIL + 4.0 * STEADY.step)
+    quaternion, rate = _propagated(job, running)
+    step = STEADY.step / FINE
+    count = math.ceil(near.horizon / step)
+    times = np.asarray(LEAD + step * np.arange(count + round(TAIL / step) + 1), dtype=float)
+    begin = SlewStart(quaternion, rate, times, count, job.inertia, job.limit, job.sizes, job.areas)
+    avoided = tuple(
+        _narrowed(cone, near, quaternion) for cone in cones(ahead, LEAD, wish.camera, **wish.angles)
+    )
+    around = along(ahead, LEAD, job.areas, near)
+    task = _task(begin, wish, job.target, job.axes, ahead, around, near.horizon, avoided)
+    try:
+        plan = plan_near(task, near)
+    except PlanningError:
+        return None
+    if plan is None or plan.horizon != near.horizon or plan.energy > HOTTER * near.heat(wish.heat):
+        return None
+    path = plan.path
+    if float(np.linalg.norm(path.rate, axis=1).max()) >= job.weights.fastest:
+        return None
+    wanted = references(
+        law_of(job.target, job.axes, path.quaternion[-1], ahead, LEAD + path.horizon), ahead, times
+    )
+    # The residual dipole moment is added here because the pointing law subtracts the estimate in flight.
+    dipole = path.dipoles(times[:count] + 0.5 * step - LEAD) + wish.residual
+    tracked = _joined(path.references(times[:count] - LEAD), wanted)
+    gain, torque_part = _tracking(tracked, ahead, dipole, begin, job.weights)
+    dipoles = np.concatenate([dipole, np.zeros((len(gain) - count, 3))])
+    return PointingTable(tracked, wanted, dipoles, gain, torque_part, job.sizes, path)
+
+
+def _propagated(job: PointingJob, running: RunningSlew) -> tuple[FloatArray, FloatArray]:
+    """Return the attitude (4,) and the rate (3,), rad/s, expected LEAD s after the origin of a job.
+
+    The body is expected to keep its present attitude error and rate error relative to the running path.
+    """
+    now, then = running.since, running.since + LEAD
+    path = running.path.references(np.array([now, then]))
+    error = multiply(job.quaternion, conjugate(path.quaternion[0]))
+    missed = job.rate - attitude_matrix(error) @ path.rate[0]
+    error = from_rotation_vector(to_rotation_vector(error) + LEAD * missed)
+    return multiply(error, path.quaternion[1]), attitude_matrix(error) @ path.rate[1] + missed
+
+
+def _narrowed(cone: Cone, path: SlewPath, start: FloatArray) -> Cone:
+    """Return an exclusion cone that neither a path nor the attitude `start` (4,) at its begin violates."""
+    room = min(
+        float(cone.clearance(path.quaternion, path.times).min()),
+        float(cone.clearance(start[None], np.zeros(1))[0]),
+    )
+    return cone if room >= 0.0 else replace(cone, angle=cone.angle + room - _INSIDE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,7 +434,9 @@ class PointingJob:
         inertia: (3, 3) kg m^2.
         sizes: estimated sizes (9,) of the disturbance torques, N m.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
+        areas: relative areas (3,) of the faces on which air and sunlight act.
         slew: parameters of slews, or None if the body always approaches the law without a slew.
+        running: the running slew whose rest is planned again, or None for a new path.
         sight: the sighted object to which to point instead of `target`; None for the target.
     """
 
@@ -334,7 +451,9 @@ class PointingJob:
     rate: FloatArray
     sizes: FloatArray
     limit: float | FloatArray
+    areas: FloatArray
     slew: SlewRequest | None = None
+    running: RunningSlew | None = None
     sight: ObjectDirection | None = None
 
     @property
@@ -348,12 +467,21 @@ def prepare() -> None:
     from scipy.linalg import lapack  # noqa: F401, PLC0415 - the control process names the job, and needs none
 
 
-def run(job: PointingJob) -> PointingTable:
+def run(job: PointingJob) -> PointingTable | None:
     """Return the pointing table, whose times are in s after the origin of the job.
 
-    The computation takes about one second, or two seconds with a slew. Raises FlightError if the magnetic
-    field is unknown, and UsageError if the law does not define an attitude.
+    The result is None if the rest of a running slew was requested and the running plan should be kept. The
+    computation takes about one second, two seconds with a slew, and a tenth of a second for the rest of a
+    slew. Raises FlightError if the magnetic field is unknown, and UsageError if the law does not define an
+    attitude.
     """
+    if job.running is not None and job.slew is not None:
+        return rest_table(job, job.slew, job.running)
+    return new_table(job)
+
+
+def new_table(job: PointingJob) -> PointingTable:
+    """Return the pointing table of a new path, with a slew if the target is far (`run`)."""
     span = job.span
     preview = span.preview
     if span is STEADY:
@@ -379,12 +507,12 @@ def run(job: PointingJob) -> PointingTable:
         references(way, ahead, times[: kept + 1]),
         field,
         ahead.position_at(times),
-        pressures(ahead, times).facing(box_areas(job.inertia), attitude_matrix(wanted.quaternion)),
+        pressures(ahead, times).facing(job.areas, attitude_matrix(wanted.quaternion)),
         job.sizes,
     )
     wish = job.slew
     if wish is not None and float(angle_between(quaternion, wanted.quaternion[0])) > FAR:
-        begin = SlewStart(quaternion, job.rate, times, kept, job.inertia, job.limit, job.sizes)
+        begin = SlewStart(quaternion, job.rate, times, kept, job.inertia, job.limit, job.sizes, job.areas)
         path = slew(begin, wish, job.target, job.axes, ahead, job.weights.fastest)
         if path is not None:
             return slew_table(begin, path, wish.residual, job.target, job.axes, ahead, found, job.weights)

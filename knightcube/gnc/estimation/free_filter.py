@@ -514,6 +514,12 @@ class FreeFilter:
         return self._constants[TORQUES].copy()
 
     @property
+    def inertia(self) -> FloatArray:
+        """Inertia tensor (3, 3) kg m^2, body axes."""
+        self.motion.correct(self._constants[INERTIA])
+        return self.motion.inertia
+
+    @property
     def coil_matrix(self) -> FloatArray:
         """Matrix (3, 3) from the commanded to the estimated dipole of the coils."""
         return _EYE + self._matrix(COILS)

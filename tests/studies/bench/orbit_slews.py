@@ -21,6 +21,7 @@ from unittest.mock import patch
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import box_areas
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.errors import PlanningError
 from knightcube.gnc.control import pointing_job
@@ -126,7 +127,7 @@ def _jobs(runs: int, seed: int) -> int:
         for name, task in slews(runs, seed, True):
             job = _job(name, task, rng.normal(size=9))
             begin = time.process_time()
-            planned += pointing_job.run(job).slew is not None
+            planned += pointing_job.new_table(job).slew is not None
             whole.append(time.process_time() - begin)
     sys.stdout.write(f"{planned} of {runs} jobs gave a slew\n")
     for what, taken in (("whole jobs", whole), ("of these the slew", plans)):
@@ -158,5 +159,6 @@ def _job(name: str, task: SlewTask, draw: FloatArray) -> PointingJob:
         task.rate,
         TORQUE[craft][0] * draw,
         float(task.craft.limit.mean()) / RESERVE,
+        box_areas(task.craft.inertia),
         SlewRequest(task.horizon, task.craft.weights, np.zeros(3), STAR_CAMERA, angles),
     )

@@ -149,7 +149,7 @@ class ObjectChase(PointingFlight):
 
     def _plan(self, time: float) -> None:
         job = self._aim.directed(self._job())
-        table = pointing_job.run(job)
+        table = pointing_job.new_table(job)
         if self._law is None:
             self._fly(table, time)
         else:

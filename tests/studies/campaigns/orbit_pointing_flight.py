@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.disturbance import pressures
+from knightcube.astro.earth.disturbance import box_areas, pressures
 from knightcube.astro.earth.ephemeris import Ephemeris
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.orbit_knowledge import OrbitState
@@ -215,7 +215,8 @@ class PointingFlight:
 
     def _plan(self, time: float) -> None:
         on_path = self._law is not None and self._astray.since is None
-        table = pointing_job.run(self._job() if on_path else replace(self._job(), slew=self._wish(time)))
+        job = self._job() if on_path else replace(self._job(), slew=self._wish(time))
+        table = pointing_job.new_table(job)
         self._fly(table, time)
         self._arrives = time if table.slew is None else time + pointing_job.LEAD + table.slew.horizon
 
@@ -251,6 +252,7 @@ class PointingFlight:
             found.rate,
             found.torque_sizes,
             flight.limit * (CYCLE - PAUSE) / CYCLE,
+            box_areas(flight.inertia),
         )
 
     def _around(self, time: float) -> FilterEnvironment:

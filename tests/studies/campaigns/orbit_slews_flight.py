@@ -77,7 +77,7 @@ class SlewFlight(PointingFlight):
     def _begin(self, time: float) -> SlewPath:
         """Begin the slew; return the planned path."""
         wish = replace(self._wish(time), seconds=self.horizon)
-        table = pointing_job.run(replace(self._job(), slew=wish))
+        table = pointing_job.new_table(replace(self._job(), slew=wish))
         if table.slew is None:
             raise LookupError("no slew")
         self._slews = True

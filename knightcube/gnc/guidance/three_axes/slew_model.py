@@ -302,6 +302,19 @@ class SlewPath:
         """The duration, s."""
         return float(self.times[-1])
 
+    def heat(self, weights: FloatArray) -> float:
+        """Return the heat (J) for heating powers per squared dipole moment (3,), W/(A m^2)^2."""
+        left, right = self.dipole[:-1], self.dipole[1:]
+        squares = (left * left + left * right + right * right) @ weights / 3.0
+        return float(np.diff(self.times) @ squares)
+
+    def since(self, time: float, nodes: int) -> SlewPath:
+        """Return the rest of the path from a time (s) before its end on, with times from zero on."""
+        times = np.linspace(0.0, self.horizon - time, 2 * nodes + 1)
+        found = self.references(np.minimum(time + times, self.horizon))
+        dipole = self.dipoles(np.minimum(time + times, self.horizon))
+        return SlewPath(times, found.quaternion, found.rate, found.acceleration, dipole)
+
     def references(self, times: FloatArray) -> AttitudeReferences:
         """Return the commanded motion at times (m,) s.
 

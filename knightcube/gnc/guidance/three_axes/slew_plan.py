@@ -174,9 +174,7 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
     check(task)
     tried = 0
     if near is not None:
-        search = SlewSearch(task, *GRIDS[0])
-        found = search.solver.again(near)
-        plan = None if found is None else _first(task, search, iter([found]))
+        plan = plan_near(task, near)
         if plan is not None:
             return plan
     for coarse, budget in GRIDS_WITH_CONES if task.cones else GRIDS:
@@ -186,6 +184,18 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
             return plan
         tried += search.tried
     raise PlanningError(_refusal(task, tried))
+
+
+def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
+    """Return the plan to which the path `near` of a similar task converges, or None.
+
+    The path `near` has the duration of the task. No other initial guess is tried. Raises PlanningError for
+    invalid values.
+    """
+    check(task)
+    search = SlewSearch(task, *GRIDS[0])
+    found = search.solver.again(near)
+    return None if found is None else _first(task, search, iter([found]))
 
 
 def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> SlewPlan | None:

@@ -1,10 +1,10 @@
-"""Sun acquisition accepts the Sun of the solar cells, and reports once whether there is a Sun."""
+"""Sun acquisition reports once whether there is a Sun; commands allow for the learned coils."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from flight.bodies.orbit.control import SunAcquisitionLaw
+from flight.bodies.orbit.control import SunAcquisitionLaw, commanded
 from flight.link.events import EventKind
 from flight.loop.facts import EventLog
 from hal.interfaces.devices import StringReading
@@ -78,3 +78,15 @@ def test_a_sun_that_has_gone_is_remembered_for_a_while_and_its_loss_told_with_th
     seen.fly(int(MEMORY), int(MEMORY) + 10, np.zeros(6))
     assert seen.told[-1][0] == "sun-missed"
     assert "no string has" in seen.told[-1][1]
+
+
+def test_the_command_for_learned_coils_causes_the_wanted_dipole() -> None:
+    wanted = np.array([0.05, -0.02, 0.01])
+    coils = np.array([[0.82, 0.03, -0.02], [0.05, 1.17, 0.0], [-0.04, 0.01, 1.1]])
+    np.testing.assert_allclose(coils @ commanded(wanted, coils), wanted, atol=1e-12)
+
+
+def test_the_command_for_a_coil_that_seems_dead_stays_bounded() -> None:
+    """The coil monitor decides about it; until then the command is not amplified without a bound."""
+    wanted = np.array([0.05, -0.02, 0.01])
+    np.testing.assert_allclose(commanded(wanted, np.diag([1.0, 0.0, -1.0])), wanted / [1.0, 0.7, 0.7])

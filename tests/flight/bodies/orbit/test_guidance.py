@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flight.bodies.orbit.guidance import (
+    LearnedBody,
     ObjectAim,
     PlannedCraft,
     PointingPaths,
@@ -67,7 +68,7 @@ def submitted(
         craft,
         paths,
         cast(Any, SimpleNamespace(state=lambda _: ORBIT)),
-        lambda: (np.zeros(9), RESIDUAL),
+        lambda: LearnedBody(INERTIA, np.zeros(9), RESIDUAL),
         ObjectAim(None, LIMIT, cast(Any, services.events)),
         cast(Any, services),
     )

@@ -14,7 +14,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
-from knightcube.gnc.control.pointing_job import LEAD, PointingJob, run
+from knightcube.gnc.control.pointing_job import LEAD, PointingJob, new_table
 from knightcube.gnc.control.pointing_law import PointingLaw
 from knightcube.gnc.control.pointing_table import PointingWeights
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, following, references
@@ -77,7 +77,7 @@ class Chase:
             self.aim.accept(self.tracker.objects, frame.time_ns)
             if self.aim.moved and second % 3 == 0:
                 job = self.aim.directed(self._job(second))
-                table = run(job)
+                table = new_table(job)
                 self.aim.judge(job, table, frame.time_ns)
                 law, origin = PointingLaw(table, self.limit), second
             self._turn(law, second, origin)
@@ -88,10 +88,12 @@ class Chase:
         weights = PointingWeights(turn=0.0175, rate=1.0, dipole=1e-3, fastest=0.014)
         axes = BodyAxes(np.eye(3)[2], np.eye(3)[0])
         target, nothing = PointingTarget(Goal.NADIR), np.zeros(9)
-        inertia = np.diag(self.inertia)
+        inertia, areas = np.diag(self.inertia), np.ones(3)
         origin_ns = second * SECOND_NS
         state = self.quaternion, self.spin
-        return PointingJob(1, origin_ns, orbit, inertia, axes, weights, target, *state, nothing, self.limit)
+        return PointingJob(
+            1, origin_ns, orbit, inertia, axes, weights, target, *state, nothing, self.limit, areas
+        )
 
     def _turn(self, law: PointingLaw | None, second: int, origin: int) -> None:
         field_ = FIELD.field_at(np.array([float(second)]))[0]
@@ -175,7 +177,7 @@ def test_the_boresight_stays_where_an_object_is_looked_for_whatever_axis_the_bod
         flown.aim.aim(OBJECT)
         axis = np.array([0.0, 0.0, 1.0])
         weights = PointingWeights(turn=0.0175, rate=1.0, dipole=3e-4, fastest=0.014, roll=0.1745, axis=axis)
-        table = run(flown.aim.directed(replace(flown._job(0), weights=weights)))
+        table = new_table(flown.aim.directed(replace(flown._job(0), weights=weights)))
         shown = attitude_matrix(table.path.quaternion).transpose(0, 2, 1) @ BORESIGHT
         assert np.degrees(np.arccos(np.clip(shown @ flown.first, -1.0, 1.0))).max() < 2.5
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import box_areas, pressures
 from knightcube.astro.quaternion import from_rotation_vector, multiply
-from knightcube.gnc.control.pointing_job import SlewRequest, SlewStart
+from knightcube.gnc.control.pointing_job import SlewRequest, SlewStart, slew, slew_table
+from knightcube.gnc.control.pointing_table import PointingPreview, PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.knightcube.gnc.control.pointing_cases import (
@@ -16,6 +21,7 @@ from tests.knightcube.gnc.control.pointing_cases import (
     RESIDUAL,
     SIZE,
     STEP,
+    WEIGHTS,
     X,
     Y,
     Z,
@@ -44,4 +50,15 @@ BEGIN = SlewStart(
     INERTIA,
     LIMIT,
     SIZE,
+    box_areas(INERTIA),
 )
+
+
+def planned(sizes: FloatArray) -> PointingTable:
+    """Plan with torques of these sizes (9,) N m."""
+    begin = replace(BEGIN, sizes=sizes)
+    path = slew(begin, WISH, NADIR, AXES, ORBIT, np.inf)
+    assert path is not None
+    field, position = ORBIT.field_at(TIMES), ORBIT.position_at(TIMES)
+    expected = PointingPreview(WANTED, WANTED, field, position, pressures(ORBIT, TIMES), sizes)
+    return slew_table(begin, path, RESIDUAL, NADIR, AXES, ORBIT, expected, WEIGHTS)

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.disturbance import pressures
-from knightcube.astro.quaternion import angle_between, attitude_matrix
+from knightcube.astro.earth.orbit_knowledge import OrbitState
+from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.control import pointing_job
 from knightcube.gnc.control.pointing_job import (
     FINE,
+    LEAD,
+    PointingJob,
+    RunningSlew,
     SlewRequest,
     slew,
-    slew_table,
 )
 from knightcube.gnc.control.pointing_law import PointingLaw
-from knightcube.gnc.control.pointing_table import PointingPreview, PointingTable
+from knightcube.gnc.control.pointing_table import PointingTable
+from knightcube.gnc.guidance.three_axes.slew_model import cones
 from tests.knightcube.gnc.control.pointing_cases import (
+    INERTIA,
     LIMIT,
     ORBIT,
     RESIDUAL,
@@ -34,19 +39,9 @@ from tests.knightcube.gnc.control.pointing_requests import (
     BEGIN,
     NADIR,
     TIMES,
-    WANTED,
     WISH,
+    planned,
 )
-
-
-def planned(sizes: FloatArray) -> PointingTable:
-    """Plan with torques of these sizes (9,) N m."""
-    begin = replace(BEGIN, sizes=sizes)
-    path = slew(begin, WISH, NADIR, AXES, ORBIT, np.inf)
-    assert path is not None
-    field, position = ORBIT.field_at(TIMES), ORBIT.position_at(TIMES)
-    expected = PointingPreview(WANTED, WANTED, field, position, pressures(ORBIT, TIMES), sizes)
-    return slew_table(begin, path, RESIDUAL, NADIR, AXES, ORBIT, expected, WEIGHTS)
 
 
 @pytest.fixture(scope="module")
@@ -137,3 +132,74 @@ def test_a_body_within_one_cone_still_avoids_the_other() -> None:
         shown = attitude_matrix(path.quaternion) @ ORBIT.sun_at(TIMES[:1])[0]
         nearest = float(np.arccos(np.clip(shown @ camera, -1.0, 1.0)).min())
         assert (nearest < 0.9 * angle) == crosses
+
+
+def rest_of(table: PointingTable, since: float, q: FloatArray, w: FloatArray) -> PointingTable | None:
+    """Return the plan for the rest of the slew of a table, from an estimate `since` s after its start."""
+    assert table.slew is not None
+    ahead = replace(ORBIT, times=ORBIT.times - STEP - since)
+    at = np.zeros(1)
+    orbit = OrbitState(ahead.julian_date, ahead.position_at(at)[0], ahead.velocity_at(at)[0], 0.0)
+    job = PointingJob(1, 0, orbit, INERTIA, AXES, WEIGHTS, NADIR, q, w, SIZE, LIMIT, BEGIN.areas, WISH)
+    with patch.object(pointing_job, "predict", lambda *_: ahead):
+        return pointing_job.run(replace(job, running=RunningSlew(table.slew, since)))
+
+
+def test_the_rest_of_a_slew_begins_where_the_body_will_be_and_arrives_at_the_same_time(
+    table: PointingTable,
+) -> None:
+    """The body is 0.04 deg off the running path."""
+    path = table.slew
+    assert path is not None
+    since = path.horizon / 3.0
+    there = path.references(np.array([since, since + LEAD]))
+    off = from_rotation_vector(np.radians([0.02, -0.02, 0.03]))
+    rest = rest_of(table, since, multiply(off, there.quaternion[0]), attitude_matrix(off) @ there.rate[0])
+    assert rest is not None
+    assert rest.slew is not None
+    begun = multiply(off, there.quaternion[1])
+    assert np.degrees(angle_between(rest.path.quaternion[0], begun)) < 1e-3
+    np.testing.assert_allclose(rest.path.rate[0], attitude_matrix(off) @ there.rate[1], atol=1e-7)
+    assert rest.path.times[0] == LEAD
+    assert since + LEAD + rest.slew.horizon == pytest.approx(path.horizon)
+    assert np.degrees(angle_between(rest.slew.quaternion[-1], path.quaternion[-1])) < 0.1
+    after = rest.path.times[-1] - LEAD - rest.slew.horizon
+    assert after == pytest.approx(pointing_job.TAIL, abs=STEP)
+
+
+def test_on_a_known_body_the_rest_is_the_rest_of_the_running_plan(table: PointingTable) -> None:
+    path = table.slew
+    assert path is not None
+    for share in (0.2, 0.5):
+        there = path.references(np.array([share * path.horizon]))
+        rest = rest_of(table, share * path.horizon, there.quaternion[0], there.rate[0])
+        assert rest is not None
+        assert rest.slew is not None
+        running = path.since(share * path.horizon + LEAD, 24)
+        assert rest.slew.heat(WISH.heat) < 1.005 * running.heat(WISH.heat)
+        assert np.abs(rest.slew.dipole[0] - running.dipole[0]).max() < 0.01 * LIMIT, "no jump of the current"
+
+
+def test_a_rest_that_costs_far_more_heat_is_not_flown(table: PointingTable) -> None:
+    """Near the end, 3 deg would be led back at a multiple of the heat that the running path takes."""
+    assert table.slew is not None
+    since = 0.8 * table.slew.horizon
+    there = table.slew.references(np.array([since]))
+    away = multiply(from_rotation_vector(np.radians([3.0, 0.0, 0.0])), there.quaternion[0])
+    assert rest_of(table, since, there.quaternion[0], there.rate[0]) is not None
+    assert rest_of(table, since, away, there.rate[0]) is None
+
+
+def test_a_rest_goes_no_deeper_into_a_cone_than_the_running_path(table: PointingTable) -> None:
+    """The running path was planned without this cone, and crosses the Sun halfway."""
+    path = table.slew
+    assert path is not None
+    halfway = path.references(np.array([0.5 * path.horizon])).quaternion[0]
+    camera = attitude_matrix(halfway) @ ORBIT.sun_at(np.array([STEP]))[0]
+    (sun,) = cones(ORBIT, STEP, camera, sun=0.2)
+    narrowed = pointing_job._narrowed(sun, path, path.quaternion[0])
+    assert narrowed.angle < 0.01
+    assert float(narrowed.clearance(path.quaternion, path.times).min()) >= 0.0
+    late = path.since(0.9 * path.horizon, 4)
+    beyond = replace(sun, angle=0.01)
+    assert pointing_job._narrowed(beyond, late, late.quaternion[0]) is beyond

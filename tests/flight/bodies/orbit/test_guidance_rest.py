@@ -1,0 +1,174 @@
+"""During a slew the rest of it is planned again and handed over at its begin, without a jump."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from flight.bodies.orbit.guidance import (
+    REST,
+    REST_AGAIN_NS,
+    LearnedBody,
+    ObjectAim,
+    PlannedCraft,
+    PointingPaths,
+    PointingPlanner,
+    PointingTargetLaw,
+)
+from flight.loop.body import Target
+from flight.loop.executive import JobResult
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.earth.disturbance import box_areas
+from knightcube.gnc.control.pointing_job import PointingJob
+from knightcube.gnc.control.pointing_table import PointingTable
+from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from tests.flight.bodies.orbit.guidance_tables import AWAY, NADIR, STILL
+from tests.knightcube.gnc.control.pointing_cases import INERTIA, LIMIT, ORBIT, WEIGHTS, X, Z
+from tests.knightcube.gnc.control.pointing_requests import WISH, planned
+
+RESIDUAL = np.array([1e-3, 0.0, 0.0])
+SUN = PointingTarget(Goal.SUN)
+LEARNED = INERTIA + 1e-4 * np.ones((3, 3))
+ESTIMATE = SimpleNamespace(quaternion=np.array([0.0, 0.0, 0.0, 1.0]), rate=np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def slew() -> PointingTable:
+    """Return the table of a slew that begins 10 s after the origin of its job."""
+    return planned(np.zeros(9))
+
+
+class Flight:
+    """A planner whose worker is replaced by the list of its jobs."""
+
+    def __init__(self, inertia: Any = LEARNED) -> None:
+        self.jobs: list[PointingJob] = []
+        self.events: list[str] = []
+
+        def submit(_: str, job: PointingJob) -> bool:
+            self.jobs.append(job)
+            return True
+
+        services = SimpleNamespace(
+            jobs=SimpleNamespace(submit=submit),
+            events=SimpleNamespace(report=lambda event, *_: self.events.append(event.name)),
+        )
+        self.paths = PointingPaths(LIMIT, 0.1)
+        self.planner = PointingPlanner(
+            PlannedCraft(INERTIA, BodyAxes(Z, X), WEIGHTS, LIMIT, WISH),
+            self.paths,
+            cast(Any, SimpleNamespace(state=lambda _: ORBIT)),
+            lambda: LearnedBody(inertia, np.zeros(9), RESIDUAL),
+            ObjectAim(None, LIMIT, cast(Any, services.events)),
+            cast(Any, services),
+        )
+
+    def serve(self, now: float, goal: Any = NADIR) -> None:
+        target = Target(0, PointingTargetLaw(goal, self.paths))
+        self.planner.serve(cast(Any, ESTIMATE), target, round(now * SECOND_NS))
+
+    def finish(self, now: float, value: Any, outcome: str = "done") -> None:
+        result = SimpleNamespace(outcome=outcome, value=value, error="worker died")
+        self.planner.finish(cast(JobResult, result), round(now * SECOND_NS))
+
+
+def test_the_rest_is_planned_again_every_few_seconds_with_the_learned_body(slew: PointingTable) -> None:
+    flight = Flight()
+    flight.paths.offer(slew, NADIR, 0)
+    flight.serve(9.0)
+    assert not flight.jobs, "the slew has not begun"
+    flight.serve(40.0)
+    flight.serve(41.0)
+    (job,) = flight.jobs
+    assert job.running is not None
+    assert job.running.path is slew.slew
+    assert job.running.since == pytest.approx(30.0)
+    assert job.slew is not None
+    assert job.slew.residual is RESIDUAL
+    np.testing.assert_array_equal(job.inertia, LEARNED)
+    np.testing.assert_array_equal(job.areas, box_areas(INERTIA))
+    flight.finish(41.0, None)
+    again = 40.0 + REST_AGAIN_NS / SECOND_NS
+    flight.serve(again - 0.1)
+    assert len(flight.jobs) == 1
+    flight.serve(again)
+    assert len(flight.jobs) == 2
+
+
+def test_near_its_end_a_slew_is_not_planned_again(slew: PointingTable) -> None:
+    assert slew.slew is not None
+    last = 10.0 + (1.0 - REST) * slew.slew.horizon
+    for now, count in ((last - 1.0, 1), (last + 1.0, 0)):
+        flight = Flight()
+        flight.paths.offer(slew, NADIR, 0)
+        flight.serve(now)
+        assert len(flight.jobs) == count
+
+
+def test_a_rest_is_followed_from_its_begin_and_one_that_is_late_from_the_present_time(
+    slew: PointingTable,
+) -> None:
+    for arrives, expected in ((41.0, 50.0), (55.0, 55.0)):
+        flight = Flight()
+        flight.paths.offer(slew, NADIR, 0)
+        flight.serve(40.0)
+        before = flight.paths.sample(round(arrives * SECOND_NS))
+        rest = replace(slew, path=replace(slew.path, times=slew.path.times - 0.5))
+        flight.finish(arrives, rest)
+        assert before is not None
+        end_ns = round((40.0 + 9.5) * SECOND_NS)
+        if arrives < 49.5:
+            still = flight.paths.sample(end_ns - 1)
+            assert still is not None
+            assert still.law is before.law
+        point = flight.paths.sample(round(expected * SECOND_NS))
+        assert point is not None
+        assert point.law is not before.law
+        assert point.seconds == pytest.approx(expected - 40.0), "the times of the rest count from its job"
+        assert flight.planner.counts() == (1, 0)
+
+
+def test_without_a_plan_for_the_rest_the_running_plan_goes_on(slew: PointingTable) -> None:
+    for value, outcome, events in ((None, "done", []), (None, "died", ["planner-failed"])):
+        flight = Flight()
+        flight.paths.offer(slew, NADIR, 0)
+        flight.serve(40.0)
+        before = flight.paths.sample(50 * SECOND_NS)
+        flight.finish(41.0, value, outcome)
+        point = flight.paths.sample(50 * SECOND_NS)
+        assert before is not None
+        assert point is not None
+        assert point.law is before.law
+        assert flight.paths.is_slewing(50 * SECOND_NS, NADIR)
+        assert flight.events == events
+
+
+def test_a_rest_is_dropped_if_the_body_has_left_its_path_or_has_another_target(slew: PointingTable) -> None:
+    flight = Flight()
+    flight.paths.offer(slew, NADIR, 0)
+    flight.serve(40.0)
+    flight.paths.led(AWAY, STILL, 41 * SECOND_NS)
+    flight.finish(41.0, slew)
+    assert flight.planner.counts() == (0, 0)
+    flight = Flight()
+    flight.paths.offer(slew, NADIR, 0)
+    flight.serve(40.0)
+    flight.paths.offer(slew, SUN, round(40.5 * SECOND_NS))
+    before = flight.paths.sample(60 * SECOND_NS)
+    flight.finish(41.0, slew)
+    point = flight.paths.sample(60 * SECOND_NS)
+    assert before is not None
+    assert point is not None
+    assert point.law is before.law
+
+
+def test_an_inertia_that_no_body_has_is_not_planned_with(slew: PointingTable) -> None:
+    flight = Flight(INERTIA - 0.006 * np.eye(3))
+    flight.paths.offer(slew, NADIR, 0)
+    flight.serve(40.0)
+    np.testing.assert_array_equal(flight.jobs[0].inertia, INERTIA)
