@@ -60,7 +60,10 @@ class TargetLaw(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A target and its number in packets: that of a configured step, or COMMANDED and above, or KEPT."""
+    """A target and its number in packets.
+
+    The number is that of a configured step, a number from COMMANDED on, or KEPT.
+    """
 
     index: int
     law: TargetLaw
@@ -159,7 +162,7 @@ class Filter(Protocol):
         """Treat the coil currents recorded since a time as unknown."""
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of past times, and call `applied` with a flag for each that passed its gate."""
+        """Apply measurements of past times, and call `applied` with flags for the accepted measurements."""
 
     def catch_up(self, most: int | None = None) -> None:
         """Repeat the filter updates made after a late measurement: all updates, or at most `most` of them."""
@@ -357,8 +360,8 @@ class BodyEstimation(Protocol):
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
         """Accept that the coil monitor multiplied the described dipoles of the coils by `change` (3,).
 
-        `deviations` (3,) are the relative standard deviations of the corrected dipoles. The default does
-        nothing, for a filter that estimates no coil apart from the others.
+        The relative standard deviations of the corrected dipoles are `deviations` (3,). The default does
+        nothing. It is for a filter that does not estimate the coils separately.
         """
         del change, deviations
 

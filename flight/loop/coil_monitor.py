@@ -3,21 +3,21 @@
 In each cycle, the loop passes the commands (`commanded`, `interrupted`), the samples of the inertial unit
 (`observe_motion`) and the newest reading of the current monitor (`measured`) to `CoilMonitor`. Then the loop
 reads the results: `verdicts`, `available`, `resting`, `braked`, `at_rest`, `probe`, `suspicion` and
-`monitor_doubted`. No call waits. The class `CoilKnowledge` determines whether the coil currents are known:
-they are unknown while the PWM driver fails, after the loop has stalled, and while the supply current
+`monitor_doubted`. No call waits. The class `CoilKnowledge` determines whether the coil currents are known.
+The currents are unknown while the PWM driver fails, after the loop has stalled, and while the supply current
 contradicts the commands.
 
 The current monitor measures the sum of |I| over the three H-bridges. The current monitor cannot detect a
 reversed coil, and it detects an open coil only while that coil is driven. Every reading is compared with the
-prediction of each hypothesis: all coils healthy, or one axis open, shorted, or with one leg of an input stuck
-(`flight.loop.coil_response`). A verdict is given when the hypothesis `healthy` is rejected and all hypotheses
-that explain the later readings name the same axis. If several axes remain possible, because no axis or
-several axes are driven, each of these axes is driven alone by a small probe current, one after another. The
-other coils carry no current for the 1.6 s of a probe, so that one probe shows whether its coil draws current.
-A reversed coil is detected from the angular acceleration,
-which also distinguishes a wrong current monitor from a broken coil. Averaged over longer bins, the
-acceleration reveals missing torque at currents that are too small for the current monitor. The probe then
-shows whether the coil is open.
+prediction of each hypothesis (`flight.loop.coil_response`). A hypothesis is that all coils are healthy, or
+that one axis is open, shorted, or has one leg of an input stuck. A verdict is given when the hypothesis
+`healthy` is rejected and all hypotheses that explain the later readings name the same axis. Several axes
+remain possible if no axis or several axes are driven. Each of these axes is then driven alone by a small
+probe current, one after another. The other coils carry no current for the 1.6 s of a probe, so that one probe
+shows whether its coil draws current. A reversed coil is detected from the angular acceleration, which also
+distinguishes a wrong current monitor from a broken coil. Averaged over longer bins, the acceleration reveals
+missing torque at currents that are too small for the current monitor. The probe then shows whether the coil
+is open.
 
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
@@ -31,12 +31,12 @@ force during an ADC sample is ambiguous. While commands change continuously, all
 every few seconds as a check, even without a suspicion.
 
 A reversed coil draws the same supply current as a healthy coil, so only the motion can show it. A coil that
-turns the body the wrong way is not isolated: it is used with the opposite sign. A coil whose torque is too
-small is used with its estimated gain. The class `CoilCorrection` holds sign and gain of each coil, and
+rotates the body in the wrong direction is not isolated, but used with the opposite sign. A coil whose torque
+is too small is used with its estimated gain. The class `CoilCorrection` holds sign and gain of each coil, and
 converts between the currents on the wire, which determine the supply current, and the effective currents,
 which determine the torque. A correction made in a tumble is reviewed when the body is slower than
-`tumble_rate`: the motion then confirms the coil's sign or changes it again. A coil whose sign changes more
-than twice in ten minutes is kept at zero current until the body is slow, or for ten minutes.
+`tumble_rate`. The motion then confirms the coil's sign, or the sign is changed again. A coil whose sign
+changes more than twice in ten minutes is kept at zero current until the body is slow, or for ten minutes.
 
 A verdict on a broken coil is not final. While the body is slow, a broken coil is used again for a trial ten
 minutes after its verdict, and at most three times. If the fault persists, the coil is found broken again.
@@ -105,7 +105,7 @@ class StuckLeg:
     """
 
     def __init__(self, excess: float) -> None:
-        """`excess` is the smallest excess of the supply current (A) that indicates a fault."""
+        """Set the smallest `excess` of the supply current (A) that indicates a fault."""
         self._excess = excess
         self._pause = self._unclear = 0
         self._high = self._short = self._normal = self._looks = 0
@@ -265,7 +265,7 @@ class BrakeProof:
         self._axes.discard(axis)
 
     def ingest(self, exceeds: bool) -> frozenset[int]:
-        """Process whether an ADC sample shows a current in spite of braking.
+        """Process an ADC sample, which may show a current in spite of braking.
 
         Return the axes that are braked wrongly.
         """
@@ -291,7 +291,7 @@ class CoilVerdict:
 
 @dataclass(frozen=True, slots=True)
 class CoilMonitorSettings:
-    """Properties of the coil circuit and of the current monitor.
+    """Properties of the coil circuit and of the current monitor, and limits of the verdicts.
 
     Attributes:
         full_current: current (A) of each coil when fully on, which is the supply voltage divided by its
@@ -309,7 +309,7 @@ class CoilMonitorSettings:
         probe_current: amplitude (A) of the square wave that reveals which of several axes is faulty.
         probe_half_ns: half the period (ns) of the probe's square wave.
         response: settings for judging coils by the body's motion; None if the motion is not used.
-        slow: as `response`, but with longer bins, which reveal missing torque at small currents.
+        slow: settings like `response` with longer bins, which reveal missing torque at small currents.
         tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
         trial_after_ns: time (ns) from the verdict on a coil to its next trial.
         trials: largest number of trials of each coil.
@@ -447,15 +447,15 @@ _MOST_EVIDENCE, _MOST_SEGMENTS = 40, 4
 _IN_DOUBT = 5
 """Number of readings after which a verdict may name an axis with an uncertain kind of fault."""
 _AGAIN_NS = 60_000_000_000
-"""Shortest time (ns) from one series of probes because of missing torque to the next."""
+"""Shortest time (ns) between two series of probes for missing torque."""
 _LONGEST_REST_NS = 600_000_000_000
 """Longest time (ns) for which a coil whose sign changes repeatedly is kept at zero current."""
 _MOST_CHANGES = 2
-"""Largest number of changes of a coil's sign in that time."""
+"""Largest number of changes of a coil's sign within ten minutes."""
 
 
 class Evidence:
-    """Predictions of the readings since a suspicion, in one segment for each probe.
+    """Predictions of the readings since a suspicion. Each probe begins a new segment.
 
     A hypothesis must explain the readings of each segment. Otherwise, the few readings of the probe that
     rejects a hypothesis would be outliers among the readings that do not depend on the hypothesis.
@@ -525,7 +525,8 @@ class CoilCorrection:
     Attributes:
         factors: dipole (3,) of each coil relative to the described dipole at the same current: 1 for a
             healthy coil, -1 for a reversed coil.
-        deviations: relative standard deviations (3,) of the estimated gains; zero for coils as described.
+        deviations: relative standard deviations (3,) of the estimated gains; zero for coils without an
+            estimated gain.
     """
 
     def __init__(self) -> None:
@@ -550,7 +551,7 @@ class CoilCorrection:
     def reverse(self, axis: int, now_ns: int, *, in_tumble: bool) -> bool:
         """Change the sign of a coil, and return whether it was changed.
 
-        The sign stays as it is if it has changed too often in the last ten minutes.
+        The sign is not changed if it has changed too often in the last ten minutes.
         """
         recent = [time_ns for time_ns in self._changes[axis] if now_ns - time_ns < _LONGEST_REST_NS]
         self._changes[axis] = recent
@@ -626,22 +627,24 @@ class CoilMonitor:
         self._fresh = 0
         self._strange = 0
         self._suspected_ns: int | None = None
-        self._judge_ns = 0  # time (ns) after which a verdict may leave the kind of fault open
+        self._judge_ns = 0  # time (ns) after which a verdict may name an axis without the kind of fault
         self._sound_ns = 0  # time (ns) at which a driven coil last drew the expected current
-        self._unmixed_ns = 0  # time (ns) since which the circuit, as averaged in a reading, has not changed
+        self._unmixed_ns = (
+            0  # time (ns) since which the circuit has not changed, as far as a reading can show
+        )
         self._evidence = Evidence(self._bounds)
         self._probe = Probe(settings.probe_current, settings.probe_half_ns)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
-        self._weak = ""  # text about the coil whose torque is missing in the motion
-        self._weak_ns = -_AGAIN_NS  # time (ns) of the last probes because of missing torque
+        self._weak = ""  # text about a coil without the expected torque
+        self._weak_ns = -_AGAIN_NS  # time (ns) of the last probes for missing torque
         self._prime: int | None = None  # axis to probe first
         self._verdicts: dict[int, CoilVerdict] = {}
         self.correction = CoilCorrection()
         self._news: list[str] = []  # texts of the changes of the correction
         self._trials = [0, 0, 0]
         self._speed = math.inf
-        # Axes kept at zero current, each with the start time (ns) and the reason.
+        # Axes that are kept at zero current, with start time (ns) and reason.
         self._rests: dict[int, tuple[int, str]] = {}
         self._looked_ns = 0
         self._leg = StuckLeg(_STUCK_EXCESS * min(settings.full_current))
@@ -782,7 +785,7 @@ class CoilMonitor:
                 self._probe_weak_coil(feeble[0], now_ns)
 
     def _probe_weak_coil(self, axis: int, now_ns: int) -> None:
-        """Have the current monitor, if it gives readings, decide by probes whether a coil is open."""
+        """Start probes, by which the current monitor decides whether a coil is open."""
         silent = now_ns - self._reading_ns > self._settings.window_ns
         if silent or self._suspected_ns is not None or now_ns - self._weak_ns < _AGAIN_NS:
             return

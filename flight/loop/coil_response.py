@@ -1,25 +1,24 @@
 """Responses of the coils to commands: supply current and angular acceleration, with and without faults.
 
-For each hypothesis (all healthy, or one fault on one axis), the supply current is predicted from the
-commands. Each H-bridge has two inputs, A and B. The input A is pulsed for positive currents, the input B for
-negative currents. If an output leg is stuck high, it drives its coil continuously, except while the other
-input is pulsed.
+For each hypothesis, which is that all coils are healthy or that one axis has one fault, the supply current is
+predicted from the commands. Each H-bridge has two inputs, A and B. The input A is pulsed for positive
+currents, the input B for negative currents. If an output leg is stuck high, it drives its coil continuously,
+except while the other input is pulsed.
 
 The class `CoilResponse` estimates the torque gain of each coil from the body's angular acceleration over some
 seconds. The measured rate and the commanded rate change, which is the integral of J^-1 (m x B), are averaged
-over short bins. Differences of neighbouring bins are accelerations. A generalised least squares fit, which
-uses that the noise of neighbouring differences is correlated, over the last bins
-estimates the gain of each coil, together with a constant disturbance, a torsion and a damping about each free
-axis. The gain is 1 for a healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the
-commands vary too little, the standard deviation of the gain is large, and the axis is not judged. A gain
-larger than `LARGEST_GAIN` is physically impossible. A gain larger than `LARGEST_GAIN` shows that the model is
-wrong, and no axis is judged.
+over short bins. Differences of neighbouring bins are accelerations. A generalised least squares fit over the
+last bins estimates the gain of each coil, together with a constant disturbance, a torsion and a damping about
+each free axis. The fit accounts for the correlated noise of neighbouring differences. The gain is 1 for a
+healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the commands vary too little, the
+standard deviation of the gain is large, and the axis is not judged. A gain larger than `LARGEST_GAIN` is
+physically impossible. A gain larger than `LARGEST_GAIN` shows that the model is wrong, and no axis is judged.
 
 The torques of three coils are normal to the field, so that the three gains can hardly be separated from each
 other within a short time. The gain of each coil is therefore estimated with the other two coils assumed
 healthy within the accuracy of their description. An axis is judged only if a fault of this axis explains the
-motion clearly better than a fault of another axis. A coil is reversed if this is far more likely than that
-all coils are healthy.
+motion clearly better than a fault of another axis. A coil is considered reversed if this hypothesis is far
+more likely than that of healthy coils.
 
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
 that an inertia error of 2 % can make healthy coils look reversed. The fit therefore subtracts the gyroscopic
@@ -57,7 +56,7 @@ from knightcube.gnc.estimation.rigid_body import (
 
 @dataclass(frozen=True, slots=True)
 class Supplied:
-    """An ADC sample, during which the braking did not change, and the current expected of healthy coils.
+    """An ADC sample during which the braking did not change, with the current that healthy coils would draw.
 
     Attributes:
         current: measured supply current, A.
@@ -98,7 +97,7 @@ ELECTRICAL = (
 )
 _VARIANTS: tuple[CoilFault | None, ...] = (None, *ELECTRICAL)
 PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
-"""Index of each variant in a prediction; the variant None is a healthy bridge."""
+"""Index of each fault variant in a prediction, where the variant None is a healthy bridge."""
 _SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)[:, None]
 _SHORTED_SLACK = 0.04
 _OUTLIERS = 0.15
@@ -178,7 +177,7 @@ def predict(
 def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
     """Return the supply currents (n, v, k), A, of n bridges in v variants for the commands (n, k), A.
 
-    `full` is the current (n, 1), A, of each coil when it is fully on. For a shorted coil, the result is the
+    The current of each coil that is fully on is `full` (n, 1), A. For a shorted coil, the result is the
     current of a healthy coil.
     """
     forward, backward = np.maximum(commands, 0.0), np.maximum(-commands, 0.0)
@@ -292,7 +291,7 @@ class CoilCommands:
     def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
         """Return the newest ADC sample, with the bounds of the current that healthy coils would draw.
 
-        `known` maps axes to their known faults.
+        The mapping `known` gives the known fault of each broken axis.
         """
         sizes = np.abs(self.window(reading.newest_since_ns, reading.time_ns))
         free = [axis for axis, fault in known.items() if fault in {CoilFault.SHORTED, CoilFault.UNCERTAIN}]
@@ -373,15 +372,17 @@ _GAIN_PRIOR = 10.0
 _LEAST_GAIN_ERROR = 0.05
 """Smallest error assumed for the gain of a healthy coil."""
 _WEAK_GAIN, _SIGMAS = 0.7, 2.5
-"""Upper limit of a weak coil's gain, and number of standard deviations that must lie below the limit."""
+"""Largest gain of a coil that is reported as weak, and number of standard deviations by which the estimate
+must be below this gain."""
 _STRONG_GAIN = 1.25
 """Lower limit of the gain of a coil that is stronger than assumed."""
 LEAST_GAIN, _EXACT = 0.1, 0.1
 """Smallest gain of a weak coil that is worth using, and largest standard deviation of a gain to be used."""
 _CLEARLY, _CERTAINLY, _WORSE = 9.0, 20.0, 25.0
-"""Differences of weighted sums of squares. A fault of one coil must explain the motion better than a fault of
-another coil by the first, and a reversed coil better than three healthy coils by the second. A fit of all
-gains may explain the motion better than a fault of one coil by less than the third."""
+"""Thresholds for the differences of weighted sums of squares between hypotheses. A fault of one coil must
+explain the motion better than a fault of another coil by the first threshold, and a reversed coil better than
+three healthy coils by the second threshold. A fit of all gains may explain the motion better than a fault of
+one coil by less than the third threshold."""
 
 
 class CoilResponse:
@@ -686,7 +687,7 @@ class CoilResponse:
 
 
 class Finding(Enum):
-    """What a fit shows of a coil."""
+    """Findings of a fit about a coil."""
 
     REVERSED = auto()
     FEEBLE = auto()
@@ -699,7 +700,8 @@ class MotionFit(NamedTuple):
     """Fit of the gains over some bins.
 
     Attributes:
-        gain, sigma: gain (3,) of each coil with the others assumed healthy, and its standard deviation (3,).
+        gain, sigma: gain (3,) of each coil with the other coils assumed healthy, and standard deviation (3,)
+            of this gain.
         weights: weights (k,) of the error modes.
         possible: whether the gains of all axes are physically possible.
         alone: whether a fault of one axis explains the motion clearly better than that of another axis.
@@ -764,7 +766,7 @@ class MotionWitness:
     """
 
     def __init__(self, response: CoilResponse | None, full_current: tuple[float, float, float]) -> None:
-        """`full_current` is the current (3,), A, of each coil when it is fully on."""
+        """Set the current `full_current` (3,), A, of each coil that is fully on."""
         self._response = response
         self._full_current = full_current
         self._doubted_ns = -_DOUBTED_FOR_NS

@@ -87,7 +87,7 @@ _DRIVEN = STEERING | {Mode.DETUMBLE}
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A row of the fact table: the events that report begin and end of a fact, and the conditions for them.
+    """A row of the fact table, with the conditions and events of the begin and end of a fact.
 
     Facts that the 40 Hz control cycle updates are counted in cycles, other facts in runs of the health task.
 
@@ -192,7 +192,7 @@ class Facts:
         self._mode = Mode.BOOT
 
     def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
-        """Update a fact with its condition, which is None if unknown. `text` is the text of the event."""
+        """Update a fact with its condition, which is None if unknown. The text of the event is `text`."""
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:
             return

@@ -165,8 +165,8 @@ class Navigation:
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
         """Apply the measurements of a frame at their times, over the next cycles.
 
-        The function `report` is called now or in a later cycle, with a flag for each measurement that passed
-        its gate.
+        The function `report` is called now or in a later cycle with flags that state which measurements
+        passed the gate.
         """
         if self._filter.started:
             self._filter.measure_late(late, report)
