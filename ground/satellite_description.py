@@ -300,17 +300,17 @@ def _coil_lines(satellite: Satellite) -> list[Line]:
 def _current_lines(satellite: Satellite) -> list[Line]:
     """Return the simulated errors of the currents, in proportion to those of the configuration `orbit`."""
     least = min(coil.current_limit for coil in satellite.coils)
-    lines: list[Line] = [
+    fields = np.zeros((3, 3))
+    for index, coil in enumerate(satellite.coils[:3]):
+        fields[:, index] = np.array(coil.axis) * _STRAY_FIELD / coil.current_limit
+    rows = ", ".join(f"[{', '.join(f'{value:.2g}' for value in row)}]" for row in fields)
+    return [
         (
             f"  current_noise: {_CURRENT_ERROR * least:.2g}",
             "A, bound of a uniform error in each cycle [computed]",
-        )
+        ),
+        (f"  coil_field: [{rows}]", "T/A, field of each coil at the magnetometer [assumed]"),
     ]
-    if len(satellite.coils) == 3:
-        columns = [np.array(coil.axis) * _STRAY_FIELD / coil.current_limit for coil in satellite.coils]
-        rows = ", ".join(f"[{', '.join(f'{value:.2g}' for value in row)}]" for row in np.array(columns).T)
-        lines.append((f"  coil_field: [{rows}]", "T/A, field of each coil at the magnetometer [assumed]"))
-    return lines
 
 
 def _camera_lines(satellite: Satellite, values: Derived) -> list[Line]:

@@ -31,6 +31,8 @@ from tests.support.places import ROOT
 
 GIVEN = ("--mass", "4", "--size", "3u", "--coil", "axis=xyz,dipole=0.2,current=0.1,resistance=40")
 
+FOURTH = ("--coil", "axis=1/1/1,dipole=1,current=0.1,resistance=5")
+
 
 def written(folder: Path, *words: str) -> OrbitConfig:
     """Return the configuration that the command writes with these options."""
@@ -77,6 +79,17 @@ def test_a_satellite_without_cameras_is_accepted(tmp_path: Path) -> None:
     assert config.camera is None
     assert config.wide_cameras == ()
     assert config.requirements.knowledge_deg is None
+
+
+def test_two_rods_and_a_tilted_air_coil_are_described(tmp_path: Path) -> None:
+    rods, air = "axis=xy,dipole=0.5,current=0.1,resistance=50", "axis=0/3/4,turns=200,area=0.02,resistance=30"
+    config = written(tmp_path, "--mass", "8", "--size", "6u", "--coil", rods, "--coil", f"{air},current=0.12")
+    assert [coil.axis for coil in config.coils.windings] == [(1, 0, 0), (0, 1, 0), (0, 0.6, 0.8)]
+    assert [coil.strength() for coil in config.coils.windings] == pytest.approx([5.0, 5.0, 4.0])
+    assert config.coils.limits == (0.1, 0.1, 0.12)
+    assert config.coils.supply_voltage == pytest.approx(5.0)
+    (tmp_path / "mine.yaml").unlink()
+    assert len(written(tmp_path, "--mass", "8", "--size", "6u", "--coil", rods).coils.windings) == 2
 
 
 @pytest.mark.parametrize(("utc", "hours"), [("2026-03-20T12:00:00", "10.5"), ("2026-09-01T00:00:00", "18")])
@@ -157,8 +170,8 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
         (("--coil", "axis=x,dipole=1,current=1,resistance=5"), "these coils control one axis only"),
         (("--coil", "axis=x,turns=9,current=1,resistance=5"), "give either `dipole`"),
         (
-            ("--mass", "4", "--size", "3u", "--coil", "axis=xy,dipole=1,current=0.1,resistance=5"),
-            "nothing was written: `coils.windings` has 2 entries",
+            ("--mass", "4", "--size", "3u", "--coil", "axis=xyz,dipole=1,current=0.1,resistance=5", *FOURTH),
+            "nothing was written: `coils.windings` has 4 entries",
         ),
         (("--star-camera", "90"), "--star-camera 90: give a number from 6 to 40 deg, or none"),
         (("--name", "my satellite"), "--name my satellite: give letters, digits and underscores"),
