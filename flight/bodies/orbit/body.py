@@ -383,13 +383,15 @@ def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
     """Return the filter's settings that follow from the configuration."""
     section, coils = config.estimation, config.coils.map()
     strength = float(np.linalg.norm(coils.dipoles, axis=1).max())
+    errors = description_errors(config)
     return FreeFilterSettings(
         gyro=(section.bias_start, section.bias_walk),
         coil_noise=section.current_noise * strength / math.sqrt(CONTROL_RATE_HZ),
         torque=config.torque_sizes(),
         magnet=(_UNIFORM * config.inertial_unit.accuracy.field_bias, _FIELD_BIAS_WALK),
         field=_FIELD_ERROR,
-        errors=description_errors(config),
+        errors=errors,
+        coils=None if coils.aligned else coils.error_covariance(errors.coil_gain, errors.coil_axes),
         roles={name: Role(role) for name, role in section.roles.items()},
         gate_sigma=section.gate_sigma,
     )

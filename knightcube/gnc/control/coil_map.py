@@ -69,6 +69,25 @@ class CoilMap:
             return np.asarray(matrix / self._strength)
         return np.asarray(matrix @ self._inverse)
 
+    @property
+    def aligned(self) -> bool:
+        """Whether three coils lie along the body axes x, y and z, in this order."""
+        return self._strength is not None
+
+    def error_covariance(self, gain: float, axes: float) -> FloatArray:
+        """Return the covariance (9, 9) of the matrix from the commanded to the actual dipole, row by row.
+
+        The errors of the coils are independent and uniform. The dipole of a coil has the largest relative
+        error `gain`, and its axis the largest misalignment `axes` (rad) in each of two directions.
+        """
+        found: FloatArray = np.zeros((3, 3, 3, 3))
+        for dipole, current in zip(self.dipoles.T, self._inverse, strict=True):
+            along = np.outer(dipole, dipole)
+            across = float(dipole @ dipole) * np.eye(3) - along
+            own = (gain**2 * along + axes**2 * across) / 3.0
+            found += np.einsum("ik,j,l->ijkl", own, current, current)
+        return found.reshape(9, 9)
+
     def _box(self) -> FloatArray:
         """Return the half lengths (3,) of the box with the largest volume inside what the coils can make."""
         if self._strength is not None:

@@ -245,6 +245,8 @@ class FreeFilterSettings:
             limits the claimed accuracy of the inertia, because flexible parts are not contained in Euler's
             equation of a rigid body.
         errors: largest errors of the description of body and sensors.
+        coils: covariance (9, 9) of the coils' matrix, row by row, at the start; None for coils along the body
+            axes, whose covariance follows from `errors`.
         roles: roles of the blocks of the error state whose role differs from the default, by name of the
             block.
         rate_start: standard deviation of the first rate, rad/s.
@@ -266,6 +268,7 @@ class FreeFilterSettings:
     coil_walk: float = 1e-4
     inertia_walk: float = 1e-5
     errors: BodyErrors = dataclasses.field(default_factory=BodyErrors)
+    coils: FloatArray | None = None
     roles: Mapping[str, Role] = dataclasses.field(default_factory=dict)
     rate_start: float = 1e-3
     fine: float = math.radians(0.1)
@@ -277,6 +280,9 @@ class FreeFilterSettings:
         start, walk = self.torque
         torques = np.repeat([CONSTANT_SHARE * start, AIR_SHARE * start, LIGHT_SHARE * start], 3)
         errors, ones = self.errors, np.ones(3)
+        coils = self.coils
+        if coils is None:
+            coils = _matrix_errors(errors.coil_gain, errors.coil_axes)
         blocks = [
             StateBlock("attitude", np.zeros(3)),
             StateBlock("rate", np.zeros(3)),
@@ -286,7 +292,7 @@ class FreeFilterSettings:
             StateBlock("field_bias", self.magnet[0] * ones, self.magnet[1]),
             StateBlock("torques", torques, walk),
             StateBlock("inertia", inertia_covariance(inertia, errors), self.inertia_walk),
-            StateBlock("coils", _matrix_errors(errors.coil_gain, errors.coil_axes), self.coil_walk),
+            StateBlock("coils", coils, self.coil_walk),
             StateBlock("gyro_matrix", _matrix_errors(errors.gyro_scale, errors.gyro_alignment)),
             StateBlock("field_matrix", _matrix_errors(errors.field_matrix, errors.field_matrix)),
             StateBlock("camera", _UNIFORM * errors.camera * ones),

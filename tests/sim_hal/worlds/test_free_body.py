@@ -9,15 +9,27 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from flight.bodies.orbit.body import filter_settings
 from flight.schema import reader
 from flight.schema.document import ConfigError
 from flight.schema.orbit import as_orbit
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
+from sim_hal.description_errors import description_errors
 from sim_hal.settings import CraftSection, Disturbances, FreeBodySection, OrbitSection, Simulation, TipOff
 from sim_hal.worlds import free_body
-from sim_hal.worlds.free_body import CRAFTS, FreeBody, Loads, Rotation, State, box, build, craft_model
+from sim_hal.worlds.free_body import (
+    CRAFTS,
+    FreeBody,
+    Loads,
+    Rotation,
+    State,
+    box,
+    build,
+    built_craft,
+    craft_model,
+)
 from sim_hal.worlds.world import World, WorldInputs, make_world
 from tests.support.flights import demo_config, demo_world
 from tests.support.pointing_settings import WEIGHTS
@@ -317,3 +329,22 @@ def test_the_campaign_of_pointing_judges_the_weights_that_are_flown(name: str, c
     assert config.dipole_weight() == pytest.approx(judged.dipole, rel=0.01)
     for weight in ("turn", "rate", "roll"):
         assert getattr(flown, weight) == pytest.approx(getattr(judged, weight), rel=0.01), weight
+
+
+def test_the_filter_expects_the_errors_of_tilted_coils_that_the_world_draws() -> None:
+    """Mean square of the nine elements of the coil matrix in expected standard deviations, 200 satellites."""
+    config = as_orbit(reader.load(FOLDER / "orbit_1u_tilted.yaml"))
+    coils, prior = config.coils.map(), filter_settings(config).coils
+    assert prior is not None
+    text = (FOLDER / "orbit_1u_tilted.yaml").read_text(encoding="utf-8")
+    section = reader.simulation_section(text, "orbit_1u_tilted.yaml", Simulation)
+    assert section is not None
+    assert section.free_body is not None
+    squares = []
+    for seed in range(200):
+        errors = description_errors(config, reader.replace(section, seed=seed))
+        generator = np.random.default_rng(seed)
+        built = built_craft(section.free_body, generator, errors, craft_model(section.free_body, config))
+        error = (coils.per_dipole(built.coil_dipole) - np.eye(3)).ravel()
+        squares.append(float(error @ np.linalg.solve(prior, error)) / 9.0)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.1)

@@ -67,3 +67,11 @@ def test_a_dipole_beyond_a_limit_keeps_its_direction() -> None:
     inside = np.array([0.1, -0.2, 0.3])
     assert limited(inside, limits) is inside
     np.testing.assert_allclose(limited(np.array([0.2, -0.8, 0.4]), limits), [0.05, -0.2, 0.1])
+
+
+def test_the_covariance_of_coils_along_the_body_axes_is_that_of_gain_and_misalignment() -> None:
+    coils = CoilMap(np.diag([0.6, 2.0, 0.1]), LIMITS, OHMS)
+    assert coils.aligned
+    assert not CoilMap(TILTED, LIMITS, OHMS).aligned
+    expected = np.where(np.eye(3, dtype=bool), 0.2**2, 0.05**2).ravel() / 3.0
+    np.testing.assert_allclose(coils.error_covariance(0.2, 0.05), np.diag(expected), atol=1e-15)
