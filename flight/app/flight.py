@@ -30,6 +30,7 @@ from flight.app.devices import (
     simulated_rig,
 )
 from flight.app.run import RunRequest, RunResult, begin_folder, open_log
+from flight.app.separation import SeparationInhibit
 from flight.app.service import (
     Chosen,
     EndingSignals,
@@ -64,13 +65,14 @@ from flight.loop.horizon_cameras import HorizonCameraSettings, HorizonCameraTask
 from flight.loop.imaging import Imaging, ImagingSettings, ObjectTracks
 from flight.loop.modes import ModeControl, ModeSettings
 from flight.loop.navigation import Navigation, NavigationSettings, Positioning, SunSensing
-from flight.loop.state import Learned, StateKeeper, open_state, service_folder
+from flight.loop.state import Learned, StateKeeper, open_state, service_folder, state_folder
 from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
 from flight.loop.worker_processes import ProcessRunner
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_settings
 from flight.schema.document import ConfigError, merged_text, read_text
 from flight.schema.sections import CONTROL_RATE_HZ, Config
+from hal.buses.clock import SystemClock
 from hal.buses.linux_process import worker_cores
 from hal.interfaces.wires import SECOND_NS, Clock, Rig
 from knightcube.errors import UsageError
@@ -226,14 +228,22 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
 def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Opened:
     """Return a flight that is ready to begin. `stack` closes it.
 
-    A board, which has an archive, retries the start until it succeeds.
+    A board, which has an archive, retries the start until it succeeds, and first waits for the end of the
+    separation inhibit.
     """
     judge = partial(_judge, request)
     if request.archive is None:
         return _open(judge(), stack)
     retry = StartRetry(lambda: signals.received)
     stack.callback(retry.close)
-    opened = retried_start(judge, _open, stack, retry)
+    inhibit = SeparationInhibit(SystemClock())
+
+    def open_after_inhibit(judged: _Judged, stack: ExitStack) -> _Opened:
+        if (folder := state_folder(judged.config, os.environ)) is not None:
+            inhibit.check(folder, judged.config.separation.inhibit)
+        return _open(judged, stack)
+
+    opened = retried_start(judge, open_after_inhibit, stack, retry)
     if summary := retry.summary():
         opened.loop.note(events.START_WAITED, summary)
     return opened

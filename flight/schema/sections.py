@@ -207,6 +207,12 @@ class State(Section, frozen=True, kw_only=True):
     period: Annotated[float, Meta(ge=1.0, le=3600.0)] = 10.0
 
 
+class Separation(Section, frozen=True, kw_only=True):
+    """Coils and transmitter stay off until the satellite has had power for `inhibit` s."""
+
+    inhibit: Annotated[float, Meta(ge=0.0, le=86_400.0)] = 0.0
+
+
 class Config(Section, frozen=True, kw_only=True):
     """The configuration sections of every body; the configuration of a body adds more sections.
 
@@ -232,6 +238,7 @@ class Config(Section, frozen=True, kw_only=True):
     duration: Positive
     telemetry: Telemetry = Telemetry()
     state: State = State()
+    separation: Separation = Separation()
     simulation: dict[str, Any] | None = None
 
     def field_range(self) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from flight.app.separation import SeparationInhibit
 from flight.app.service import StartRetry, StoppedError, accepted_config, retried_start
 from flight.link.process.commanding import ControlLine, Sent
 from flight.link.process.downlink import LogFollower
@@ -33,10 +34,15 @@ _WRITE_TIMEOUT_S = 0.5  # longest wait for a radio that takes telemetry more slo
 
 @dataclass(frozen=True, slots=True)
 class _JudgedLink:
-    """A validated configuration: its link section, its command socket, and why another file was read."""
+    """Values of a validated configuration.
+
+    The attribute `socket` is the command socket of the flight, `inhibit` the duration of the separation
+    inhibit, s, and `problem` the reason why another file was read.
+    """
 
     link: Link
     socket: Path
+    inhibit: float
     problem: str
 
 
@@ -93,7 +99,8 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
     with ExitStack() as stack:
         retry = StartRetry(ended)
         stack.callback(retry.close)
-        opened = retried_start(partial(_judge, config, log), partial(_open, log), stack, retry)
+        inhibit = SeparationInhibit(SystemClock())
+        opened = retried_start(partial(_judge, config, log), partial(_open, log, inhibit), stack, retry)
         overseer = ServiceManager(os.environ, os.getpid())
         stack.callback(overseer.close)
         stack.callback(overseer.stopping)
@@ -110,17 +117,19 @@ def _judge(config_path: Path, log: Path) -> _JudgedLink:
     config = parse(chosen.text, str(chosen.path))
     if config.link is None or config.commands.socket is None:
         raise ConfigError(str(chosen.path), "no `link` section: there is nothing to connect")
-    return _JudgedLink(config.link, Path(config.commands.socket), chosen.problem)
+    socket, inhibit = Path(config.commands.socket), config.separation.inhibit
+    return _JudgedLink(config.link, socket, inhibit, chosen.problem)
 
 
-def _open(log: Path, judged: _JudgedLink, stack: ExitStack) -> _OpenedLink:
-    """Open keys and lines.
+def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: ExitStack) -> _OpenedLink:
+    """Open keys and lines after the separation inhibit.
 
     Raises UsageError, FlightError, DeviceError or OSError for problems that may pass.
     """
     if judged.problem:
         _say(judged.problem)
     section, clock = judged.link, SystemClock()
+    inhibit.check(Path(section.keys).absolute().parent, judged.inhibit)
     vault = Vault(Path(section.keys))
     if all(vault.read(spi) is None for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)):
         raise UsageError(f"{section.keys}: no key can be read: mount or copy the satellite's keys there")

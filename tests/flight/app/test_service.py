@@ -115,6 +115,20 @@ def test_a_board_waits_for_its_socket_folder_and_leaves_no_run_and_no_boot_of_th
     assert StateStore(tmp_path / "state", lambda *_: None).load().boot_count == 1
 
 
+def test_a_board_flies_after_the_separation_inhibit(board: list[str], tmp_path: Path) -> None:
+    (tmp_path / "later").mkdir()
+    with Path(board[1]).open("a", encoding="utf-8") as file:
+        file.write("\nseparation: {inhibit: 0.4}\n")
+    assert main(board) == 0
+    assert main(board) == 0
+    texts = []
+    for run in sorted((tmp_path / "runs").iterdir()):
+        events = {to_text(row["name"]): to_text(row["text"]) for row in read_run(run)["event"]}
+        texts.append(events.get("start-waited", ""))
+    assert "separation inhibit of 0.4 s" in texts[0]
+    assert texts[1] == ""
+
+
 def test_a_board_that_is_stopped_while_it_waits_ends_well(
     board: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

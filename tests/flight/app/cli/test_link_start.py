@@ -115,6 +115,22 @@ def test_a_port_that_is_taken_is_waited_for_and_the_service_manager_learns_of_ea
     assert service.process.wait(_LONGEST_S) == 0
 
 
+def test_no_line_is_opened_during_the_separation_inhibit(
+    place: Path, start: Callable[[Path], Service]
+) -> None:
+    (port,) = free_ports([socket.SOCK_DGRAM])
+    config = write_linked_config(place, udp=f"127.0.0.1:{port}")
+    with config.open("a", encoding="utf-8") as file:
+        file.write("separation: {inhibit: 86400.0}\n")
+    service = start(config)
+    for _ in range(2):
+        service.says("cannot begin yet: separation inhibit of 86400 s")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", port))
+    service.process.terminate()
+    assert service.process.wait(_LONGEST_S) == 0
+
+
 def test_what_is_not_there_yet_is_waited_for_in_turn(place: Path, start: Callable[[Path], Service]) -> None:
     """The configuration, then the keys, whose folder is empty until they are mounted, then an old process."""
     whole = write_linked_config(place, udp="127.0.0.1:0")
