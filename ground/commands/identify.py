@@ -1,7 +1,8 @@
-"""Command `flight identify`, which gives the constants of a body that a flight has shown.
+"""Command `flight identify`, which estimates the constants of a body from a flight.
 
 For the testbed, the command flies pulses of a coil and fits the constants of the plant. The filter of a
-satellite learns its description in every flight, so the command only reads the run of a satellite.
+satellite learns inertia, coils and sensors in every flight. For a satellite, the command therefore only reads
+the folder of a run.
 """
 
 from __future__ import annotations

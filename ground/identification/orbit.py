@@ -5,7 +5,8 @@ standard deviations. The last packet of a run is compared with the configuration
 values are written as sections of a configuration.
 
 The motion shows only the ratios of the inertia's elements to the trace, and the ratio of the coils' dipole to
-the trace. The learned inertia is therefore scaled to the configured trace, and the coils with it.
+the trace. The learned inertia is therefore scaled to the configured trace, and the coils' dipole is scaled by
+the same factor.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from knightcube.gnc.estimation import free_filter as states
 from knightcube.gnc.estimation.rigid_body import BodyErrors, inertia_covariance, tensor
 
 LEARNED = 0.5
-"""Largest ratio of the claims of a learned quantity to the standard deviations in the configuration, rms."""
+"""Largest ratio of the claimed to the configured standard deviations (rms) of a learned quantity."""
 _UNIFORM = math.sqrt(3.0)
 """Largest value of a uniformly distributed error with a standard deviation of one."""
 _FRACTIONS = np.geomspace(1.0, 1e-3, 13).tolist()
-"""Fractions of the configured accuracies of the inertia that are tried."""
+"""Fractions of the configured accuracies of the inertia that are tried, largest first."""
 _ELEMENTS = ("xx", "yy", "zz", "yz", "zx", "xy")
 _AXES = ("x", "y", "z")
 _MATRIX = tuple(a + b for a in _AXES for b in _AXES)
@@ -47,10 +48,10 @@ class LearnedQuantity:
         name: name of the quantity.
         labels: names of the elements.
         unit: unit of all values.
-        described: (n,) values in the configuration of the run.
-        value: (n,) values at the end of the run.
-        claim: (n,) standard deviations of `value`.
-        prior: (n,) standard deviations of `described`.
+        described: values (n,) in the configuration of the run.
+        value: estimated values (n,) at the end of the run.
+        claim: standard deviations (n,) of `value`.
+        prior: standard deviations (n,) of `described`, from the configured accuracies.
     """
 
     name: str
@@ -63,7 +64,7 @@ class LearnedQuantity:
 
     @property
     def learned(self) -> bool:
-        """Whether the flight has reduced the uncertainty."""
+        """Whether the flight has reduced the uncertainty of the quantity to less than half."""
         return float(np.sum(self.claim**2)) < LEARNED**2 * float(np.sum(self.prior**2))
 
     @property
@@ -141,9 +142,9 @@ def learned_description(run: Run, config: OrbitConfig) -> LearnedDescription:
 def fragment(found: LearnedDescription, folder: Path, extends: str) -> str:
     """Return the learned values as a configuration that extends the file `extends`.
 
-    `folder` is the folder of the run. The file also contains the accuracies of the learned values. Quantities
-    that were not learned, and the residual dipole and the gyro bias, which have no key, are omitted.
-    Raises InputError if no body has the learned inertia.
+    The text names the folder of the run, `folder`, and contains the accuracies of the learned values.
+    Quantities that were not learned are omitted, and so are residual dipole and gyro bias, which have no key.
+    Raises InputError if no body can have the learned inertia.
     """
     sections = [_craft(found), _coils(found), _inertial_unit(found), _camera(found)]
     lines = [
@@ -205,7 +206,7 @@ def _largest(matrix: LearnedQuantity) -> tuple[float, float]:
 def _inertia_accuracy(found: LearnedDescription) -> tuple[float, float]:
     """Return the smallest accuracies `moments` and `axes_deg` that contain the claims of the inertia.
 
-    They do not exceed the accuracies of the configuration.
+    The accuracies do not exceed those of the configuration.
     """
     one, accuracy = found.quantities["inertia"], found.config.craft.accuracy
     inertia = tensor(one.value)
@@ -229,7 +230,7 @@ def _inertial_unit(found: LearnedDescription) -> list[str]:
     known, accuracy = unit.calibration, unit.accuracy
     values, accuracies = [], []
     if gyro.learned:
-        # The readings were corrected by the configured matrix, so the learned matrix is the remaining error.
+        # The learned matrix refers to readings that were corrected by the configured matrix.
         values += [f"    gyro_matrix:   # +- {gyro.claim.max():.2g}"]
         values += _rows(np.array(known.gyro_matrix) @ gyro.value.reshape(3, 3), 6)
         scale, alignment = _largest(gyro)
