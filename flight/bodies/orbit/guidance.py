@@ -226,7 +226,7 @@ class PointingTargetLaw:
 
 
 def target_of(target: Target) -> PointingTarget:
-    """Return the pointing target of a satellite's target."""
+    """Return the pointing target that a numbered target of a satellite contains."""
     law = target.law
     assert isinstance(law, PointingTargetLaw), "only the satellite's own targets reach its planner"
     return law.target

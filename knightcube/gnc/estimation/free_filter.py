@@ -321,8 +321,8 @@ MINIMUM_FIELD_ERROR = 1e-8
 """Minimum standard deviation (T per axis) of the field model's error, which also represents slow variations
 of the magnetometer's errors."""
 CURRENTS = 1e-7
-"""Standard deviation (T per axis) of the field by auroral currents, which must not lead to rejected
-measurements."""
+"""Standard deviation (T per axis) of the magnetic field of auroral currents. It is added to the measurement
+noise, so that measurements in auroral zones are not rejected."""
 AIR_WALK = 6e-3
 """Random walk of the air density, relative to the density, per sqrt(s): 15 % in ten minutes."""
 _EYE: FloatArray = np.eye(3)
@@ -595,8 +595,8 @@ class FreeFilter:
         """Apply a gyro rate (3,) rad/s with covariance (3, 3), and return whether the rate passed the gate.
 
         If the gyro rate is an average over an interval, `change` (3,) rad/s is the change of the rate since
-        the middle of the interval, `since` s ago, due to the acceleration of the last step. This method adds
-        the effect of the changing acceleration since `begin_mean`.
+        the middle of the interval, `since` s ago, due to the acceleration of the last step. The average is
+        corrected for the change of the acceleration since `begin_mean`.
         """
         matrix = _EYE + self._matrix(GYRO_MATRIX)
         then = self.rate
