@@ -43,13 +43,15 @@ class CraftSection(Section, frozen=True, kw_only=True):
 
     The craft is a box of `size` (3,), m. The vector `centre_of_mass` (3,), m, leads from the centre of the
     box to the centre of mass, in body axes. `inertia`, kg m^2, holds the moments of inertia (3,) about the
-    body axes, or the inertia tensor (3, 3). The list `windings` describes the coils. An omitted value equals
+    body axes, or the inertia tensor (3, 3). The residual dipole in shadow is `residual_dipole` (3,), A m^2,
+    plus that of the section `disturbances`. The list `windings` describes the coils. An omitted value equals
     that of the flight configuration.
     """
 
     inertia: Inertia | None = None
     size: tuple[Positive, Positive, Positive] | None = None
     centre_of_mass: Vector | None = None
+    residual_dipole: Vector | None = None
     windings: tuple[Winding, ...] | None = None
 
 

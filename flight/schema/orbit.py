@@ -69,13 +69,15 @@ class Craft(Section, frozen=True, kw_only=True):
     The satellite is a box with the edges `size` (m) along the body axes. The vector `centre_of_mass` (m)
     leads from the centre of the box to the centre of mass. The value `inertia` holds the moments of inertia
     about the body axes, or the rows of the inertia tensor, kg m^2. Without `inertia`, the moments are those
-    of a homogeneous box of `mass` (kg). The coils are described in the section `coils`.
+    of a homogeneous box of `mass` (kg). The coils are described in the section `coils`. The vector
+    `residual_dipole` (A m^2) is the expected magnetic dipole of the satellite in shadow with the coils off.
     """
 
     size: tuple[Positive, Positive, Positive]
     mass: Positive | None = None
     centre_of_mass: Vector = (0.0, 0.0, 0.0)
     inertia: Inertia | None = None
+    residual_dipole: Vector = (0.0, 0.0, 0.0)
     accuracy: CraftAccuracy = CraftAccuracy()
 
     def inertia_matrix(self) -> FloatArray:

@@ -127,7 +127,7 @@ def learned_description(run: Run, config: OrbitConfig) -> LearnedDescription:
             ("field_bias", _AXES, "T", none, states.MAGNET),
             ("camera", _AXES, "rad", none, states.CAMERA),
             ("gyro_bias", _AXES, "rad/s", none, states.GYRO),
-            ("dipole", _AXES, "A m^2", none, states.DIPOLE),
+            ("dipole", _AXES, "A m^2", np.array(config.craft.residual_dipole), states.DIPOLE),
             ("sunlit_dipole", _AXES, "A m^2", none, states.SUNLIT),
         )
         if name != "camera" or config.camera is not None
@@ -143,7 +143,7 @@ def fragment(found: LearnedDescription, folder: Path, extends: str) -> str:
     """Return the learned values as a configuration that extends the file `extends`.
 
     The text names the folder of the run, `folder`, and contains the accuracies of the learned values.
-    Quantities that were not learned are omitted, and so are residual dipole and gyro bias, which have no key.
+    Quantities that were not learned are omitted, and so are the gyro bias and the dipole in sunlight.
     Raises InputError if no body can have the learned inertia.
     """
     sections = [_craft(found), _coils(found), _inertial_unit(found), _camera(found)]
@@ -156,7 +156,7 @@ def fragment(found: LearnedDescription, folder: Path, extends: str) -> str:
 
 def _craft(found: LearnedDescription) -> list[str]:
     """Return the lines of the section `craft`."""
-    inertia, coils = found.quantities["inertia"], found.quantities["coils"]
+    inertia, coils, dipole = (found.quantities[name] for name in ("inertia", "coils", "dipole"))
     accuracy = found.config.craft.accuracy
     values, accuracies = [], []
     if inertia.learned:
@@ -166,13 +166,17 @@ def _craft(found: LearnedDescription) -> list[str]:
         values += _rows(tensor(inertia.value), 4)
         moments, axes_deg = _inertia_accuracy(found)
         accuracies = [f"moments: {_above(moments)}", f"axes_deg: {_above(axes_deg)}"]
+    if dipole.learned:
+        values += [f"  residual_dipole: {_row(dipole.value)}   # A m^2 +- {dipole.claim.max():.2g}"]
     if coils.learned:
         gain, axes = _largest(coils)
         accuracies += [
             f"coil_gain: {_above(min(gain, accuracy.coil_gain))}",
             f"coil_axes_deg: {_above(min(math.degrees(axes), accuracy.coil_axes_deg))}",
         ]
-    return ["craft:", *values, f"  accuracy: {{{', '.join(accuracies)}}}"] if accuracies else []
+    if accuracies:
+        values += [f"  accuracy: {{{', '.join(accuracies)}}}"]
+    return ["craft:", *values] if values else []
 
 
 def _coils(found: LearnedDescription) -> list[str]:

@@ -184,6 +184,7 @@ class CraftModel:
         dipoles: dipole moment of each coil per ampere (3, n), m^2, body axes, one column per coil.
         centre_of_mass: vector (3,) from the centre of the box to the centre of mass, m, body axes.
         offset: distance of the true from the described centre of mass, m.
+        residual_dipole: residual dipole (3,) in shadow, A m^2, body axes.
     """
 
     inertia: FloatArray
@@ -191,6 +192,7 @@ class CraftModel:
     dipoles: FloatArray
     centre_of_mass: tuple[float, float, float] = (0.0, 0.0, 0.0)
     offset: float = PRESSURE_ARM
+    residual_dipole: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 CRAFTS = {
@@ -296,7 +298,7 @@ def build(section: CraftModel, disturbances: Disturbances, generator: np.random.
         faces=box(section.size, arm, mirrored),
         coil_dipole=np.einsum("kij,jk->ik", coil_frames(section.dipoles), columns),
         coil_frames=coil_frames(section.dipoles),
-        constant_dipole=worst * CONSTANT_DIPOLE * constant,
+        constant_dipole=np.array(section.residual_dipole) + worst * CONSTANT_DIPOLE * constant,
         sunlit_dipole=worst * SUNLIT_DIPOLE * sunlit,
         walking_dipole=worst * WALKING_DIPOLE,
     )
@@ -694,6 +696,7 @@ def craft_model(section: FreeBodySection, config: Config | None = None) -> Craft
         dipoles=coils.map().dipoles,
         centre_of_mass=craft.centre_of_mass or described.centre_of_mass,
         offset=described.accuracy.centre_of_mass,
+        residual_dipole=craft.residual_dipole or described.residual_dipole,
     )
 
 

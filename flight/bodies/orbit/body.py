@@ -408,7 +408,8 @@ def _filter(
     """Return the attitude filter, and the reasons why learned states were rejected."""
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
     inertia, free, coils = craft.inertia_matrix(), filter_settings(config), config.coils.map()
-    slow, problems = start_from(learned, free.error_state(inertia), section.changed, utc)
+    layout, dipole = free.error_state(inertia), craft.residual_dipole
+    slow, problems = start_from(learned, layout, section.changed, utc, dipole)
     settings = OrbitFilterSettings(
         inertia=inertia,
         coils=coils,

@@ -901,15 +901,20 @@ def learned_of(slow: SlowStates, utc: float) -> dict[str, Learned]:
 
 
 def start_from(
-    learned: Mapping[str, Learned], layout: ErrorState, changed: float, utc: float
+    learned: Mapping[str, Learned],
+    layout: ErrorState,
+    changed: float,
+    utc: float,
+    dipole: Sequence[float] = _NOTHING,
 ) -> tuple[SlowStates, list[str]]:
     """Return the prior of the slow states at a time (UTC, s), and why learned states were rejected.
 
-    Between two boots, each state may have changed by the fraction `changed` of its initial standard
-    deviation.
+    The residual dipole that is expected before the first boot is `dipole` (3,), A m^2. Between two boots,
+    each state may have changed by the fraction `changed` of its initial standard deviation.
     """
     initial, walks = layout.prior[SLOW, SLOW], layout.walks[SLOW]
     prior = SlowStates(np.zeros(len(initial)), initial.copy())
+    prior.values[DIPOLE.start - SLOW.start : DIPOLE.stop - SLOW.start] = dipole
     if LEARNED_AT not in learned:
         return prior, []
     age = utc - learned[LEARNED_AT].values[0]
@@ -924,7 +929,7 @@ def start_from(
         if values.shape != at.shape:
             problems.append(f"{name} has {len(values)} values instead of {len(at)}")
             continue
-        if not plausible(values, initial.diagonal()[at]).all():
+        if not plausible(values - prior.values[at], initial.diagonal()[at]).all():
             problems.append(f"{name} {values.tolist()}: not within {PLAUSIBLE:g} sigma of what is expected")
             continue
         prior.values[at] = values

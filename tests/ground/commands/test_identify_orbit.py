@@ -153,6 +153,8 @@ def test_the_learned_sensors_are_combined_with_the_configured_ones(tmp_path: Pat
         "field_bias_sigma": [1e-8] * 3,
         "camera": [0.0, 0.0, 1e-3],
         "camera_sigma": [1e-5] * 3,
+        "dipole": [1e-3, 0.0, -2e-3],
+        "dipole_sigma": [1e-4] * 3,
     }
     folder = tmp_path / "run"
     run = packed_run(folder, description=[(10.0, packet)])
@@ -171,4 +173,5 @@ def test_the_learned_sensors_are_combined_with_the_configured_ones(tmp_path: Pat
     between = multiply(conjugate(np.array(before.mounting)), np.array(flown.camera.mounting))
     np.testing.assert_allclose(to_rotation_vector(between), [0.0, 0.0, 1e-3], atol=1e-8)
     assert flown.camera.accuracy.mounting_deg == pytest.approx(np.degrees(np.sqrt(3.0) * 1e-5), rel=0.01)
+    assert flown.craft.residual_dipole == pytest.approx((1e-3, 0.0, -2e-3))
     assert flown.craft.accuracy.moments == as_orbit(load(config)).craft.accuracy.moments, "not learned"

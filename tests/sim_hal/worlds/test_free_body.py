@@ -322,6 +322,24 @@ def test_the_true_body_has_the_described_tensor_unless_it_is_given_another() -> 
         FreeBody(described, lambda: np.zeros(3))
 
 
+def test_the_true_residual_dipole_is_the_described_one_plus_the_disturbance() -> None:
+    config = as_orbit(reader.load(FOLDER / "orbit_3u.yaml"))
+    described = (2e-3, -1e-3, 0.0)
+    config = reader.replace(config, craft=reader.replace(config.craft, residual_dipole=described))
+    calm = Disturbances(residual_dipole=0.0)
+    found = [
+        FreeBody(section, lambda: np.zeros(3), craft=craft_model(section, config)).craft.constant_dipole
+        for section in (
+            FreeBodySection(craft=CraftSection(), disturbances=calm),
+            FreeBodySection(craft=CraftSection()),
+            FreeBodySection(craft=CraftSection(residual_dipole=(0.0, 0.0, 1e-3)), disturbances=calm),
+        )
+    ]
+    np.testing.assert_allclose(found[0], described)
+    assert np.linalg.norm(found[1] - described) == pytest.approx(1e-3)
+    np.testing.assert_allclose(found[2], [0.0, 0.0, 1e-3])
+
+
 @pytest.mark.parametrize(("name", "craft"), [("orbit.yaml", "knightcube"), ("orbit_3u.yaml", "cubesat_3u")])
 def test_the_campaign_of_pointing_judges_the_weights_that_are_flown(name: str, craft: str) -> None:
     config, judged = as_orbit(reader.load(FOLDER / name)), WEIGHTS[craft]

@@ -95,6 +95,21 @@ def test_without_a_time_or_far_from_what_is_expected_nothing_is_believed() -> No
     assert np.array_equal(prior.values[PARTS[SOURCES]], known().values[PARTS[SOURCES]])
 
 
+def test_the_first_boot_starts_from_the_described_residual_dipole() -> None:
+    described = (2e-3, -1e-3, 5e-4)
+    at = slice(DIPOLE.start - GYRO.start, DIPOLE.stop - GYRO.start)
+    prior, problems = start_from({}, LAYOUT, CHANGED, THEN, described)
+    assert not problems
+    np.testing.assert_array_equal(prior.values[at], described)
+    assert np.count_nonzero(prior.values) == 3
+    np.testing.assert_array_equal(prior.covariance, PRIOR)
+    near = known()
+    near.values[at] = np.array(described) + 3.0 * START[at]
+    prior, problems = start_from(stored(near), LAYOUT, CHANGED, THEN, described)
+    assert not problems, "plausible near the description"
+    np.testing.assert_array_equal(prior.values, near.values)
+
+
 def test_the_filter_starts_from_them_and_a_contradiction_takes_their_claim_away() -> None:
     prior, _ = start_from(stored(known()), LAYOUT, CHANGED, THEN)
     found = FreeFilter(INERTIA, SETTINGS, prior)
