@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
+import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -107,6 +108,18 @@ class DipoleHistory:
         if to_ns <= from_ns:
             return np.array(self._dipoles[-1] if self._dipoles else _NOTHING)
         return np.subtract(self._sum(to_ns), self._sum(from_ns)) / (to_ns - from_ns)
+
+    def impulse(self, from_ns: int, to_ns: int) -> FloatArray:
+        """Return the mean (3,), A m^2 s, of the integral of the dipole from a time of an interval to its end.
+
+        By the angular momentum of this impulse, the rate at the end of the interval `from_ns` to `to_ns`
+        differs from the mean rate of the interval.
+        """
+        first, last = bisect.bisect_right(self._times, from_ns), bisect.bisect_left(self._times, to_ns)
+        knots = np.array([from_ns, *self._times[first:last], to_ns])
+        sums = np.array([self._sum(time_ns) for time_ns in knots.tolist()])
+        mean = np.diff(knots) @ (0.5 * (sums[1:] + sums[:-1])) / (to_ns - from_ns)
+        return np.asarray((sums[-1] - mean) / SECOND_NS)
 
     def at_rest_since(self) -> int | None:
         """Return the time (ns) since which the dipole is zero, or None if it is not zero."""
@@ -260,8 +273,10 @@ class StepReplay:
         refused_fields: number of magnetic fields in a row that contradict the estimate.
     """
 
-    def __init__(self, settings: OrbitFilterSettings) -> None:
+    def __init__(self, settings: OrbitFilterSettings, dipoles: DipoleHistory) -> None:
+        """`dipoles` holds the commanded dipoles during the history."""
         self._settings = settings
+        self._dipoles = dipoles
         self.free = FreeFilter(settings.inertia, settings.free, settings.slow)
         self.steps: deque[FilterStep] = deque()
         self.refused_gyros = 0
@@ -415,7 +430,7 @@ class StepReplay:
             for measurement in step.late:
                 self._advance(step, time_ns, measurement.time_ns)
                 time_ns = measurement.time_ns
-                if self._apply(measurement):
+                if self._apply(step, measurement):
                     used.add(id(measurement))
             self._advance(step, time_ns, step.end_ns)
             self._end(step)
@@ -424,18 +439,20 @@ class StepReplay:
     def _advance(self, step: FilterStep, from_ns: int, to_ns: int) -> None:
         seconds = (to_ns - from_ns) / SECOND_NS
         parts = math.ceil(seconds / _LONGEST)
-        for _ in range(parts):
-            self.free.advance(seconds / parts, step.dipole, step.around, step.doubt)
+        times_ns = [from_ns + (to_ns - from_ns) * k // parts for k in range(parts + 1)] if parts else []
+        for begin_ns, end_ns in itertools.pairwise(times_ns):
+            part = (end_ns - begin_ns) / SECOND_NS
+            dipole, impulse = self._dipoles.mean(begin_ns, end_ns), self._dipoles.impulse(begin_ns, end_ns)
+            # The integral of the dipole's integral beyond that of the mean dipole.
+            uneven = part * (0.5 * part * dipole - impulse)
+            self.free.advance(part, dipole, step.around, step.doubt, uneven)
 
     def _end(self, step: FilterStep) -> None:
         """Apply the mean gyro and magnetometer readings of a step at its end."""
         free, settings = self.free, self._settings
         since = (step.end_ns - step.gyro_ns) / SECOND_NS
-        shown = attitude_matrix(free.quaternion) @ step.around.field
-        # The coils may act only during a part of the step.
-        # Therefore `impulse`, not the mean dipole, gives the rate change after the mean time of the samples.
-        uneven = np.cross(step.impulse - since * step.dipole, shown)
-        change = since * free.acceleration + free.motion.inverse @ uneven
+        # The coils may act only during a part of the step, which the mean dipoles do not show.
+        change = self._rate_change(step, since, step.impulse - free.impulse(since))
         spread = settings.free.coil_error**2 * float(change @ change) + settings.gyro_noise**2 / step.samples
         refused = not free.gyro(step.gyro, spread * _EYE, change, since)
         self.refused_gyros = self.refused_gyros + 1 if refused else 0
@@ -446,15 +463,29 @@ class StepReplay:
             used = free.field(now, step.around.field, settings.field_noise**2 / step.fields * _EYE)
             self.refused_fields = 0 if used else self.refused_fields + 1
 
-    def _apply(self, measurement: Measurement) -> bool:
+    def _rate_change(self, step: FilterStep, since: float, impulse: FloatArray) -> FloatArray:
+        """Return the change (3,), rad/s, of the rate since the mean of an interval with its middle `since` s ago.
+
+        `impulse` (3,), A m^2 s, is that of the dipole of the interval, less that of the newest dipole, which
+        acts in the present acceleration (`DipoleHistory.impulse`).
+        """
+        free = self.free
+        shown = attitude_matrix(free.quaternion) @ step.around.field
+        uneven = cross_product(free.coil_matrix @ impulse, shown)
+        return np.asarray(since * free.acceleration + free.motion.inverse @ uneven)
+
+    def _apply(self, step: FilterStep, measurement: Measurement) -> bool:
         """Apply a measurement to the estimate at its time, and return whether it passed the gate."""
         free = self.free
         if isinstance(measurement, AttitudeMeasurement):
             stars = measurement.by_stars
             return free.attitude(measurement.quaternion, measurement.covariance, by_stars=stars)
         if isinstance(measurement, MeanRateMeasurement):
-            since = 0.5 * (measurement.time_ns - measurement.since_ns) / SECOND_NS
-            return free.mean_rate(measurement.rate, measurement.covariance, since * free.acceleration)
+            begin_ns, end_ns = measurement.since_ns, measurement.time_ns
+            since = 0.5 * (end_ns - begin_ns) / SECOND_NS
+            uneven = self._dipoles.impulse(begin_ns, end_ns) - since * free.driven
+            change = self._rate_change(step, since, uneven)
+            return free.mean_rate(measurement.rate, measurement.covariance, change, since)
         if isinstance(measurement, DirectionMeasurement):
             return free.direction(measurement.observed, measurement.reference, measurement.covariance)
         if isinstance(measurement, FieldMeasurement):
@@ -614,10 +645,10 @@ class OrbitFilter:
         """
         self._settings = settings
         self._around = around
-        self._replay = StepReplay(settings)
+        self._dipoles = DipoleHistory(settings.history_ns + 2 * settings.step_ns)  # a step may begin earlier
+        self._replay = StepReplay(settings, self._dipoles)
         self._free, self._steps = self._replay.free, self._replay.steps
         self._propagated = EstimatePropagation(self._free)
-        self._dipoles = DipoleHistory(settings.history_ns)
         self._open: OpenStep | None = None
         self._field_check = StuckFieldCheck()
         self._refused_attitudes = 0

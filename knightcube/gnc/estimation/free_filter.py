@@ -345,6 +345,7 @@ class FreeMemory:
     quaternion: FloatArray
     rate: FloatArray
     acceleration: FloatArray
+    driven: FloatArray
     constants: FloatArray
     covariance: FloatArray
     field_error: float
@@ -358,6 +359,7 @@ class FreeFilter:
         quaternion: attitude (4,), from ICRS into body axes.
         rate: body rate (3,) in body axes, rad/s.
         acceleration: angular acceleration (3,) in body axes during the last step, rad/s^2.
+        driven: commanded dipole (3,) of the coils in body axes during the last step, A m^2.
         covariance: covariance (STATES, STATES) of the error state.
         field_error: standard deviation of the field model's error, T per axis.
         changes: number of changes of the estimate so far. refused: number of measurements that did not pass
@@ -377,11 +379,14 @@ class FreeFilter:
         self._gates = gate_bounds(settings.gate_sigma)
         self._constants: FloatArray = np.zeros(STATES)
         self.acceleration: FloatArray = np.zeros(3)
-        self._slope: FloatArray = np.zeros(
-            (3, STATES)
-        )  # derivative of the angular acceleration with respect to the states
-        self._lag: FloatArray = np.zeros(3)  # integral (rad) of the present rate minus the past rate
-        self._since = 0.0  # time (s) over which `_lag` is integrated
+        self.driven: FloatArray = np.zeros(3)
+        # `_slope` is the derivative of the angular acceleration with respect to the states.
+        self._slope: FloatArray = np.zeros((3, STATES))
+        # `_lag` (rad) is the integral of the present rate minus the past rate.
+        self._lag: FloatArray = np.zeros(3)
+        # `_given` (A m^2 s^2) is the integral of the commanded dipole multiplied by the time since `begin_mean`.
+        self._given: FloatArray = np.zeros(3)
+        self._since = 0.0  # time (s) over which `_lag` and `_given` are integrated
         self.started = False
         self.refused = 0
         self.changes = 0
@@ -456,13 +461,20 @@ class FreeFilter:
         """Return a copy of the estimate, for `recall`."""
         constants, covariance = self._constants.copy(), self.covariance.copy()
         return FreeMemory(
-            self.quaternion, self.rate, self.acceleration, constants, covariance, self.field_error
+            self.quaternion,
+            self.rate,
+            self.acceleration,
+            self.driven,
+            constants,
+            covariance,
+            self.field_error,
         )
 
     def recall(self, then: FreeMemory) -> None:
         """Restore an earlier estimate from its copy `then`."""
         self.changes += 1
-        self.quaternion, self.rate, self.acceleration = then.quaternion, then.rate, then.acceleration
+        self.quaternion, self.rate = then.quaternion, then.rate
+        self.acceleration, self.driven = then.acceleration, then.driven
         self._constants, self.covariance = then.constants.copy(), then.covariance.copy()
         self.field_error = then.field_error
 
@@ -573,21 +585,40 @@ class FreeFilter:
         return np.asarray(self._constants[DIPOLE] + sunlit * self._constants[SUNLIT])
 
     def advance(
-        self, seconds: float, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0
+        self,
+        seconds: float,
+        dipole: FloatArray,
+        around: FilterEnvironment,
+        doubt: float = 0.0,
+        uneven: FloatArray | None = None,
     ) -> None:
-        """Propagate by one or two `seconds` under the commanded dipole (3,) A m^2, body axes.
+        """Propagate by one or two `seconds` under the mean commanded dipole (3,) A m^2, body axes.
 
         The value `doubt` (A m^2) is the standard deviation per axis of a dipole that may differ from the
-        command.
+        command. If the dipole changes during `seconds`, `uneven` (3,) A m^2 s^2 is the double time integral
+        of the dipole minus that of the mean dipole.
         """
         speed = math.sqrt(float(self.rate @ self.rate))
         steps = max(1, math.ceil(speed * seconds / LARGEST_ROTATION))
         for _ in range(steps):
             self._step(seconds / steps, dipole, around, doubt)
+        if uneven is not None:
+            field = attitude_matrix(self.quaternion) @ around.field
+            rotation = self.motion.inverse @ cross_product(self.coil_matrix @ uneven, field)
+            self.quaternion = multiply(from_rotation_vector(rotation), self.quaternion)
 
     def begin_mean(self) -> None:
         """Begin the interval over which gyro samples are averaged."""
-        self._lag, self._since = np.zeros(3), 0.0
+        self._lag, self._given, self._since = np.zeros(3), np.zeros(3), 0.0
+
+    def impulse(self, since: float) -> FloatArray:
+        """Return the integral (3,), A m^2 s, of the propagated dipole up to now, averaged over its begin.
+
+        The begin is at any time of an interval since `begin_mean`, whose middle is `since` s ago.
+        """
+        if self._since == 0.0:
+            return since * self.driven
+        return np.asarray(self._given / self._since + (since - 0.5 * self._since) * self.driven)
 
     def gyro(
         self, rate: FloatArray, covariance: FloatArray, change: FloatArray | None = None, since: float = 0.0
@@ -610,13 +641,16 @@ class FreeFilter:
         rows[:, GYRO_MATRIX] += by_matrix(then)
         return self._update(rate - matrix @ then - self._constants[GYRO], rows, covariance)
 
-    def mean_rate(self, rate: FloatArray, covariance: FloatArray, change: FloatArray) -> bool:
+    def mean_rate(
+        self, rate: FloatArray, covariance: FloatArray, change: FloatArray, since: float = 0.0
+    ) -> bool:
         """Apply a rate (3,) rad/s that the star camera measured, with its covariance (3, 3).
 
-        The change of the rate since the measurement is `change` (3,), rad/s.
+        The change of the rate since the middle of the exposure, `since` s ago, is `change` (3,), rad/s.
         """
-        rows = np.zeros((3, STATES))
-        rows[:, RATE], rows[:, CAMERA] = _EYE, cross_matrix(self.rate)
+        rows = -since * self._slope
+        rows[:, RATE] += _EYE
+        rows[:, CAMERA] += cross_matrix(self.rate)
         turned = attitude_matrix(from_rotation_vector(self._constants[CAMERA])) @ self.rate
         return self._update(rate + change - turned, rows, covariance)
 
@@ -695,7 +729,10 @@ class FreeFilter:
         self.covariance[HORIZON, HORIZON] += (1.0 - kept**2) * self.layout.prior[HORIZON, HORIZON]
 
     def _step(self, dt: float, driven: FloatArray, around: FilterEnvironment, doubt: float) -> None:
-        """Propagate state and covariance by one step of the midpoint rule."""
+        """Propagate state and covariance by one step of the classical Runge-Kutta method.
+
+        The midpoint rule would err by as much as an error of the inertia of 4e-4.
+        """
         self.changes += 1
         motion, rate = self.motion, self.rate
         motion.correct(self._constants[INERTIA])
@@ -703,21 +740,23 @@ class FreeFilter:
         whole = self.coil_matrix @ driven + self.residual_dipole(around.sunlit)
         torque, flow = motion.torque(middle, driven, whole, self._constants[TORQUES], around)
         first = motion.acceleration(rate, torque)
-        half = rate + 0.5 * dt * first
+        second = motion.acceleration(rate + 0.5 * dt * first, torque)
+        half = rate + 0.5 * dt * second
         acceleration = motion.acceleration(half, torque)
+        last = motion.acceleration(rate + dt * acceleration, torque)
         flow[0:3, ATTITUDE], flow[0:3, RATE] = -cross_matrix(half), _EYE
         flow[3:6, RATE] = motion.stiffness(half)
         flow[3:6, INERTIA] += motion.by_inertia(half, acceleration)
         self._slope = flow[3:6].copy()
-        after = rate + dt * acceleration
-        # This is the integral of the rate for an acceleration that changes linearly during the step.
-        swept = dt * (0.5 * (rate + after) - dt / 6.0 * (acceleration - first))
+        after = rate + dt / 6.0 * (first + 2.0 * (second + acceleration) + last)
+        swept = dt * (rate + dt / 6.0 * (first + second + acceleration))
         # The rate changes its direction during the step (Bortz 1971, to second order).
         rotation = from_rotation_vector(swept + dt * dt / 12.0 * cross_product(rate, after))
         self._lag = self._lag + self._since * (after - rate) + dt * after - swept
+        self._given = self._given + dt * (self._since + 0.5 * dt) * driven
         self._since += dt
         self.quaternion = multiply(rotation, self.quaternion)
-        self.acceleration = acceleration
+        self.acceleration, self.driven = acceleration, driven
         self.rate = after
         noise = self.rate_noise(driven, around, doubt)
         self.covariance = propagated(self.covariance, flow, dt, noise, self.layout.walks)
