@@ -464,10 +464,10 @@ class StepReplay:
             self.refused_fields = 0 if used else self.refused_fields + 1
 
     def _rate_change(self, step: FilterStep, since: float, impulse: FloatArray) -> FloatArray:
-        """Return the change (3,), rad/s, of the rate since the mean of an interval with its middle `since` s ago.
+        """Return the change (3,), rad/s, of the rate since the mean over an interval.
 
-        `impulse` (3,), A m^2 s, is that of the dipole of the interval, less that of the newest dipole, which
-        acts in the present acceleration (`DipoleHistory.impulse`).
+        The middle of the interval is `since` s ago. `impulse` (3,), A m^2 s, is that of the dipole
+        (`DipoleHistory.impulse`), less that of the newest dipole, which acts in the present acceleration.
         """
         free = self.free
         shown = attitude_matrix(free.quaternion) @ step.around.field

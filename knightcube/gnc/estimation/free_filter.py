@@ -384,7 +384,7 @@ class FreeFilter:
         self._slope: FloatArray = np.zeros((3, STATES))
         # `_lag` (rad) is the integral of the present rate minus the past rate.
         self._lag: FloatArray = np.zeros(3)
-        # `_given` (A m^2 s^2) is the integral of the commanded dipole multiplied by the time since `begin_mean`.
+        # `_given` (A m^2 s^2) is the integral of the commanded dipole times the time since `begin_mean`.
         self._given: FloatArray = np.zeros(3)
         self._since = 0.0  # time (s) over which `_lag` and `_given` are integrated
         self.started = False

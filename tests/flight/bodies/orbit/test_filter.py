@@ -307,3 +307,16 @@ def test_the_dipole_of_a_corrected_coil_is_unknown_in_the_steps_before() -> None
     assert [step.dipole[0] for step in steps] == [-dipole for dipole in driven]
     assert any(driven)
     assert not all(driven)
+
+
+def test_the_impulse_of_a_dipole_is_that_by_which_a_rate_differs_from_its_mean() -> None:
+    """The dipole acts in the last quarter of a second, of which the mean rate shows an eighth."""
+    history = DipoleHistory(10 * SECOND_NS)
+    history.record(0, (0.0, 0.0, 0.0), True)
+    history.record(3 * SECOND_NS // 4, (0.0, 0.08, 0.0), True)
+    found = history.impulse(0, SECOND_NS)
+    assert found == pytest.approx([0.0, 0.08 * (0.25 - 0.25**2 / 2.0), 0.0])
+    history.record(2 * SECOND_NS, (0.0, 0.0, 0.0), True)
+    assert history.impulse(SECOND_NS, 2 * SECOND_NS) == pytest.approx([0.0, 0.04, 0.0]), (
+        "half of a constant dipole"
+    )

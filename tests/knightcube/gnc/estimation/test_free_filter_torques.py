@@ -230,3 +230,20 @@ def test_the_torque_by_air_changes_with_its_density_and_so_by_a_fraction_of_its_
         grown.append(np.sqrt(np.diag(found.covariance[at, at]) / seconds))
     np.testing.assert_allclose(grown[0], settings.torque[1])
     np.testing.assert_allclose(grown[1], np.hypot(settings.torque[1], [0.0, AIR_WALK * 8e-8, 0.0]))
+
+
+def test_a_dipole_that_acts_late_in_a_step_rotates_the_body_less() -> None:
+    """Half a second of rest and half a second of a dipole have the mean of half the dipole for a second."""
+    dipole = np.array([0.0, 0.09, 0.0])
+    apart, together = (FreeFilter(INERTIA, FreeFilterSettings(errors=NO_ERRORS)) for _ in range(2))
+    for found in (apart, together):
+        found.start(IDENTITY, STAR**2 * np.eye(3), np.zeros(3))
+    for part in (np.zeros(3), dipole):
+        apart.advance(0.5, part, AROUND)
+    assert apart.impulse(0.5) == pytest.approx(0.375 * dipole)
+    uneven = 1.0 * (0.5 * 0.5 * dipole - 0.375 * dipole)
+    together.advance(1.0, 0.5 * dipole, AROUND, 0.0, uneven)
+    off = to_rotation_vector(multiply(apart.quaternion, conjugate(together.quaternion)))
+    assert np.linalg.norm(off) < 1e-8
+    assert np.linalg.norm(together.motion.inverse @ np.cross(uneven, FIELD)) > 1e-6
+    assert apart.rate == pytest.approx(together.rate, abs=1e-9)
