@@ -12,6 +12,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
+from sim_hal.description_errors import NO_ERRORS, DescriptionErrors
 from sim_hal.settings import Disturbances, FreeBodySection, OrbitSection, TipOff
 from sim_hal.worlds.free_body import CRAFTS, FreeBody
 
@@ -44,8 +45,12 @@ class FreeFlight:
         orbit: str,
         release: TipOff,
         disturbances: Disturbances | None = None,
+        description: DescriptionErrors = NO_ERRORS,
     ) -> None:
-        """Release the craft at time 0 on `orbit`, its node and place in the orbit drawn by the seed."""
+        """Release the craft at time 0 on `orbit`, its node and place in the orbit drawn by the seed.
+
+        The true body differs from the described craft by `description`.
+        """
         self.generator = np.random.default_rng([seed, _STREAM])
         altitude, inclination = ORBITS[orbit]
         node, anomaly = self.generator.uniform(0.0, 360.0, 2).tolist()
@@ -61,7 +66,7 @@ class FreeFlight:
             disturbances=disturbances or Disturbances(),
         )
         self._currents: FloatArray = np.zeros(3)
-        self.body = FreeBody(section, lambda: self._currents, seed=seed, utc=UTC)
+        self.body = FreeBody(section, lambda: self._currents, seed=seed, utc=UTC, description=description)
         self.body.release_at(0)
         shape = CRAFTS[craft]
         self.inertia: FloatArray = shape.inertia

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from flight.bodies.orbit.control import commanded
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import box_areas, pressures
 from knightcube.astro.earth.ephemeris import Ephemeris
@@ -39,6 +40,7 @@ from knightcube.gnc.estimation.free_filter import (
 )
 from knightcube.gnc.guidance.three_axes.attitude_law import law_of, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from sim_hal.description_errors import NO_ERRORS
 from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds.orbit import log_density
 from tests.studies.campaigns.free_flight import (
@@ -86,7 +88,11 @@ class PointingFlight:
     """
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
-        """`wanted`: craft, share of the worst disturbances, target, and the first turn, deg, if any."""
+        """`wanted`: craft, share of the worst disturbances, target, and the first turn, deg, if any.
+
+        A `description` (DescriptionErrors) makes the body differ from its description, and `residual`
+        multiplies the worst residual dipole of 1e-3 A m^2.
+        """
         self._wanted = wanted
         target = wanted["target"]
         self._target = target if isinstance(target, PointingTarget) else TARGETS[target]
@@ -97,12 +103,14 @@ class PointingFlight:
         noises = Disturbances(
             drag=share * density_ratio(orbit, wanted.get("density")),
             solar_pressure=share,
-            principal_turn_deg=3.0 * share,
+            residual_dipole=wanted.get("residual", 1.0),
+            principal_turn_deg=0.0 if "description" in wanted else 3.0 * share,
             **(STILL if wanted.get("still") else {}),
         )
+        errors = wanted.get("description", NO_ERRORS)
         held = FreeFlight(wanted["craft"], seed, orbit, TipOff(rate=(0.0, 0.0, 0.0)), noises)
         held.advance(0)
-        self.flight = flight = FreeFlight(wanted["craft"], seed, orbit, self._release(held), noises)
+        self.flight = flight = FreeFlight(wanted["craft"], seed, orbit, self._release(held), noises, errors)
         flight.advance(0)
         self._filter = FreeFilter(flight.inertia, FreeFilterSettings(torque=TORQUE[wanted["craft"]]))
         gyro = self._gyro(flight.motion.rate, 1.0)
@@ -184,6 +192,7 @@ class PointingFlight:
         self._turn, dipole = command.rotation, command.dipole
         if self._astray.since is not None:
             dipole = damping_dipole(flight.inertia, found.rate, field) - residual
+        dipole = commanded(dipole, found.coil_matrix)
         dipole = dipole * CYCLE / (CYCLE - PAUSE)
         dipole = dipole * min(1.0, flight.limit / float(np.abs(dipole).max()))
         if round(time / CYCLE) % 5 == 0:
@@ -244,7 +253,7 @@ class PointingFlight:
             0,
             0,
             OrbitState(truth.utc, place, velocity, FIX_SIGMA),
-            flight.inertia,
+            found.inertia,
             AXES,
             self._wanted.get("weights", WEIGHTS[self._wanted["craft"]]),
             self._target,
