@@ -25,7 +25,8 @@ def principal_axes(inertia: FloatArray) -> tuple[FloatArray, FloatArray]:
     if not np.any(inertia - np.diag(np.diag(inertia))):
         return np.diag(inertia).copy(), np.eye(3)
     moments, axes = np.linalg.eigh(inertia)
-    best = max(permutations(range(3)), key=lambda order: float(np.abs(np.diag(axes[:, order])).sum()))
+    orders = list(permutations(range(3)))
+    best = orders[int(np.argmax([np.abs(np.diag(axes[:, order])).sum() for order in orders]))]
     rotation = axes[:, best].T
     rotation = rotation * np.where(np.diag(rotation) < 0.0, -1.0, 1.0)[:, None]
     if np.linalg.det(rotation) < 0.0:

@@ -9,6 +9,7 @@ import pytest
 
 from flight.schema.reader import replace
 from ground.telemetry import Run
+from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import FaultEntry
 from tests.support.flights import config_for, demo_world, event_names, fly
 
@@ -63,5 +64,7 @@ def test_a_frame_that_is_not_in_order_is_reported_and_not_believed(
     assert spoiled.sum() == 1
     assert not streak["accepted"][spoiled].any()
     assert streak["accepted"][time < AT].all()
-    error = np.abs(run["control"]["rate"] - run["truth"]["rate"][: len(run["control"]), 1])
+    rate: FloatArray = run["control"]["rate"]
+    true: FloatArray = run["truth"]["rate"][: len(rate), 1]
+    error = np.abs(rate - true)
     assert np.nanmax(error[40:]) < 5e-3

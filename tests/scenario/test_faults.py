@@ -117,7 +117,9 @@ def test_some_bad_packets_are_reported_and_flown_through(tmp_path: Path, faults:
     assert "task-failed" not in names
     assert_whole(run)
     assert run["housekeeping"]["imu_bad_checksum"][-1] + run["housekeeping"]["imu_discarded_bytes"][-1] > 0
-    error = np.abs(run["control"]["rate"] - run["truth"]["rate"][: len(run["control"]), 1])
+    rate: FloatArray = run["control"]["rate"]
+    true: FloatArray = run["truth"]["rate"][: len(rate), 1]
+    error = np.abs(rate - true)
     assert np.nanmax(error[40:]) < 0.01, "no corrupt value reached the estimate"
 
 

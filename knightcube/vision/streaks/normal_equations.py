@@ -251,10 +251,12 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
     fast, rest = times.copy(), times.copy()
     if pace[0] < pace[-1]:
         until = np.where(slow.any(axis=1), time[_SAMPLES - 1 - slow[:, ::-1].argmax(axis=1)], -np.inf)
-        fast[:, 0] = rest[:, 1] = np.clip(until, times[:, 0], times[:, 1])
+        divided: FloatArray = np.clip(until, times[:, 0], times[:, 1])
+        fast[:, 0] = rest[:, 1] = divided
     else:
         since = np.where(slow.any(axis=1), time[slow.argmax(axis=1)], np.inf)
-        fast[:, 1] = rest[:, 0] = np.clip(since, times[:, 0], times[:, 1])
+        divided = np.clip(since, times[:, 0], times[:, 1])
+        fast[:, 1] = rest[:, 0] = divided
     way = speed * (motion.progress(fast[:, 1]) - motion.progress(fast[:, 0]))
     fast[way < _LEAST_FAST * scene.width] = 0.0
     return fast, rest
