@@ -21,7 +21,7 @@ CRAFT = {"knightcube": 0.0959, "cubesat_3u": 0.2}
 """A m^2, the limit of each coil."""
 WATTS = {"knightcube": 54.8, "cubesat_3u": 5.0}
 """W/(A m^2)^2, of the coils."""
-ORBITS = {"sso": (500e3, 97.4), "iss": (420e3, 51.6), "low": (300e3, 51.6)}
+ORBITS = {"sso": (500e3, 97.4), "iss": (420e3, 51.6), "low": (300e3, 51.6), "equator": (500e3, 0.0)}
 """Altitude m, inclination deg."""
 UTC = "2026-11-23T00:00:00Z"
 FIELD_NOISE, HARD_IRON = 1e-7, 1.5e-7
@@ -71,7 +71,7 @@ class FreeFlight:
         shape = CRAFTS[craft]
         self.inertia: FloatArray = shape.inertia
         self.limit = CRAFT[craft]
-        self._dipole_per_ampere = float(shape.dipoles[0, 0])
+        self.dipole_per_ampere = float(shape.dipoles[0, 0])
         self.time_ns = 0
         self.square = 0.0
         """A^2 m^4 s: the integral of the commanded dipole squared."""
@@ -86,12 +86,12 @@ class FreeFlight:
         """Command a dipole (3,) A m^2 from now on."""
         if self.coil_noise and dipole.any():
             dipole = dipole + self.coil_noise * self.generator.standard_normal(3)
-        self._currents = dipole / self._dipole_per_ampere
+        self._currents = dipole / self.dipole_per_ampere
 
     def advance(self, time_ns: int) -> None:
         """Let time pass until `time_ns`."""
         seconds = (time_ns - self.time_ns) / SECOND
-        dipole = self._currents * self._dipole_per_ampere
+        dipole = self._currents * self.dipole_per_ampere
         self.square += seconds * float(dipole @ dipole)
         self.gyro_bias = self.gyro_bias + GYRO_BIAS_WALK * np.sqrt(seconds) * self.generator.standard_normal(
             3
