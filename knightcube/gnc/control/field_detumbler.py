@@ -232,7 +232,7 @@ INSTANTS = 150
 DENSER = 1.5
 """Exponent of the power law that makes the times of the field prediction denser at the start. For a
 prediction over 1,500 s, the first time step is 1 s and the last 15 s."""
-LEFT = 0.7
+LEFT = 0.9
 """Residual momentum of a plan, as a fraction of the momentum at which a body counts as detumbled."""
 FEW, SOON = 4.0, 5.0
 """Ratio of the momentum to the residual momentum of a plan, and duration (s), that define the last phase of
@@ -299,9 +299,8 @@ class FieldDetumbler:
         self._braking = braking
         self._expected = expected
         self._filter = FieldRate(settings)
-        # A mean moment of inertia is used because the residual momentum may lie along any axis.
-        moment = float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
-        self._rest = LEFT * braking.slow * moment
+        # A residual momentum causes the fastest rotation about the axis of the smallest moment of inertia.
+        self._rest = LEFT * braking.slow * float(np.linalg.eigvalsh(settings.inertia)[0])
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
@@ -422,8 +421,7 @@ class FieldDetumbler:
                 return without_growth(dipole, [works])
             self._initial_known = True
             multiple = braking.spin_up if speed > braking.gentle else 1.0
-            self._fastest = min(self._fastest, multiple * speed)
-            self._most_energy = min(self._most_energy, multiple * multiple * energy)
+            self._fastest, self._most_energy = multiple * speed, multiple * multiple * energy
         # Each bound is compared with a value that is one standard deviation of the rate above the estimate.
         upper = speed + sigma
         grows = [works] if energy * upper**2 >= self._most_energy * speed**2 else []

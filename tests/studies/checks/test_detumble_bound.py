@@ -37,3 +37,24 @@ def test_what_lies_along_a_field_that_turns_waits_for_the_turn() -> None:
     ahead = np.array([np.sin(0.5 * speed * found), 0.0, np.cos(0.5 * speed * found)])
     across = np.linalg.norm(np.cross(turning[found > MIDDLES], ahead), axis=1)
     assert REACH * STEP * across.sum() == pytest.approx(1e-4 * ahead[2], rel=0.05)
+
+
+def test_a_torque_of_other_causes_shortens_the_bound() -> None:
+    torque = REACH * STRENGTH
+    found = least_time(np.array([3e-4, 4e-4, 0.0]), STILL, STEP, REACH, 0.0, others=0.25 * torque)
+    assert found == pytest.approx(4e-4 / torque, rel=1e-3)
+
+
+def test_no_control_of_full_strength_beats_the_bound() -> None:
+    """Dipoles along -B x (h + a constant vector) include the greedy one and some that wait for the field."""
+    speed, rng = 2.2e-3, np.random.default_rng(7)
+    turning = STRENGTH * np.stack([np.sin(speed * MIDDLES), 0.0 * MIDDLES, np.cos(speed * MIDDLES)], axis=1)
+    for _ in range(40):
+        start = 3e-4 * rng.standard_normal(3)
+        constant = rng.choice([0.0, 1.0]) * 3e-4 * rng.standard_normal(3)
+        left, now, steps = 0.3 * float(np.linalg.norm(start)), start.copy(), 0
+        while steps < len(turning) and np.linalg.norm(now) > left:
+            dipole = -np.cross(turning[steps], now + constant * np.linalg.norm(now) / np.linalg.norm(start))
+            now += STEP * np.cross(REACH * dipole / np.linalg.norm(dipole), turning[steps])
+            steps += 1
+        assert least_time(start, turning, STEP, REACH, left) <= STEP * steps + 1e-6

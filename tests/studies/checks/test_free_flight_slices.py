@@ -16,11 +16,12 @@ def test_a_tumbling_knightcube_stops_and_the_table_says_when(tmp_path: Path) -> 
     result = detumble.run(Case("a", (20_261_123, 0), {**CASE, "law": "attitude", "speed": 0.014}))
     assert not result["lost"]
     assert result["seconds"] < 400.0
+    assert 0.0 < result["least"] <= result["seconds"], "no control beats the bound"
     assert result["fastest_deg"] < 1.3 * np.degrees(0.014), (
         "only the gyro's bias and a held dipole may add to the rate"
     )
     found = detumble.summarise([result], tmp_path)
-    assert found.facts["knightcube/attitude"]["worst"] == result["seconds"]
+    assert found.facts["knightcube/attitude/sso+iss"]["worst"] == result["seconds"]
     assert "knightcube" in found.text
 
 
@@ -33,11 +34,18 @@ def test_the_magnetometer_alone_knows_the_rate_that_the_coils_brake() -> None:
     assert result["fastest_deg"] < 30.0
 
 
+def test_a_body_whose_inertia_is_not_known_stops_above_the_bound() -> None:
+    wanted = {**CASE, "orbit": "equator", "law": "inertia", "speed": 0.05}
+    result = detumble.run(Case("i", (20_261_123, 2), wanted))
+    assert not result["lost"]
+    assert 0.0 < result["least"] <= result["seconds"]
+
+
 def test_a_body_that_did_not_stop_is_counted_as_lost(tmp_path: Path) -> None:
     case = Case("lost", (1, 0), {"craft": "cubesat_3u", "law": "attitude", "orbit": "iss", "longest": 3.0})
     result = detumble.run(case)
     assert result["lost"]
-    assert detumble.summarise([result], tmp_path).facts["cubesat_3u/attitude"]["lost"] == 1
+    assert detumble.summarise([result], tmp_path).facts["cubesat_3u/attitude/sso+iss"]["lost"] == 1
 
 
 def test_a_satellite_that_starts_with_nothing_learned_turns_to_its_target(tmp_path: Path) -> None:
