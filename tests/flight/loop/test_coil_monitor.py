@@ -173,6 +173,9 @@ def test_an_open_coil_is_tried_again_while_the_body_is_slow(trials: int) -> None
         assert watch.begin_trial(100 * trial + 9) is None, "the body is too fast"
         watch.observe_motion(100 * trial + 10, np.array([0.01, 0.0, 0.0]), quiet)
         assert watch.begin_trial(100 * trial + 4) is None, "too early"
+        watch._weak = "coil z: its torque is missing"
+        assert watch.begin_trial(100 * trial + 5) is None, "another coil is suspected"
+        watch._weak = ""
         found = watch.begin_trial(100 * trial + 5)
         assert found == (1, f"coil y is tried again, {trial + 1} of {trials}")
         assert watch.available.all()

@@ -14,6 +14,7 @@ from flight.loop.coil_response import (
     CoilFault,
     CoilResponse,
     Finding,
+    MotionFit,
     MotionWitness,
     ResponseSettings,
 )
@@ -178,6 +179,33 @@ def test_a_gain_that_no_coil_can_have_gives_no_verdict() -> None:
     assert body.response.axes(Finding.REVERSED) == []
     assert body.response.axes(Finding.FEEBLE) == []
     assert not any(body.response.is_healthy(axis) for axis in range(3)), "the model is wrong for all axes"
+
+
+@pytest.mark.parametrize(("gain", "found"), [(1.3, [0]), (1.7, [])])
+def test_a_coil_stronger_than_possible_is_neither_sound_nor_strong(gain: float, found: list[int]) -> None:
+    response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
+    response.gain, response.sigma = np.array([gain, 1.0, 1.0]), np.full(3, 0.01)
+    for _ in range(3):
+        response._count(0, True, alone=True, is_reversed=False)
+    assert response.axes(Finding.SOUND) == response.axes(Finding.STRONG) == found
+
+
+@pytest.mark.parametrize(
+    ("possible", "gain", "found"), [(True, -0.9, [0]), (False, -0.9, []), (True, -0.4, [])]
+)
+def test_an_impossible_or_unclear_fit_of_few_bins_changes_no_sign(
+    possible: bool, gain: float, found: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
+    gains, never = np.array([gain, 1.0, 1.0]), (False, False, False)
+    short = MotionFit(gains, np.full(3, 0.1), np.zeros(0), possible, never, (True, False, False))
+    whole = MotionFit(np.ones(3), np.full(3, 0.1), np.zeros(0), True, never, never)
+    response._rows.extend([np.zeros((3, 6))] * 15)
+    response._speeds.append(0.1)
+    monkeypatch.setattr(response, "_solved", lambda rows, _: whole if len(rows) == 15 else short)
+    for _ in range(3):
+        response._fit(0.2)
+    assert response.axes(Finding.REVERSED) == found
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -1,9 +1,12 @@
-"""A slice of campaign `coil-faults`: the faults that disturb the estimate most, at fixed seeds."""
+"""Slices of the campaigns `coil-faults` and `unlike-inertia`, at fixed seeds."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from tests.studies.campaigns import unlike_inertia
 from tests.studies.campaigns.coil_faults import LONGEST_BEYOND, LONGEST_REFUSAL, SPAN, cases, run
 
 
@@ -16,3 +19,17 @@ def test_a_broken_coil_misleads_the_estimate_for_less_than_a_quarter_of_a_second
     assert max(result["beyond_s"], result["beyond_after_end_s"]) < LONGEST_BEYOND
     assert (result["last_refusal_s"] or 0.0) <= LONGEST_REFUSAL
     assert result["beyond_before_s"] == 0.0
+
+
+@pytest.mark.parametrize("key", ["orbit tumble reversed 0", "orbit_3u tumble open 0"])
+def test_a_broken_coil_of_an_unlike_body_is_handled_soon_and_no_healthy_coil_is_judged(
+    key: str, tmp_path: Path
+) -> None:
+    (case,) = (case for case in unlike_inertia.cases(1, 7) if case.key == key)
+    result = unlike_inertia.run(case)
+    assert result["handled_s"] is not None
+    assert result["handled_s"] <= unlike_inertia.SOON
+    facts = unlike_inertia.summarise([result], tmp_path).facts
+    assert facts["with_healthy_isolated"] == facts["with_healthy_suspected"] == 0
+    assert facts["with_healthy_corrected"] == 0
+    assert facts[f"{key[:-2]}: handled_within_30_s"] == 1
