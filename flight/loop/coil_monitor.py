@@ -498,6 +498,17 @@ class Evidence:
             if all(fits(segment, self._bounds, known, axis, fault) for segment in segments)
         ]
 
+    def shows_working_monitor(self, known: Mapping[int, CoilFault]) -> bool:
+        """Return whether the current monitor measured the current of a healthy coil in a probe.
+
+        Such a reading shows more clearly than the motion of a tumbling body that the monitor works.
+        """
+        return any(
+            fits(segment, self._bounds, known) and any(one.mean[:, 0].any() for one in segment)
+            for segment in list(self._segments)[1:]
+            if segment
+        )
+
     def rejects_healthy_now(self, known: Mapping[int, CoilFault]) -> bool:
         """Return whether the readings of the newest segment contradict healthy coils."""
         newest = self._segments[-1]
@@ -973,7 +984,8 @@ class CoilMonitor:
         if fault is CoilFault.SHORTED and excess < _LEAST_SHORT:
             self._reset()  # a small excess may be an error of the current monitor
             return
-        if self._is_contradicted(axis, fault):
+        works = self._evidence.shows_working_monitor(self._known)
+        if not works and self._is_contradicted(axis, fault):
             why = f"{self._strangeness}; yet the motion shows no change of coil {AXES[axis]}"
             self._witness.doubt_monitor(why, now_ns)
         else:

@@ -378,3 +378,19 @@ def test_a_gap_in_the_readings_restarts_the_watch() -> None:
     assert [verdict.axis for verdict in watch.verdicts] == [0]
     watch.forget(0)
     assert watch.available.all()
+
+
+@pytest.mark.parametrize("probed", [False, True])
+def test_the_motion_overrules_the_current_monitor_unless_a_probe_shows_that_the_monitor_works(
+    probed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
+    monkeypatch.setattr(watch._witness, "contradicts", lambda *_: True)
+    watch._suspect("too little current")
+    watch._evidence.begin_segment()
+    watch._evidence.add([_alone(1, 0.04 if probed else 0.0)])
+    watch._evidence.begin_segment()
+    watch._evidence.add([_alone(0, 0.0)])
+    watch._conclude(0, CoilFault.OPEN, 0)
+    assert bool(watch.verdicts) is probed
+    assert bool(watch.monitor_doubted) is not probed
