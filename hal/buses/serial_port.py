@@ -6,9 +6,13 @@ same device name by a udev rule.
 
 from __future__ import annotations
 
+import os
+import select
 import termios
 import threading
+import time
 from collections import deque
+from contextlib import suppress
 
 import serial
 
@@ -86,11 +90,11 @@ class PySerialPort:
         return chunks
 
     def send(self, data: bytes) -> None:
-        """Write bytes. Raises NotResponding if the port is lost or the output queue is full."""
+        """Write bytes. Raises NotResponding if the port is lost or the output queue remains full."""
         if self._failure:
             raise NotResponding(self._device, self._failure)
         try:
-            self._serial.write(data)
+            self._write(data)
         except _PORT_ERRORS as error:
             message = f"writing failed ({error}): is the device still there?"
             raise NotResponding(self._device, message) from error
@@ -115,12 +119,24 @@ class PySerialPort:
         self._serial.close()
         self._failure = self._failure or "the port was closed"
 
+    def _write(self, data: bytes) -> None:
+        """Write bytes, and wait while the output queue is full. Raises TimeoutError.
+
+        The method `write` of pyserial raises an error also if all bytes were written but the thread was
+        interrupted meanwhile.
+        """
+        file, until = self._serial.fileno(), time.monotonic() + self._write_timeout
+        while data:
+            with suppress(BlockingIOError):
+                data = data[os.write(file, data) :]
+            if data and not select.select([], [file], [], max(until - time.monotonic(), 0.0))[1]:
+                raise TimeoutError("the output queue is full")
+
     def _open(self) -> serial.Serial:
         return serial.Serial(
             self._device,
             self.baud_rate,
             timeout=_READ_TIMEOUT_S,
-            write_timeout=self._write_timeout,
             exclusive=True,
         )
 

@@ -122,13 +122,24 @@ def test_a_patient_port_is_gone_until_it_is_there(tmp_path: Path) -> None:
 def test_a_port_that_takes_no_bytes_costs_less_than_a_control_cycle_and_is_not_responding() -> None:
     near, far = os.openpty()
     port = PySerialPort(os.ttyname(far), 115200, SystemClock())
-    timeout = port._serial.write_timeout
-    assert timeout is not None
-    assert timeout < 1.0 / CONTROL_RATE_HZ
-    with pytest.raises(NotResponding, match="writing failed"):
+    assert port._write_timeout < 1.0 / CONTROL_RATE_HZ
+    with pytest.raises(NotResponding, match="the output queue is full"):
         port.send(bytes(1 << 20))  # nobody reads the other end
     os.close(near)
     port.close()
+    os.close(far)
+
+
+def test_a_thread_that_is_interrupted_while_it_writes_has_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    near, far = os.openpty()
+    port = PySerialPort(os.ttyname(far), 115200, SystemClock())
+    now = iter(range(1000))
+    monkeypatch.setattr("hal.buses.serial_port.time.monotonic", lambda: float(next(now)))
+    port.send(b"$VNRRG,01*72\r\n")
+    monkeypatch.undo()
+    assert os.read(near, 100) == b"$VNRRG,01*72\r\n"
+    port.close()
+    os.close(near)
     os.close(far)
 
 
