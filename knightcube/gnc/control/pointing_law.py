@@ -85,8 +85,8 @@ class PointingLaw:
         """Return the command at a time (s) for an estimated attitude (4,) and rate (3,) rad/s.
 
         The magnetic field `field` (3,), T, is in body axes. The estimated residual dipole moment
-        `residual_dipole` (3,) A m^2 is cancelled directly. The effects of disturbance torques of the
-        estimated `sizes` (n,) are reduced as far as the field allows.
+        `residual_dipole` (3,) A m^2 is cancelled directly, as far as it is normal to the field. The effects
+        of disturbance torques of the estimated `sizes` (n,) are reduced as far as the field allows.
         """
         wanted = self.reference(time)
         rotation = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
@@ -97,9 +97,9 @@ class PointingLaw:
         error = np.concatenate([cut_rotation, cut_rate - np.cross(cut_rotation, wanted.rate)])
         k, table = self._table.path.position(time)[0], self._table
         beyond = sizes - table.sizes
-        pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond
+        pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond + residual_dipole
         # The dipole moment along the field is removed, because a dipole along the field causes no torque.
-        dipole = field * (float(field @ pull) / float(field @ field)) - pull - residual_dipole
+        dipole = field * (float(field @ pull) / float(field @ field)) - pull
         return PointingCommand(limited(dipole, self._limit), rotation, missed)
 
 
