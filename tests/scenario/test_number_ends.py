@@ -85,6 +85,7 @@ def test_every_integer_of_the_testbed_may_pass_its_end(
     elsewhere = {
         "spin",
         "navigation",
+        "fix",
         "directions",
         "truth",
         "orbit_truth",

@@ -60,12 +60,20 @@ def flight(body: str, seed: int, about: FloatArray | None = None) -> tuple[Orbit
     ), world
 
 
+def _mounting() -> float:
+    """Return the standard deviation (rad per axis) of the camera's mounting, uniform within its accuracy."""
+    camera = as_orbit(configuration.parse(CONFIG.read_text(encoding="utf-8"))).camera
+    assert camera is not None
+    return float(np.radians(camera.accuracy.mounting_deg) / np.sqrt(3.0))
+
+
 def compared(
     run: Run, first: float = BEGIN + 5.0, last: float = BEGIN + SLEW
 ) -> tuple[int, int, int, FloatArray]:
     """Return how many frames the slew had, with a rate, used; and the rates' NEES of an axis (n,).
 
-    It is judged from `first` to `last` s.
+    It is judged from `first` to `last` s, in body axes. The claim of a frame holds in camera axes, and the
+    accuracy of the camera's mounting is added.
     """
     frames, truth = run["streak"], run["truth"]
     times, rates = truth["time_ns"] * 1e-9, truth["rate"].astype(float)
@@ -80,6 +88,8 @@ def compared(
         mean = np.mean([np.interp(at, times, part) for part in rates.T], axis=1)
         xx, yy, zz, xy, xz, yz = frame["covariance"].astype(float)
         covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        rotation = np.cross(np.eye(3), mean)  # change of the rate by a misalignment of the camera
+        covariance += _mounting() ** 2 * rotation.T @ rotation
         error = frame["rate"].astype(float) - mean
         found.append(error @ np.linalg.solve(covariance, error) / 3.0)
     return int(within.sum()), len(found), int(frames["accepted"][within].sum()), np.array(found)

@@ -102,7 +102,7 @@ def test_coloured_noise_is_noticed_and_the_uncertainty_grows() -> None:
 
 def test_a_coil_connected_the_other_way_is_named() -> None:
     record = fly_bare(replace(USUAL, dipole=-USUAL.dipole), 40.0)
-    with pytest.raises(IdentificationError, match=r"coils\.signs"):
+    with pytest.raises(IdentificationError, match=r"`sign` of `coils\.windings`"):
         fit(record, NOISE)
 
 
