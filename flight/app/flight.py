@@ -30,12 +30,12 @@ from flight.app.devices import (
     simulated_rig,
 )
 from flight.app.run import RunRequest, RunResult, begin_folder, open_log
-from flight.app.separation import SeparationInhibit
 from flight.app.service import (
     Chosen,
     EndingSignals,
     FlownConfig,
     FlownRelease,
+    SeparationInhibit,
     StartRetry,
     accepted_config,
     requested_config,

@@ -44,6 +44,7 @@ import re
 import signal
 import sys
 import threading
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -57,6 +58,7 @@ from flight.app.devices import corrupted_text
 from flight.app.run import RunRequest
 from flight.link import events
 from flight.link.events import EventKind
+from flight.link.regular_files import read_regular
 from flight.link.telemetry.log import Recorder
 from flight.loop.facts import EventLog
 from flight.loop.flight_loop import FlightLoop
@@ -157,6 +159,65 @@ def pauses() -> Iterator[float]:
     while True:
         yield pause
         pause = min(2.0 * pause, LONGEST_PAUSE_S)
+
+
+_LARGEST_POWERED = 64
+
+
+class InhibitedError(FlightError):
+    """Raised while the separation inhibit lasts. The error text states the remaining time."""
+
+
+class SeparationInhibit:
+    """Keeps coils and transmitter off for a configured time after the first power-up.
+
+    Launch providers require this time. The CubeSat Design Specification allows no transmission within 45
+    minutes after the deployment. The time with power is counted in a file, so that a restart neither ends the
+    inhibit nor begins it again. Flight and link count separately, each in its own folder.
+
+    A damaged or missing file counts as the first power-up, because coils that are off too long are the
+    smaller harm.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._counted_ns = clock.now_ns()
+        self._elapsed: float | None = None
+
+    def check(self, folder: Path, seconds: float) -> None:
+        """Raise InhibitedError unless the satellite has had power for `seconds` s.
+
+        The counted time is stored in `folder` at each call until it is complete.
+        """
+        if seconds == 0.0:
+            return
+        path = folder / "powered"
+        if self._elapsed is None:
+            self._elapsed = _powered(path)
+        now_ns = self._clock.now_ns()
+        stored = self._elapsed
+        self._elapsed += (now_ns - self._counted_ns) / SECOND_NS
+        self._counted_ns = now_ns
+        if stored < seconds:
+            with suppress(OSError):  # a disk that cannot be written only prolongs the inhibit at a restart
+                folder.mkdir(parents=True, exist_ok=True)
+                replace_file(LinuxFiles(), path, _powered_record(self._elapsed))
+        if (left := seconds - self._elapsed) > 0.0:
+            raise InhibitedError(f"separation inhibit of {seconds:g} s: {left:.0f} s with power are left")
+
+
+def _powered_record(elapsed: float) -> bytes:
+    text = f"{elapsed:.1f}".encode()
+    return text + b" %08x\n" % zlib.crc32(text)
+
+
+def _powered(path: Path) -> float:
+    """Return the stored time with power, s, or 0 if the file is missing or damaged."""
+    with suppress(OSError, ValueError):
+        text, _, crc = (read_regular(path, _LARGEST_POWERED) or b"").partition(b" ")
+        if crc == b"%08x\n" % zlib.crc32(text):
+            return float(text)
+    return 0.0
 
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -3,9 +3,7 @@
 In each cycle, the loop passes the commands (`commanded`, `interrupted`), the samples of the inertial unit
 (`observe_motion`) and the newest reading of the current monitor (`measured`) to `CoilMonitor`. Then the loop
 reads the results: `verdicts`, `available`, `resting`, `braked`, `at_rest`, `probe`, `suspicion` and
-`monitor_doubted`. No call waits. The class `CoilKnowledge` determines whether the coil currents are known.
-The currents are unknown while the PWM driver fails, after the loop has stalled, and while the supply current
-contradicts the commands.
+`monitor_doubted`. No call waits.
 
 The current monitor measures the sum of |I| over the three H-bridges. The current monitor cannot detect a
 reversed coil, and it detects an open coil only while that coil is driven. Every reading is compared with the
@@ -49,14 +47,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
 import numpy as np
 
 from flight.loop.coil_response import (
-    ELECTRICAL,
     LARGEST_GAIN,
     LEAST_GAIN,
     MEAN,
@@ -65,6 +62,7 @@ from flight.loop.coil_response import (
     CoilCommands,
     CoilFault,
     CoilResponse,
+    Evidence,
     Finding,
     MotionWitness,
     Predicted,
@@ -74,7 +72,7 @@ from flight.loop.coil_response import (
     fits,
     predict,
 )
-from hal.interfaces.devices import NO_AXES, Axes, CoilState, PowerReading
+from hal.interfaces.devices import NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import BoolArray, FloatArray
 
 _SURE = 2
@@ -334,62 +332,6 @@ class CoilMonitorSettings:
     absent: frozenset[int] = frozenset()
 
 
-_UNSEEN_NS = 600_000_000
-"""Largest age (ns) of a PWM error at its detection; the driver reads its outputs back twice a second."""
-_UNSUSPECTED_NS = 800_000_000
-"""Longest time (ns) from a fault to its suspicion, which takes four readings of the current monitor."""
-STOOD_NS = 200_000_000
-"""Stall of the control loop (ns) after which the guardian may have set the coils to zero."""
-
-
-@dataclass(frozen=True, slots=True)
-class CurrentValidity:
-    """Validity of the recorded coil currents.
-
-    Attributes:
-        now: whether the currents in force are known.
-        since_last_look: whether the PWM chip kept all commands since the previous call.
-        since_ns: time (ns) since which the currents have been known.
-        uncertain_since_ns: time (ns) since which currents recorded as known are uncertain, or None.
-    """
-
-    now: bool
-    since_last_look: bool
-    since_ns: int
-    uncertain_since_ns: int | None
-
-
-class CoilKnowledge:
-    """Determines once a cycle whether the coil currents are known."""
-
-    def __init__(self) -> None:
-        self._obeys = True
-        self._suspected = False
-        self._since_ns = -1
-        self._looked_ns: int | None = None
-
-    def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
-        """Return which currents are known, from the driver's state and the time since the last call.
-
-        `suspected` states whether the supply current contradicts a healthy circuit, so that a coil may carry
-        any current.
-        """
-        obeyed, self._obeys = self._obeys, not in_force.error
-        was_suspected, self._suspected = self._suspected, suspected
-        looked_ns, self._looked_ns = self._looked_ns, now_ns
-        stood = looked_ns is not None and now_ns - looked_ns > STOOD_NS
-        since_last_look = obeyed and self._obeys and not stood
-        now = self._obeys and not suspected
-        if now and (was_suspected or not since_last_look):
-            self._since_ns = now_ns
-        uncertain = [now_ns - _UNSEEN_NS] if obeyed and not self._obeys else []
-        if suspected and not was_suspected:
-            uncertain.append(now_ns - _UNSUSPECTED_NS)
-        if looked_ns is not None and stood:
-            uncertain.append(looked_ns)
-        return CurrentValidity(now, since_last_look, self._since_ns, min(uncertain, default=None))
-
-
 class Probe:
     """Drives one axis after another alone by a square wave with zero mean.
 
@@ -443,7 +385,6 @@ _STUCK_EXCESS = 0.3
 _LEAST_SHORT = 0.02
 """Smallest excess current (A) of a shorted coil that the motion of the body can confirm."""
 _READING_NS = 200_000_000
-_MOST_EVIDENCE, _MOST_SEGMENTS = 40, 4
 _IN_DOUBT = 5
 """Number of readings after which a verdict may name an axis with an uncertain kind of fault."""
 _AGAIN_NS = 60_000_000_000
@@ -452,82 +393,6 @@ _LONGEST_REST_NS = 600_000_000_000
 """Longest time (ns) for which a coil whose sign changes repeatedly is kept at zero current."""
 _MOST_CHANGES = 2
 """Largest number of changes of a coil's sign within ten minutes."""
-
-
-class Evidence:
-    """Predictions of the readings since a suspicion. Each probe begins a new segment.
-
-    A hypothesis must explain the readings of each segment. Otherwise, the few readings of the probe that
-    rejects a hypothesis would be outliers among the readings that do not depend on the hypothesis.
-    """
-
-    def __init__(self, bounds: Bounds) -> None:
-        self._bounds = bounds
-        self._segments: deque[deque[Predicted]] = deque(maxlen=_MOST_SEGMENTS)
-        self.clear()
-
-    def __len__(self) -> int:
-        """Return the number of predictions."""
-        return sum(len(segment) for segment in self._segments)
-
-    def clear(self) -> None:
-        """Discard all predictions."""
-        self._segments.clear()
-        self.begin_segment()
-
-    def begin_segment(self) -> None:
-        """Begin a new segment for the readings from now on."""
-        self._segments.append(deque(maxlen=_MOST_EVIDENCE))
-
-    def add(self, predictions: Sequence[Predicted]) -> None:
-        """Append the predictions of a reading to the newest segment."""
-        self._segments[-1].extend(predictions)
-
-    def readings(self) -> list[Predicted]:
-        """Return all predictions in order of time."""
-        return [one for segment in self._segments for one in segment]
-
-    def possible_faults(self, known: Mapping[int, CoilFault]) -> list[tuple[int, CoilFault]]:
-        """Return axes and faults that explain the readings, together with the known faults."""
-        segments = [segment for segment in self._segments if segment]
-        return [
-            (axis, fault)
-            for axis in range(3)
-            if axis not in known
-            for fault in ELECTRICAL
-            if all(fits(segment, self._bounds, known, axis, fault) for segment in segments)
-        ]
-
-    def shows_working_monitor(self, known: Mapping[int, CoilFault]) -> bool:
-        """Return whether the current monitor measured the current of a healthy coil in a probe.
-
-        Such a reading shows more clearly than the motion of a tumbling body that the monitor works.
-        """
-        return any(
-            fits(segment, self._bounds, known) and any(one.mean[:, 0].any() for one in segment)
-            for segment in list(self._segments)[1:]
-            if segment
-        )
-
-    def rejects_healthy_now(self, known: Mapping[int, CoilFault]) -> bool:
-        """Return whether the readings of the newest segment contradict healthy coils."""
-        newest = self._segments[-1]
-        return bool(newest) and not fits(newest, self._bounds, known)
-
-    def is_normal_again(
-        self, known: Mapping[int, CoilFault], possible: Sequence[tuple[int, CoilFault]]
-    ) -> bool:
-        """Return whether the newest readings agree with healthy coils.
-
-        The newest readings must also reject the `possible` faults, unless all coils were commanded to zero.
-        Coils at zero show no fault, and their currents are known.
-        """
-        newest = self.readings()[-8:]
-        if not fits(newest, self._bounds, known):
-            return False
-        if not any(one.mean[:, 0].any() for one in newest):
-            return True
-        return not any(fits(newest, self._bounds, known, axis, fault) for axis, fault in possible)
 
 
 class CoilCorrection:

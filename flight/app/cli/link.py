@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from flight.app.separation import SeparationInhibit
-from flight.app.service import StartRetry, StoppedError, accepted_config, retried_start
+from flight.app.service import SeparationInhibit, StartRetry, StoppedError, accepted_config, retried_start
 from flight.link.process.commanding import ControlLine, Sent
 from flight.link.process.downlink import LogFollower
 from flight.link.process.station import Line, SerialLine, Station, StationSettings, TcpLine, UdpLine

@@ -15,14 +15,7 @@ import numpy as np
 from flight.bodies.orbit.coarse_attitude import CoarseSunFeed, horizon_camera_feed
 from flight.bodies.orbit.control import FieldDetumblingLaw, PointingTracker, SunAcquisitionLaw, expected_field
 from flight.bodies.orbit.environment import EstimatedEnvironment
-from flight.bodies.orbit.filter import (
-    COIL_FACTORS,
-    OrbitFeed,
-    OrbitFilter,
-    OrbitFilterSettings,
-    learned_of,
-    start_from,
-)
+from flight.bodies.orbit.filter import OrbitFeed, OrbitFilter, OrbitFilterSettings
 from flight.bodies.orbit.guidance import (
     LearnedBody,
     ObjectAim,
@@ -32,6 +25,7 @@ from flight.bodies.orbit.guidance import (
     PointingTargets,
     Sensor,
 )
+from flight.bodies.orbit.learned_states import COIL_FACTORS, learned_of, start_from
 from flight.bodies.streak_methods import corner_estimator
 from flight.link import events
 from flight.link.modes import Mode

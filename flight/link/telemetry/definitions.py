@@ -163,14 +163,7 @@ KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
 """States of the quality of the attitude estimate (`flight.bodies.orbit.body`)."""
 COILS: States = ((0, "x"), (1, "y"), (2, "z"))
 """Torque coils, numbered by body axis."""
-STAGES: States = (
-    (1, "accepted"),
-    (2, "refused"),
-    (3, "started"),
-    (4, "completed"),
-    (5, "failed"),
-    (6, "repeated"),
-)
+STAGES: States = tuple(enumerate(("accepted", "refused", "started", "completed", "failed", "repeated"), 1))
 """Stages of a command (`flight.link.process.commanding.Stage`)."""
 
 SAFE_ALARM: Alarms = ((int(Mode.SAFE), "warning"),)
@@ -341,9 +334,7 @@ COMMAND = Packet(
 MAX_NODES = 40
 """Maximum number of path nodes in a plan packet."""
 
-_EFFECTIVE = (
-    "currents that the coils as described need for the dipole, before the correction of sign and gain"
-)
+_WANTED = "currents that the coils as described need for the dipole, before the correction of sign and gain"
 _WRITTEN = "currents written to the PWM chip, after the correction of sign and gain, limited and quantised"
 _Q2 = Limits(fault=(-Q2_LIMIT, Q2_LIMIT))
 
@@ -381,7 +372,7 @@ CONTROL = Packet(
         Field("path_rate", "f8", "rad/s", "current rate of the path"),
         Field("path_acceleration", "f8", "rad/s^2", "current angular acceleration of the path"),
         counter("plan", "number of the plan in use, 0 for none"),
-        Field("current_command", "f8", "A", _EFFECTIVE, 3),
+        Field("current_command", "f8", "A", _WANTED, 3),
         Field("current_written", "f8", "A", _WRITTEN, 3),
         flag("saturated", "whether the current of a coil was limited"),
     ),

@@ -82,7 +82,7 @@ class Estimate:
     covariance: FloatArray
     measured_ns: int
     latency: float = 0.0
-    field_bias: FloatArray = field(default_factory=lambda: np.zeros(3))
+    field_bias: FloatArray = field(default_factory=np.zeros(3).copy)
 
 
 class FilterState(NamedTuple):
@@ -118,9 +118,9 @@ class SlowPrior:
         latency: age of the inertial unit's samples at the time of their time stamps, s.
     """
 
-    bias: FloatArray = field(default_factory=lambda: np.zeros(3))
-    bias_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    bias: FloatArray = field(default_factory=np.zeros(3).copy)
+    bias_covariance: FloatArray = field(default_factory=np.zeros((3, 3)).copy)
     parameters: Parameters = NOMINAL
-    parameters_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    parameters_covariance: FloatArray = field(default_factory=np.zeros((3, 3)).copy)
     latency: float = 0.0
     latency_variance: float = 0.0

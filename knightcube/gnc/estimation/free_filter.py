@@ -354,6 +354,8 @@ class FreeMemory:
 class FreeFilter:
     """The filter, with the present estimate.
 
+    Over 350 lines, because every propagation and measurement changes the same estimate and covariance.
+
     Attributes:
         layout: the declared error state.
         quaternion: attitude (4,), from ICRS into body axes.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flight.app.separation import InhibitedError, SeparationInhibit
+from flight.app.service import InhibitedError, SeparationInhibit
 from tests.manual_clock import ManualClock
 
 SECOND = 1_000_000_000

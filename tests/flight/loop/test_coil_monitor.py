@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings, Evidence, StuckLeg
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings, StuckLeg
 from flight.loop.coil_response import (
     MEAN,
     NEWEST,
     PLACE,
     Bounds,
     CoilFault,
+    Evidence,
     Predicted,
     Supplied,
     fits,

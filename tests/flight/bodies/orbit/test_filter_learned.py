@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.bodies.orbit.filter import (
+from flight.bodies.orbit.learned_states import (
     BODY,
     ERRORS,
     LEARNED_AT,
