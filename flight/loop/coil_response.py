@@ -324,7 +324,7 @@ class ResponseSettings:
         free: flags (3,) of the axes about which the body can rotate; on a thread only y.
         bin_samples: number of gyro samples in a bin.
         bins: largest number of differences of neighbouring bins in the fit.
-        least_bins: number of differences of neighbouring bins before the first fit.
+        least_bins: minimum number of differences of neighbouring bins for a fit.
         model_error: acceleration error (rad/s^2) of a bin due to the uncertain delay from command to current.
         torsion, damping: prior standard deviations of torsion (1/s^2) and damping (1/s) about each free axis.
         errors: largest errors of the coils' gains, and of inertia and gyro of a body that is free about three

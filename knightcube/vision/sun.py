@@ -316,7 +316,7 @@ def _disc(
         aside = float(np.linalg.norm(circle.centre))
         if aside > settings.greatest_radius:
             return None
-        # A disc with a wrong radius is rejected later, so that its rim is not traced again.
+        # The rim of a disc with a wrong radius is not traced again, because the disc will be rejected.
         wrong = not 0.5 * settings.least_radius < circle.radius < 2.0 * settings.greatest_radius
         if wrong or aside * disc.pixels_per_radian < _NEAR:
             break

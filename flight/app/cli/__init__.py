@@ -75,7 +75,7 @@ COMMANDS = {
 """The commands of the flight application; packages with entry points in `GROUP` add more."""
 
 GROUP = "knightcube.commands"
-"""Group of entry points: tables with the purpose and the MODULE:FUNCTION of each command of a package."""
+"""Name of the group of entry points, each of which is a table of the commands that a package adds."""
 
 PROGRAM = "knightcube" if Path(sys.argv[0]).name == "knightcube" else "python -m flight"
 """Name by which the program was started: its console script or the module."""

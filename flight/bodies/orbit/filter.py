@@ -87,7 +87,7 @@ class DipoleHistory:
     def impulse(self, from_ns: int, to_ns: int) -> FloatArray:
         """Return the mean (3,), A m^2 s, of the integral of the dipole from a time of an interval to its end.
 
-        By the angular momentum of this impulse, the rate at the end of the interval `from_ns` to `to_ns`
+        The torque of this impulse is the reason why the rate at the end of the interval `from_ns` to `to_ns`
         differs from the mean rate of the interval.
         """
         first, last = bisect.bisect_right(self._times, from_ns), bisect.bisect_left(self._times, to_ns)
@@ -651,7 +651,7 @@ class OrbitFilter:
         return self._free.started
 
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
-        """Return the newest field and the gyro's rate in its step (`StepReplay.newest_field`)."""
+        """Return the newest magnetic field and the gyro rate of the same step (`StepReplay.newest_field`)."""
         self._close()
         return self._replay.newest_field()
 

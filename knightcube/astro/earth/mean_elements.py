@@ -30,7 +30,7 @@ _FIRST_SPAN, _GROWTH = 2_500.0, 3.0
 _VELOCITY_TIME = 100.0
 """Ratio (s) of the standard deviations of positions and velocities that is assumed in the fit."""
 _FAR, _NEAREST, _ROUNDS = 6.0, 300.0, 4
-"""Positions are rejected beyond _FAR median residuals and _NEAREST m, in at most _ROUNDS fits."""
+"""Residuals, in medians and in m, beyond both of which a position is rejected, and maximum number of fits."""
 _FIRST_ECCENTRICITY, _DIFFERENCE = 1e-3, 1e-6
 """Eccentricity of the first guess, and relative step of the numerical derivatives.
 

@@ -91,7 +91,7 @@ def momentum_plan(
     The predicted field after `times` (n,), s, is `field` (n, 3), T, in the inertial axes of the momentum. The
     mean dipole limit of the body axes is `limit`, A m^2. If the field prediction ends too early, the plan
     removes as much momentum as possible until the end of the prediction. Raises UsageError for fewer than
-    three times.
+    three instants.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")

@@ -1,24 +1,24 @@
 """A multiplicative extended Kalman filter of attitude, rate and biases that accepts late measurements.
 
 Each measurement is applied at its own time. A late measurement is inserted at its own time, and all later
-measurements are applied again. These measurements are applied at once, or a few at a time while the filter
-continues without the late measurement (module `replay`). The rate from a streaked image is the mean rate
-during the exposure. The filter therefore keeps the attitude at the start of an exposure until the exposure
-ends. The filter can also estimate the age of the inertial unit's samples (module `mekf`). For a body that
-hangs on the testbed's thread, the filter uses only the component of each measurement about the thread. The
-torsion and the damping of the thread are known or estimated. They are distinguished from the estimated
+measurements are applied again. The later measurements are applied in one call, or a few in each call while
+the filter continues without the late measurement (module `replay`). The rate from a streaked image is the
+mean rate during the exposure. The filter therefore keeps the attitude at the start of an exposure until the
+exposure ends. The filter can also estimate the age of the inertial unit's samples (module `mekf`). For a body
+that hangs on the testbed's thread, the filter uses only the component of each measurement about the thread.
+The torsion and the damping of the thread are known or estimated. They are distinguished from the estimated
 disturbance because their torques depend on the angle and the rate.
 
 The class `CommandCheck` checks with the gyro whether the coils carry the commanded currents. While a coil is
 broken, the model predicts an acceleration that does not occur. The innovations of the gyro then exceed their
 covariance within one to a few samples, which they do not in a healthy flight. From then on, the filter treats
 the coil currents as unknown and follows the gyro. The currents of the last half second are also treated as
-unknown. A change of the rate that no coil current can cause does not contradict the commands, because the
-gyro may be faulty. The commands are trusted again when the rate follows the commands. The model z = b + g c
-is fitted to the gyro samples z of the last second, where c is the change of the rate that the commands should
-cause. The response g must be determined well, be 1 within its uncertainty, and leave white residuals. The
-commands are therefore never trusted again while the coils are not driven. If the gyro is noisier than
-assumed, the check widens its limits and does not raise an alarm.
+unknown. A change of the rate that is too large for any coil current is no evidence against the commands,
+because the gyro may be faulty. The commands are trusted again when the rate follows the commands. The model
+z = b + g c is fitted to the gyro samples z of the last second, where c is the change of the rate that the
+commands should cause. The response g must be determined well, be 1 within its uncertainty, and leave white
+residuals. The commands are therefore never trusted again while the coils are not driven. If the gyro is
+noisier than assumed, the check widens its limits and does not raise an alarm.
 """
 
 from __future__ import annotations

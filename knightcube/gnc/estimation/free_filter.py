@@ -209,7 +209,7 @@ _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
 LASTING = 20.0
-"""Correlation time (s) of unmodelled errors of the coils, which scales the white noise that models them."""
+"""Correlation time (s) of the errors of the coils, which the filter represents by scaled white noise."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
 """Expected sizes of the constant torque and of the torques by air and sunlight, relative to that by air. The
 constant torque is small, because the error of the inertia has its own states. At one attitude the torques

@@ -476,7 +476,7 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
 def _found_stars(
     held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: float, most: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return fractional grid rows, columns and heights of the peaks whose sum is the response `held`.
+    """Return rows and columns, in fractions of a grid step, and heights of the peaks in the response `held`.
 
     Each pass of the search finds peaks in the residual response, solves for the heights of all stars, and
     subtracts these stars. The array `noise` holds the noise of a running sum by the number of its samples.

@@ -53,7 +53,7 @@ class StreakResiduals:
     """Residuals of the streaks that determine the motion, on b blocks of pixels.
 
     Attributes:
-        star: index in the scene of the star of each block of pixels (b,).
+        star: for each block of pixels (b,), the index of its star in the scene.
         time: time at which the star crosses each line of pixels (b, LINES) of the b blocks, in exposures from
             mid-exposure.
         images: images that are combined to model a streak, on lines of k pixels, (b, IMAGES, LINES, k) for b
@@ -147,7 +147,7 @@ def _displacement(
     )
 
 
-# Instants (exposures from mid-exposure) at which a path is compared with the path displaced by a lens error.
+# Instants, in exposure times from mid-exposure, at which paths with and without lens error are compared.
 _INSTANTS = np.linspace(-0.5, 0.5, 9)
 # Lower limit (px per exposure) of a star's speed in denominators.
 _SLOWEST = 1e-3

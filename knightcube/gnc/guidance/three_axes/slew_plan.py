@@ -282,7 +282,7 @@ LEAD = 2.0 * DIFFERENCE
 """Time (s) by which the ephemeris must begin before the first start and end after the last end, because rates
 are computed by central differences."""
 WINDOW_RANGE = (0.0, 2e4)
-"""Permitted range of the window of start times, s."""
+"""Permitted range of the length of the window of start times, s."""
 _BEGINS = 12
 """Number of equal intervals between the compared start times in a window."""
 _COARSE = 12

@@ -286,7 +286,7 @@ def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, f
 
     Args:
         direction: unit vectors to the stars (n, 3), the brightest first.
-        sizes: limits of the longest sides of b bands of triangles (b + 1,), as chords.
+        sizes: limits (b + 1,) of the b bands in which triangles are sorted by their longest side, as chords.
         ranks: rank of the brighter star that defines a star's reach, for each band (b,).
         few: number of the brightest stars of a circle on the sky whose triangles are added. The circles on
             the sky have the radii `sizes` and cover the sky.
