@@ -99,8 +99,8 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
     The noise `field_noise` (T, per axis and sample) includes constant errors of the magnetometer. The noise
     `torque_noise` (rad/s per sqrt(s)) represents unmodelled torques; without it, it is computed
     (`OrbitConfig.torque_noise`). The momentum plan covers `horizon` s and
-    is renewed every `replan` s. A body that starts slower than `gentle` rad/s never exceeds its initial rate;
-    a faster body may reach `spin_up` times its initial rate.
+    is renewed every `replan` s. A body that starts slower than `gentle` rad/s should not exceed its initial
+    rate; a faster body may reach `spin_up` times its initial rate.
     """
 
     field_noise: Positive = 5.0e-7
