@@ -306,7 +306,7 @@ class CoilMonitorSettings:
         evidence: number of readings that are needed for a verdict.
         probe_current: amplitude (A) of the square wave that reveals which of several axes is faulty.
         probe_half_ns: half the period (ns) of the probe's square wave.
-        response: settings for judging coils by the body's motion; None if the motion is not used.
+        response: settings for judging coils by the body's motion; None if the motion is not evaluated.
         slow: settings like `response` with longer bins, which reveal missing torque at small currents.
         tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
         trial_after_ns: time (ns) from the verdict on a coil to its next trial.

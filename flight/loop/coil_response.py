@@ -177,8 +177,8 @@ def predict(
 def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
     """Return the supply currents (n, v, k), A, of n bridges in v variants for the commands (n, k), A.
 
-    The current of each coil that is fully on is `full` (n, 1), A. For a shorted coil, the result is the
-    current of a healthy coil.
+    The current of each coil that is fully on is `full` (n, 1), A. Shorts are not
+    modelled: the result for a shorted coil is the current of a healthy coil.
     """
     forward, backward = np.maximum(commands, 0.0), np.maximum(-commands, 0.0)
     drawn = np.empty((len(commands), len(_VARIANTS), commands.shape[1]))
@@ -417,7 +417,7 @@ class CoilResponse:
         spreads = [_GAIN_PRIOR] * 3 + [settings.torsion] * count + [settings.damping] * count
         spreads += [1.0] * len(self._modes)
         self._prior: FloatArray = 1.0 / np.array(spreads) ** 2
-        # Prior weight of a healthy coil's gain, whose error is uniform within its bound.
+        # Prior weight (inverse variance) of a healthy coil's gain, whose error is uniform within a bound.
         self._healthy = 3.0 / max(settings.errors.coil_gain, _LEAST_GAIN_ERROR) ** 2
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
         self._known_ns = 0

@@ -53,7 +53,7 @@ from flight.schema.sections import CommandStep, Config, Health, Modes
 S = TypeVar("S", Modes, Health)
 
 PROVEN_NS = 60_000_000_000
-"""Flight time (ns) after which a loaded table is considered proven, and survives an unclean end."""
+"""Flight time (ns) after which a loaded table is kept even if the flight then ends uncleanly."""
 
 
 class OnboardParameters:

@@ -151,7 +151,7 @@ class TestbedConfig(Config, frozen=True, kw_only=True):
 
 
 def as_testbed(config: Config) -> TestbedConfig:
-    """Return a configuration, which must be that of the testbed. Raises ConfigError for any other body."""
+    """Return a configuration of the testbed unchanged. Raises ConfigError for any other body."""
     if not isinstance(config, TestbedConfig):
         raise ConfigError("body", f"is {config.body}: this needs a configuration of the testbed")
     return config

@@ -363,7 +363,7 @@ def _lengths(frames: Sequence[MatchedFrame], fit: LensFit) -> list[FloatArray]:
 def _spread(lengths: Sequence[FloatArray]) -> float:
     """Return the standard deviation per axis of the residuals, estimated from their median.
 
-    It is at least one. Raises CalibrationError if the median star is behind the camera.
+    It is at least one. Raises CalibrationError if half of the stars are behind the camera.
     """
     median = float(np.median(np.concatenate(lengths)))
     if not median < np.inf:

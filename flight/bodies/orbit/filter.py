@@ -296,8 +296,8 @@ class StepReplay:
     def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
         """Multiply the assumed dipoles of the coils by `change` (3,), and process the steps again.
 
-        The learned matrix of the corrected coils is reset. The steps in which a corrected coil was driven
-        have unknown dipoles, because the coil may have changed during these steps.
+        What was learned about these coils is reset. The steps in which a corrected coil was driven have
+        unknown dipoles, because the coil may have changed during these steps.
         """
         coils, changed = self._settings.coils, np.flatnonzero(change != 1.0)
         for step in self.steps:

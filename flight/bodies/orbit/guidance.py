@@ -226,7 +226,7 @@ class PointingTargetLaw:
 
 
 def target_of(target: Target) -> PointingTarget:
-    """Return the pointing target that a numbered target of a satellite contains."""
+    """Return the pointing target in the entry of a numbered target of a satellite."""
     law = target.law
     assert isinstance(law, PointingTargetLaw), "only the satellite's own targets reach its planner"
     return law.target

@@ -12,8 +12,8 @@ midpoint rule, and derivatives are computed of this discrete rule. With derivati
 the iteration would stall for bodies that rotate by degrees per time step.
 
 If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
-the module `pointing_path` instead. The cost of an error at the end of this path follows from a sweep along
-the attitude law over one more revolution.
+the module `pointing_path` instead. The cost of an error at the end of this path is computed by a backward
+Riccati sweep along the attitude law over one more revolution.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ class CommandCheck:
     def judge(self, newest: Checkpoint) -> int | None:
         """Return the time (ns) since which the currents are unknown if the newest checkpoint raises an alarm.
 
-        Return None without an alarm, and if the measurement of the checkpoint is not a gyro rate.
+        Return None if there is no alarm, or if the checkpoint holds no gyro rate.
         """
         rate = newest.measurement
         if not isinstance(rate, RateMeasurement) or not self._model.noise.unknown_current:

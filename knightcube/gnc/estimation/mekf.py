@@ -129,7 +129,7 @@ def innovation(
     needed for rate samples whose age is estimated.
     """
     size, noise = SIZE + 3 * len(state.kept), measurement.covariance
-    # A suspended body has no variance about x and z, so directions and fields need no projection.
+    # Measured directions and fields need no projection on y: a suspended body has no variance about x and z.
     if isinstance(measurement, DirectionMeasurement):
         return _direction(state, measurement, size)
     if isinstance(measurement, FieldMeasurement):
