@@ -10,14 +10,13 @@ import os
 import select
 import termios
 import threading
-import time
 from collections import deque
 from contextlib import suppress
 
 import serial
 
 from hal.interfaces.errors import NotResponding
-from hal.interfaces.wires import Clock
+from hal.interfaces.wires import SECOND_NS, Clock
 
 _READ_TIMEOUT_S = 0.1  # longest delay until the thread notices that the port closes
 _WRITE_TIMEOUT_S = 0.005  # a fifth of a control cycle; the kernel's buffer takes a command at once
@@ -125,11 +124,12 @@ class PySerialPort:
         The method `write` of pyserial raises an error also if all bytes were written but the thread was
         interrupted meanwhile.
         """
-        file, until = self._serial.fileno(), time.monotonic() + self._write_timeout
+        file, until_ns = self._serial.fileno(), self._clock.now_ns() + round(self._write_timeout * SECOND_NS)
         while data:
             with suppress(BlockingIOError):
                 data = data[os.write(file, data) :]
-            if data and not select.select([], [file], [], max(until - time.monotonic(), 0.0))[1]:
+            left = max(until_ns - self._clock.now_ns(), 0) / SECOND_NS
+            if data and not select.select([], [file], [], left)[1]:
                 raise TimeoutError("the output queue is full")
 
     def _open(self) -> serial.Serial:

@@ -93,7 +93,7 @@ def start_from(
             problems.append(f"{name} has {len(values)} values instead of {len(at)}")
             continue
         if not plausible(values - prior.values[at], initial.diagonal()[at]).all():
-            problems.append(f"{name} {values.tolist()}: not within {PLAUSIBLE:g} sigma of what is expected")
+            problems.append(f"{name} {values.tolist()}: not within {PLAUSIBLE:g} sigma of the prior")
             continue
         prior.values[at] = values
         prior.covariance[np.ix_(at, at)] = covariance + grown[np.ix_(at, at)]

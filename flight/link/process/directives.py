@@ -115,36 +115,27 @@ class SendFile:
 
 
 @dataclass(frozen=True, slots=True)
-class CancelFile:
-    """Directive to cancel a file transfer, identified by sending entity and transaction number."""
+class _OnTransfer:
+    """Directive about a file transfer, identified by sending entity and transaction number."""
 
     source: int
     number: int
 
     def __str__(self) -> str:
-        return f"cancel transfer {self.number} of entity {self.source}"
+        verb = type(self).__name__.removesuffix("File").lower()
+        return f"{verb} transfer {self.number} of entity {self.source}"
 
 
-@dataclass(frozen=True, slots=True)
-class SuspendFile:
-    """Directive to suspend a file transfer, identified by sending entity and transaction number."""
-
-    source: int
-    number: int
-
-    def __str__(self) -> str:
-        return f"suspend transfer {self.number} of entity {self.source}"
+class CancelFile(_OnTransfer):
+    """Directive to cancel a file transfer."""
 
 
-@dataclass(frozen=True, slots=True)
-class ResumeFile:
-    """Directive to resume a file transfer, identified by sending entity and transaction number."""
+class SuspendFile(_OnTransfer):
+    """Directive to suspend a file transfer."""
 
-    source: int
-    number: int
 
-    def __str__(self) -> str:
-        return f"resume transfer {self.number} of entity {self.source}"
+class ResumeFile(_OnTransfer):
+    """Directive to resume a suspended file transfer."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -157,9 +157,9 @@ def test_missing_torque_is_not_probed_without_readings_of_the_current_monitor() 
 def test_a_reversed_coil_on_the_thread_is_used_with_its_sign_changed() -> None:
     seen = observe(hold(TARGET), FAULT_AT + 14.0, [f"coil-x: reversed @ {FAULT_AT}"])
     assert seen.found == []
-    ((when, told),) = seen.news
+    ((when, text),) = seen.news
     assert FAULT_AT < when < FAULT_AT + 6.0
-    assert told.startswith("coil x: ")
+    assert text.startswith("coil x: ")
     assert seen.watch.correction.factors.tolist() == [-1.0, 1.0, 1.0]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -130,13 +131,22 @@ def test_a_port_that_takes_no_bytes_costs_less_than_a_control_cycle_and_is_not_r
     os.close(far)
 
 
-def test_a_thread_that_is_interrupted_while_it_writes_has_written(monkeypatch: pytest.MonkeyPatch) -> None:
+class InterruptedClock(SystemClock):
+    """A clock of a thread that is interrupted for a second between any two readings of the time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._seconds = itertools.count()
+
+    def now_ns(self) -> int:
+        """Return a time that is a second later at each call."""
+        return next(self._seconds) * 1_000_000_000
+
+
+def test_a_thread_that_is_interrupted_while_it_writes_has_written() -> None:
     near, far = os.openpty()
-    port = PySerialPort(os.ttyname(far), 115200, SystemClock())
-    now = iter(range(1000))
-    monkeypatch.setattr("hal.buses.serial_port.time.monotonic", lambda: float(next(now)))
+    port = PySerialPort(os.ttyname(far), 115200, InterruptedClock())
     port.send(b"$VNRRG,01*72\r\n")
-    monkeypatch.undo()
     assert os.read(near, 100) == b"$VNRRG,01*72\r\n"
     port.close()
     os.close(near)

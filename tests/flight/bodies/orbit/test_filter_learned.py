@@ -91,7 +91,7 @@ def test_without_a_time_or_far_from_what_is_expected_nothing_is_believed() -> No
     part = {**stored(known()), ERRORS: wild[ERRORS]}
     prior, problems = start_from(part, LAYOUT, CHANGED, THEN)
     assert len(problems) == 1
-    assert "sigma of what is expected" in problems[0]
+    assert "sigma of the prior" in problems[0]
     assert np.array_equal(prior.values[PARTS[SOURCES]], known().values[PARTS[SOURCES]])
 
 
