@@ -426,6 +426,21 @@ def command_of_words(text: str) -> Command:
     return command
 
 
+def words_of(command: Command) -> str:
+    """Return the line for which `command_of_words` returns the given command, with numbers of 10 digits."""
+    words = [command.packet.name]
+    for field in command.packet.fields:
+        value = command.fields[field.name]
+        labels = dict(field.states)
+        words += [
+            f"{one:.10g}" if isinstance(one, float) else str(labels.get(one, one))
+            for one in (value if field.count > 1 else [value])
+        ]
+    while words[-1] in {"", "nan"}:
+        words.pop()
+    return " ".join(words)
+
+
 def _number(field: Field, word: str) -> float | int:
     for number, label in field.states:
         if word == label:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from flight.link.commands import (
     LAYOUTS,
     PING,
     POINT,
-    SAFE,
     Command,
     CommandError,
     CommandPacker,
@@ -33,6 +32,7 @@ from flight.link.commands import (
     Point,
     command_of,
     shown,
+    words_of,
 )
 from flight.link.files.store import Store, files_folder
 from flight.link.files.transfer import Progress
@@ -89,6 +89,7 @@ from knightcube.errors import FlightError, UsageError
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 Object = dict[str, Any]
+_Words: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 _DIRECTIVES = ("play", "stop-playback", "new-key", "schedule", "unschedule", "list-schedule")
 _ORIGINS = {field.name: dict(field.states) for field in PARAMETERS.fields if field.name == "table"}
 _OF_TRANSFERS: dict[str, type[CancelFile | SuspendFile | ResumeFile]] = {
@@ -122,6 +123,13 @@ def _add_way(parser: argparse.ArgumentParser, timeout: float) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
+def _allow_behind(words: _Words) -> None:
+    """Let `--timeout` and `--json` stand behind the words of a command too."""
+    for word in words.choices.values():
+        word.add_argument("--timeout", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+        word.add_argument("--json", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+
+
 def _add_spi(parser: argparse.ArgumentParser) -> None:
     text = "key of the commands on the link (default %(default)s)"
     parser.add_argument("--spi", type=int, choices=COMMAND_SPIS, default=COMMAND_SPIS[0], help=text)
@@ -135,8 +143,7 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
     )
     _add_way(parser, 2.0)
     words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
-    for packet in COMMANDS:
-        _configure_word(words.add_parser(packet.name, help=packet.meaning.lower()), packet)
+    _add_commands(words)
     play = words.add_parser("play", help="with --link: play back a part of the archive")
     play.add_argument("begin", type=float, metavar="BEGIN", help="mission time, s")
     play.add_argument("end", type=float, metavar="END", help="mission time, s")
@@ -146,13 +153,39 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
     words.add_parser("stop-playback", help="with --link: end the playback")
     timed = words.add_parser("schedule", help="with --link: execute a command at a UTC")
     timed.add_argument("at", metavar="UTC", help="such as 2026-11-23T21:00:00")
-    timed.add_argument("words", nargs="+", metavar="WHAT", help="a command, such as slew 0.2")
+    text = "a command as it is typed without schedule, such as point nadir --roll 90"
+    timed.add_argument("words", nargs=argparse.REMAINDER, metavar="WHAT", help=text)
     deleted = words.add_parser("unschedule", help="with --link: delete a scheduled command")
     deleted.add_argument("number", type=int, metavar="N", help="number in list-schedule; 0 deletes all")
     words.add_parser("list-schedule", help="with --link: show the scheduled commands")
     key = words.add_parser("new-key", help="with --link: change a key at both ends")
     key.add_argument("changed", type=int, choices=(*COMMAND_SPIS, *TELEMETRY_SPIS), metavar="SPI")
+    _allow_behind(words)
     parser.set_defaults(command=run_command)
+
+
+def _add_commands(words: _Words) -> None:
+    """Add the telecommands to the words of a parser."""
+    for packet in COMMANDS:
+        _configure_word(words.add_parser(packet.name, help=packet.meaning.lower()), packet)
+
+
+def _with_scheduled(options: argparse.Namespace) -> argparse.Namespace:
+    """Return the options with the words of a scheduled command as one line, and those behind the words.
+
+    Raises UsageError for values that the command forbids; wrong words end the program with status 2.
+    """
+    parser = argparse.ArgumentParser(prog="schedule UTC")
+    words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
+    _add_commands(words)
+    _allow_behind(words)
+    typed = parser.parse_args(options.words)
+    behind = {name: getattr(typed, name) for name in ("timeout", "json") if hasattr(typed, name)}
+    try:
+        line = words_of(_command_of(typed))
+    except CommandError as error:
+        raise UsageError(str(error)) from error
+    return argparse.Namespace(**{**vars(options), **behind, "words": line})
 
 
 def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
@@ -172,21 +205,23 @@ def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
         )
         return
     for field in packet.fields if packet is not PING else ():
-        _add_field(parser, field, optional=packet is SAFE)
+        _add_field(parser, field)
 
 
-def _add_field(parser: argparse.ArgumentParser, field: Field, optional: bool) -> None:
+def _add_field(parser: argparse.ArgumentParser, field: Field) -> None:
     meaning = meaning_of(replace(field, states=())).replace("%", "%%")
     if field.states:
         parser.add_argument(field.name, choices=[label for _, label in field.states], help=meaning)
     elif field.kind.startswith("S"):
-        parser.add_argument(field.name, nargs="?" if optional else None, default="", help=meaning)
+        parser.add_argument(field.name, nargs="*", help=meaning)
     else:
         parser.add_argument(field.name, type=float if field.kind.startswith("f") else int, help=meaning)
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Send the command, wait for the answer and print it."""
+    if options.what == "schedule":
+        options = _with_scheduled(options)
     if options.link is not None:
         return _command_by_link(options)
     if options.what in _DIRECTIVES:
@@ -241,7 +276,7 @@ def packet_of(options: argparse.Namespace) -> bytes:
             case "stop-playback":
                 return directives.pack(Stop(), utc_ns())
             case "schedule":
-                return directives.pack(Scheduled(options.at, " ".join(options.words)), utc_ns())
+                return directives.pack(Scheduled(options.at, options.words), utc_ns())
             case "unschedule":
                 return directives.pack(Deletion(options.number), utc_ns())
             case "list-schedule":
@@ -264,6 +299,8 @@ def _command_of(options: argparse.Namespace) -> Command:
     fields = {}
     for field in packet.fields:
         value = getattr(options, field.name)
+        if field.kind.startswith("S"):
+            value = " ".join(value)
         numbers_by_label = {label: number for number, label in field.states}
         fields[field.name] = numbers_by_label[value] if field.states else value
     return command_of(packet, fields)
@@ -474,6 +511,7 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
         text = "sender: 1 for the satellite, 2 for the ground"
         placed.add_argument("source", type=int, metavar="ENTITY", help=text)
         placed.add_argument("number", type=int, metavar="N", help="number in the packet transfer")
+    _allow_behind(words)
     parser.set_defaults(command=run_files)
 
 

@@ -14,7 +14,14 @@ import numpy as np
 from flight.link.telemetry.packets import PacketArray, to_text
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.astro.quaternion import conjugate, multiply, normalise, to_rotation_vector
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_rotation_vector,
+)
 from knightcube.gnc.guidance.one_axis.plant import steady_heat, supply_power
 
 Object = dict[str, Any]
@@ -175,13 +182,16 @@ def mean_rates(truth: PacketArray, start: FloatArray, stop: FloatArray) -> Float
 def streaks(run: Run) -> Object:
     """Return the number of frames and rates from streaks, and the errors of the rates.
 
+    The errors are those of the camera: the true misalignment of a simulated camera is not part of them.
     `normalised` is the mean of e' P^-1 e / 3 over the rates with a positive definite covariance P. The mean
     is 1 if the covariances are correct.
     """
     packets = run["streak"]
     rated = with_rate(packets)
     start = rated["exposure_start_ns"] / 1e9
-    error = rated["rate"] - mean_rates(run["truth"], start, start + rated["exposure"])
+    true = mean_rates(run["truth"], start, start + rated["exposure"])
+    to_camera = attitude_matrix(from_rotation_vector(_misalignment(run)))
+    error = rated["rate"] - true @ to_camera.T
     known = np.all(np.isfinite(error), axis=1)
     return {
         "frames": len(packets),
@@ -196,7 +206,7 @@ def star_attitudes(run: Run) -> Object:
     """Return the number of frames and attitudes of the star tracker, and the errors of the attitudes.
 
     The value `rms_error` (rad) is the rms error about the body axes. The value `normalised` is the mean of e'
-    P^-1 e / 3 as in `streaks`.
+    P^-1 e / 3 as in `streaks`. The true misalignment of a simulated camera is not part of the errors.
     """
     packets, truth = run["stars"], run["truth"]
     solved = packets[np.all(np.isfinite(packets["quaternion"]), axis=1)]
@@ -208,6 +218,7 @@ def star_attitudes(run: Run) -> Object:
         columns = [np.interp(middle[covered], time, column) for column in truth["quaternion"].T]
         true = normalise(np.stack(columns, axis=-1))
         error = to_rotation_vector(multiply(solved["quaternion"][covered], conjugate(true)))
+        error -= _misalignment(run)
     return {
         "frames": len(packets),
         "solved": len(solved),
@@ -258,6 +269,12 @@ def estimate_errors(run: Run) -> Object | None:
         usable = np.isfinite(sigma) & (sigma > 0.0)
         found[f"{name}_normalised"] = _rms(error[usable] / sigma[usable]) if usable.any() else None
     return found
+
+
+def _misalignment(run: Run) -> FloatArray:
+    """Return the true misalignment (3,), rad, of a simulated star camera, or zeros if it is not known."""
+    true = run["true_description"]
+    return true["camera"][0].astype(float) if len(true) else np.zeros(3)
 
 
 def _counts(texts: PacketArray) -> dict[str, int]:

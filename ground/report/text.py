@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from itertools import groupby
 from typing import Any
 
 from flight.link.telemetry.definitions import SEVERITIES
@@ -14,7 +15,7 @@ Object = dict[str, Any]
 ARCSECONDS = 648_000.0 / math.pi
 DEGREES = 180.0 / math.pi
 _MAX_LISTED = 20
-"""Number of failed frames that the text lists."""
+"""Maximum number of lines in the table of failed frames."""
 
 
 def format_report(summary: Object) -> str:
@@ -160,9 +161,11 @@ def _knowledge(found: Object | None) -> list[str]:
         f"NEES per axis {number(found['nees_per_axis'])}",
         *own,
         *learned,
-        "  error of the residual dipole in the last ten minutes: "
-        f"{number(dipole['sunlight'], 0, 100.0)} % in sunlight, "
-        f"{number(dipole['shadow'], 0, 100.0)} % in shadow",
+        *(
+            f"  error of the residual dipole in the last ten minutes in {where}: {number(share, 0, 100.0)} %"
+            for where, share in dipole.items()
+            if share is not None
+        ),
         f"  {found['refused']} measurements and {found['fixes_refused']} fixes refused, "
         f"{found['restarts']} restarts",
     ]
@@ -299,7 +302,9 @@ def _loop(summary: Object) -> list[str]:
     ]
     if rows:
         lines += ["Times", *table(["", "median ms", "99 % ms", "max ms"], rows)]
-    return [*lines, f"Control cycles in the log: {cycles['count']}, skipped slots: {cycles['skipped']}"]
+    if cycles["count"]:
+        lines.append(f"Control cycles in the log: {cycles['count']}, skipped slots: {cycles['skipped']}")
+    return lines
 
 
 def _planner(plans: Object) -> list[str]:
@@ -337,17 +342,31 @@ def _sensing(summary: Object) -> list[str]:
         )
         lines += _errors(stars, "about x, y, z", "arcsec", 2, ARCSECONDS, "attitudes")
     lines += _star_camera(summary["star_camera"])
-    frames = summary["failed_frames"]
+    return lines + _failed_frames(summary["failed_frames"])
+
+
+def _failed_frames(frames: list[Object]) -> list[str]:
+    """Return a table of the frames without a measurement, with a line for successive frames of one cause."""
     if not frames:
-        return lines
-    rows = [
-        [str(frame["sequence"]), number(frame["exposed_s"], 3), frame["streaks"], frame["stars"] or "-"]
-        for frame in frames[:_MAX_LISTED]
-    ]
-    more = len(frames) - _MAX_LISTED
-    head = ["frame", "exposed at s", "streaks", "stars"]
-    lines += [f"Frames without rate or attitude: {len(frames)}", *table(head, rows)]
-    return lines + ([f"  and {more} more; --json lists all"] if more > 0 else [])
+        return []
+    causes = [(frame["streaks"], frame["stars"] or "-") for frame in frames]
+    rows = []
+    for (streaks, stars), group in groupby(zip(causes, frames, strict=True), key=lambda pair: pair[0]):
+        own = [frame for _, frame in group]
+        first, last = own[0], own[-1]
+        rows.append(
+            [
+                str(len(own)),
+                number(first["exposed_s"], 1),
+                number(last["exposed_s"], 1),
+                streaks,
+                stars,
+            ]
+        )
+    more = len(rows) - _MAX_LISTED
+    head = ["frames", "first at s", "last at s", "streaks", "stars"]
+    lines = [f"Frames without rate or attitude: {len(frames)}", *table(head, rows[:_MAX_LISTED])]
+    return lines + ([f"  and {more} more lines; --json lists all frames"] if more > 0 else [])
 
 
 def _star_camera(found: Object | None) -> list[str]:

@@ -27,8 +27,8 @@ def _lines(parser: argparse.ArgumentParser, before: str = "") -> list[str]:
             for name, inner in action.choices.items():
                 lines += [f"{before}{name}", *_lines(inner, f"{before}{name} ")]
             continue
-        if isinstance(action, argparse._HelpAction):
-            continue
+        if isinstance(action, argparse._HelpAction) or action.help == argparse.SUPPRESS:
+            continue  # a hidden option repeats one of the parent command
         words = [" ".join(action.option_strings) or action.dest]
         if action.nargs is not None:
             words.append(f"nargs {action.nargs}")

@@ -14,7 +14,7 @@ import importlib.util
 import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -67,15 +67,24 @@ def outlast_readers() -> None:
             setattr(sys, name, made)
 
 
-COMMANDS = {
-    "run": "fly a configuration",
-    "link": "connect a flight to its ground by protected frames",
-    "check": "check a configuration and the devices that it names, before it is flown",
+GROUPS = {
+    "fly": "Fly and judge a flight",
+    "operate": "Operate a flight",
+    "sky": "Pictures of the sky and the Earth",
+    "plan": "Plan and identify",
+    "make": "Make configurations and tables",
 }
-"""The commands of the flight application; packages with entry points in `GROUP` add more."""
+"""Headings of the groups of commands in `--help`."""
 
-GROUP = "knightcube.commands"
-"""Name of the group of entry points, each of which is a table of the commands that a package adds."""
+COMMANDS = {
+    "run": ("fly", "fly a configuration"),
+    "link": ("operate", "connect a flight to its ground by protected frames"),
+    "check": ("fly", "check a configuration and the devices that it names, before it is flown"),
+}
+"""Group and purpose of each command of the flight application; entry points in `ENTRY_POINTS` add more."""
+
+ENTRY_POINTS = "knightcube.commands"
+"""Name of the entry points, each of which is a table of the commands that a package adds."""
 
 PROGRAM = "knightcube" if Path(sys.argv[0]).name == "knightcube" else "python -m flight"
 """Name by which the program was started: its console script or the module."""
@@ -117,9 +126,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _obey(words: Sequence[str]) -> int:
     try:
         try:
-            parser = _parser(words)
+            parser = _parser(_typed() or words)
         except OSError as error:  # an unreadable module is a failure, not a mistake of the user
             raise FlightError(str(error)) from error
+        _complete(parser)
         options = parser.parse_args(words)
         status: int = options.command(options)
     finally:
@@ -127,34 +137,65 @@ def _obey(words: Sequence[str]) -> int:
     return status
 
 
+def _typed() -> list[str]:
+    """Return the words after the program's name that a shell asks to complete, or none in a usual run."""
+    line = os.environ.get("COMP_LINE", "") if "_ARGCOMPLETE" in os.environ else ""
+    return line.split()[1:]
+
+
+def _complete(parser: argparse.ArgumentParser) -> None:
+    """Answer a shell that asks for completions, and end the process; return at once in a usual run."""
+    if "_ARGCOMPLETE" not in os.environ:
+        return
+    try:
+        import argcomplete  # noqa: PLC0415 - an extra
+    except ModuleNotFoundError as error:
+        needed = "pip install 'knightcube-flight[watch]'"
+        raise FlightError(f"completion needs {error.name}: {needed}") from error
+    argcomplete.autocomplete(parser)
+
+
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    available = _available(words)
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
-        description="The on-board application of the KnightCube.",
+        description=_overview(available),
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"knightcube-flight {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name, (purpose, target) in _available(words).items():
-        command = commands.add_parser(name, help=purpose)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", help="a command of the list above")
+    for name, (_, _, target) in available.items():
+        command = commands.add_parser(name)
         if words[:1] == [name]:
             module, _, function = target.partition(":")
             getattr(importlib.import_module(module), function)(command)
     return parser
 
 
-def _available(words: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return purpose and MODULE:FUNCTION of each command; other packages are searched only if needed."""
-    own = {name: (purpose, f"{__name__}.{name}:configure") for name, purpose in COMMANDS.items()}
+def _overview(available: Mapping[str, tuple[str, str, str]]) -> str:
+    """Return the text above the options in `--help`: the commands by groups."""
+    lines = ["The on-board application of the KnightCube, and the tools of its ground."]
+    for group, heading in GROUPS.items():
+        lines += ["", f"{heading}:"]
+        lines += [f"  {name:14} {purpose}" for name, (own, purpose, _) in available.items() if own == group]
+    return "\n".join(lines)
+
+
+def _available(words: Sequence[str]) -> dict[str, tuple[str, str, str]]:
+    """Return group, purpose and MODULE:FUNCTION of each command; search other packages only if needed."""
+    own = {name: (*about, f"{__name__}.{name}:configure") for name, about in COMMANDS.items()}
     if words and words[0] in own:
         return own
-    others: dict[str, tuple[str, str]] = {}
-    for found in metadata.entry_points(group=GROUP):
+    others: dict[str, tuple[str, str, str]] = {}
+    for found in metadata.entry_points(group=ENTRY_POINTS):
         if importlib.util.find_spec(found.module.partition(".")[0]) is None:
             continue  # a board has no ground package
-        table: dict[str, tuple[str, str]] = found.load()
-        others |= {name: (purpose, f"{found.module}.{target}") for name, (purpose, target) in table.items()}
+        table: dict[str, tuple[str, str, str]] = found.load()
+        others |= {
+            name: (group, purpose, f"{found.module}.{target}")
+            for name, (group, purpose, target) in table.items()
+        }
     return own | others
 
 

@@ -19,4 +19,4 @@ def test_the_commands_are_the_published_ones() -> None:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_has_its_published_arguments(name: str) -> None:
     """Scripts depend on them: an argument that changes here changes the interface."""
-    assert arguments_of(f"ground.commands.{COMMANDS[name][1]}") == PUBLISHED[name]
+    assert arguments_of(f"ground.commands.{COMMANDS[name][2]}") == PUBLISHED[name]

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import pytest
 
-from flight.link.commands import ChangeMode, Ping, Point, Slew, unpack
+from flight.link.commands import ChangeMode, Ping, Point, Slew, command_of_words, unpack
 from flight.link.files.store import Store
 from flight.link.files.transfer import Progress
 from flight.link.modes import Mode
@@ -136,13 +136,47 @@ def words(*arguments: str) -> Any:
     [
         (("play", "1.5", "9", "--run", "3"), Play(3, 1.5, 9.0)),
         (("stop-playback",), Stop()),
-        (("schedule", "2026-11-23T21:00:00", "slew", "0.2"), Scheduled("2026-11-23T21:00:00", "slew 0.2")),
         (("unschedule", "7"), Deletion(7)),
         (("list-schedule",), Listing()),
     ],
 )
 def test_the_directives_are_packed_as_typed(arguments: tuple[str, ...], directive: Any) -> None:
     assert directives.unpack(satellite.packet_of(words(*arguments))) == directive
+
+
+@pytest.mark.parametrize(
+    "typed",
+    [
+        "slew -0.2",
+        "point ground 52.5 13.25 --roll -45",
+        "point inertial 0.6 0 0 -0.8",
+        "point nadir",
+        "point sun --roll 90",
+        "mode hold",
+        "clear coil-broken",
+        "safe end",
+        "ping",
+        "dump-parameters",
+    ],
+)
+def test_a_scheduled_command_is_the_command_as_typed(typed: str) -> None:
+    options = satellite._with_scheduled(words("schedule", "2026-11-23T21:00:00", *typed.split(), "--json"))
+    directive = directives.unpack(satellite.packet_of(options))
+    assert isinstance(directive, Scheduled)
+    assert options.json
+    flown, meant = command_of_words(directive.words), satellite._command_of(words(*typed.split()))
+    if isinstance(meant, Point):
+        assert isinstance(flown, Point)
+        assert flown.target.goal is meant.target.goal
+        assert flown.target.roll == pytest.approx(meant.target.roll, abs=1e-9)
+        assert flown.target.numbers == pytest.approx(meant.target.numbers, abs=1e-9)
+    else:
+        assert flown == meant
+
+
+def test_options_may_stand_behind_the_command() -> None:
+    assert words("slew", "0.2", "--json", "--timeout", "7").timeout == 7.0
+    assert words("slew", "0.2").timeout == 2.0
 
 
 def test_angles_are_typed_in_degrees_and_quaternions_as_they_are() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from ground.report import signals
 from ground.report.signals import PowerHistory
-from knightcube.astro.quaternion import from_rotation_vector
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from tests.support.packed_run import packed_run
 
 POWER = PowerHistory(
@@ -133,6 +133,25 @@ def test_star_attitudes_are_compared_with_the_truth_at_the_middle_of_the_exposur
     }  # fmt: skip
     np.testing.assert_allclose(found["rms_error"], [0.0, 0.0, 0.003], atol=1e-6)
     assert found["normalised"] == pytest.approx(1.0 / 3.0, rel=1e-3)
+
+
+def test_the_true_misalignment_of_the_camera_is_not_an_error_of_its_frames() -> None:
+    """A camera measures its own rotation, and so in axes that are rotated against the body's."""
+    tilt, body = np.array([2e-3, -1e-3, 3e-3]), from_rotation_vector(np.array([0.2, -0.7, 0.4]))
+    camera, rate = from_rotation_vector(tilt), np.array([0.1, 0.2, -0.05])
+    truth = [(float(t), {"quaternion": body.tolist(), "rate": rate.tolist()}) for t in range(4)]
+    small = [1e-12] * 3 + [0.0] * 3
+    star = {"middle_ns": 1_500_000_000, "quaternion": multiply(camera, body).tolist(), "covariance": small}
+    streak = {"exposure_start_ns": 1_000_000_000, "exposure": 1.0, "status": "rate",
+              "rate": (attitude_matrix(camera) @ rate).tolist(), "covariance": small}  # fmt: skip
+    run = packed_run(
+        truth=truth,
+        true_description=[(0.0, {"camera": tilt.tolist()})],
+        stars=[(1.5, star)],
+        streak=[(2.0, streak)],
+    )
+    np.testing.assert_allclose(signals.star_attitudes(run)["rms_error"], 0.0, atol=1e-6)
+    np.testing.assert_allclose(signals.streaks(run)["rms_error"], 0.0, atol=1e-6)
 
 
 def test_a_failed_frame_gave_neither_a_rate_nor_an_attitude() -> None:

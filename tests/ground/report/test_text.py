@@ -144,7 +144,8 @@ def test_knowledge_is_in_degrees_and_percent() -> None:
         "  error of the star camera's attitude 0.0030 deg rms with stars, NEES per axis 0.99",
         "  learned description, rms (inertia relative to the trace, camera in rad):",
         "  inertia: error 0.012 at the start, 0.00045 at the end, one sigma 0.00067",
-        "  error of the residual dipole in the last ten minutes: 13 % in sunlight, 5 % in shadow",
+        "  error of the residual dipole in the last ten minutes in sunlight: 13 %",
+        "  error of the residual dipole in the last ten minutes in shadow: 5 %",
         "  5 measurements and 6 fixes refused, 7 restarts",
     ]
 
@@ -290,14 +291,16 @@ def test_the_availability_of_the_star_camera_is_stated() -> None:
     assert "0 of 0 unobstructed instants; longest" in blocks(star_camera=never)[-1]
 
 
-@pytest.mark.parametrize(("count", "more"), [(20, ""), (23, "  and 3 more; --json lists all")])
-def test_up_to_twenty_failed_frames_are_listed(count: int, more: str) -> None:
+@pytest.mark.parametrize(("count", "more"), [(20, ""), (23, "  and 3 more lines; --json lists all frames")])
+def test_successive_failed_frames_of_one_cause_share_one_of_up_to_twenty_lines(count: int, more: str) -> None:
+    causes = ("too-few", "saturated")
     frames = [
-        {"sequence": k, "exposed_s": 0.5 * k, "streaks": "too-few", "stars": None} for k in range(count)
+        {"sequence": k, "exposed_s": 0.5 * k, "streaks": causes[k // 3 % 2], "stars": None}
+        for k in range(3 * count)
     ]
     lines = blocks(failed_frames=frames)[-1].splitlines()
-    assert lines[0] == f"Frames without rate or attitude: {count}"
-    assert lines[3].split() == ["1", "0.500", "too-few", "-"]
+    assert lines[0] == f"Frames without rate or attitude: {3 * count}"
+    assert lines[3].split() == ["3", "1.5", "2.5", "saturated", "-"]
     assert len(lines) == 2 + 20 + bool(more)
     assert not more or lines[-1] == more
 

@@ -354,8 +354,8 @@ def plan(
     if trial is None:
         raise PlanningError(
             f"no path was found from q2 {start_q2:.4f} at {start_rate:.4f} rad/s to {end_q2:.4f} at "
-            f"{end_rate:.4f} rad/s with |I| <= {plant.current_limit} A and |q2| <= {q2_limit} over "
-            f"{horizon:g} to {longest:.1f} s"
+            f"{end_rate:.4f} rad/s in {horizon:g} to {longest:g} s, with currents up to "
+            f"{plant.current_limit:.4g} A and |q2| <= {q2_limit:g}: use a longer horizon"
         )
     asked = horizon if time_cost is None else trial.horizon
     found = _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
