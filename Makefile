@@ -81,7 +81,7 @@ house: $(TOOLS) ## sizes of files, classes and functions
 	$(RUN) -m tests.studies.house
 
 unit: $(TOOLS)  ## the tests, on all cores
-	$(TESTS) --dist loadfile --no-loadscope-reorder
+	$(TESTS) -rs --dist loadfile --no-loadscope-reorder
 
 fast: $(TOOLS)  ## the tests that are not slow, on all cores
 	$(TESTS) --dist worksteal -m "not slow"

@@ -1,0 +1,44 @@
+"""The flights that `make` offers run in short form, with the commands of their recipes."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+MAKEFILE = (ROOT / "Makefile").read_text()
+SECONDS = {"demo": 3, "cage": 3, "orbit": 3, "orbit-3u": 3, "object": 40}
+"""Time flown of each target that judges a flight; the object enters the field of view after half a minute."""
+
+
+def commands_of(target: str) -> list[str]:
+    """Return the arguments of `python -m flight` in the recipe of a target."""
+    recipe = re.search(rf"^{target}:.*\n((?:\t.*\n)+)", MAKEFILE, re.MULTILINE)
+    assert recipe is not None
+    return re.findall(r"\$\(RUN\) -m flight (.*)", recipe.group(1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", SECONDS)
+def test_a_target_flies_and_judges_its_flight(target: str, tmp_path: Path) -> None:
+    (tmp_path / "config").symlink_to(ROOT / "config")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    flown, judged = commands_of(target)
+    for command in (f"{flown} --duration {SECONDS[target]}", judged):
+        done = subprocess.run(
+            [sys.executable, "-m", "flight", *command.split()],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=100,
+            check=False,
+        )
+        arc_is_short = "object 1" in done.stdout and "is too short" in done.stdout
+        assert done.returncode == 0 or arc_is_short, done.stderr[-2000:]
+        assert done.stdout
