@@ -7,7 +7,7 @@ reads the results: `verdicts`, `available`, `resting`, `braked`, `at_rest`, `pro
 
 The current monitor measures the sum of |I| over the three H-bridges. The current monitor cannot detect a
 reversed coil, and it detects an open coil only while that coil is driven. Every reading is compared with the
-prediction of each hypothesis (`flight.loop.coil_response`). A hypothesis is that all coils are healthy, or
+prediction of each hypothesis (`flight.loop.coil_currents`). A hypothesis is that all coils are healthy, or
 that one axis is open, shorted, or has one leg of an input stuck. A verdict is given when the hypothesis
 `healthy` is rejected and all hypotheses that explain the later readings name the same axis. Several axes
 remain possible if no axis or several axes are driven. Each of these axes is then driven alone by a small
@@ -53,24 +53,27 @@ from enum import Enum, auto
 
 import numpy as np
 
-from flight.loop.coil_response import (
-    LARGEST_GAIN,
-    LEAST_GAIN,
+from flight.loop.coil_currents import (
     MEAN,
     NEWEST,
     Bounds,
-    CoilCommands,
     CoilFault,
-    CoilResponse,
-    Evidence,
-    Finding,
-    MotionWitness,
     Predicted,
-    ResponseSettings,
     Sampling,
     Supplied,
     fits,
     predict,
+)
+from flight.loop.coil_response import (
+    LARGEST_GAIN,
+    LONGEST_REST_NS,
+    CoilCommands,
+    CoilCorrection,
+    CoilResponse,
+    Evidence,
+    Finding,
+    MotionWitness,
+    ResponseSettings,
 )
 from hal.interfaces.devices import NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import BoolArray, FloatArray
@@ -389,93 +392,6 @@ _IN_DOUBT = 5
 """Number of readings after which a verdict may name an axis with an uncertain kind of fault."""
 _AGAIN_NS = 60_000_000_000
 """Shortest time (ns) between two series of probes for missing torque."""
-_LONGEST_REST_NS = 600_000_000_000
-"""Longest time (ns) for which a coil whose sign changes repeatedly is kept at zero current."""
-_MOST_CHANGES = 2
-"""Largest number of changes of a coil's sign within ten minutes."""
-
-
-class CoilCorrection:
-    """Sign and gain of each coil relative to its description, and the reviews that are due.
-
-    Attributes:
-        factors: dipole (3,) of each coil relative to the described dipole at the same current: 1 for a
-            healthy coil, -1 for a reversed coil.
-        deviations: relative standard deviations (3,) of the estimated gains; zero for coils without an
-            estimated gain.
-    """
-
-    def __init__(self) -> None:
-        self.factors: FloatArray = np.ones(3)
-        self.deviations: FloatArray = np.zeros(3)
-        self._changes: list[list[int]] = [[], [], []]  # times (ns) of the changes of sign
-        self._unreviewed: set[int] = set()
-
-    def effective(self, wire: FloatArray) -> FloatArray:
-        """Return the currents (3,), A, with which healthy coils would have the same dipole as the coils."""
-        return self.factors * wire
-
-    def wire(self, effective: FloatArray) -> FloatArray:
-        """Return the currents (3,), A, of the coils that cause the dipole of the effective currents (3,)."""
-        return effective / self.factors
-
-    @property
-    def unreviewed(self) -> frozenset[int]:
-        """The axes whose sign was changed in a tumble and has not been reviewed while the body is slow."""
-        return frozenset(self._unreviewed)
-
-    def reverse(self, axis: int, now_ns: int, *, in_tumble: bool) -> bool:
-        """Change the sign of a coil, and return whether it was changed.
-
-        The sign is not changed if it has changed too often in the last ten minutes.
-        """
-        recent = [time_ns for time_ns in self._changes[axis] if now_ns - time_ns < _LONGEST_REST_NS]
-        self._changes[axis] = recent
-        if len(recent) >= _MOST_CHANGES:
-            return False
-        recent.append(now_ns)
-        self._multiply(axis, -1.0)
-        if in_tumble:
-            self._unreviewed.add(axis)
-        else:
-            self._unreviewed.discard(axis)
-        return True
-
-    def weigh(self, axis: int, gain: float, sigma: float = 0.0) -> bool:
-        """Multiply the gain of a coil by `gain` +- `sigma`, to at most 1, and return whether it changed."""
-        size = abs(float(self.factors[axis]))
-        factor = min(gain, 1.0 / size)
-        if factor == 1.0:
-            return False
-        self._multiply(axis, factor)
-        self.deviations = self.deviations.copy()
-        self.deviations[axis] = sigma / gain
-        return True
-
-    def restore(self, factors: FloatArray, deviations: FloatArray) -> str:
-        """Start from the factors (3,) of an earlier boot; return why they were rejected, or "".
-
-        Args:
-            factors: signs and gains of the coils.
-            deviations: relative standard deviations of the gains.
-        """
-        sizes = np.abs(factors)
-        if factors.shape != (3,) or not ((sizes >= LEAST_GAIN) & (sizes <= 1.0)).all():
-            return f"{factors.tolist()}: not three factors from {LEAST_GAIN:g} to 1 or with the opposite sign"
-        self.factors, self.deviations = factors.copy(), deviations.copy()
-        return ""
-
-    def confirm(self, axis: int) -> None:
-        """End the review of a coil, because the motion of the slow body shows its torque."""
-        self._unreviewed.discard(axis)
-
-    def text(self, axis: int) -> str:
-        """Return the factor of a coil as text."""
-        return f"flown with {self.factors[axis]:+.2f} of its described dipole"
-
-    def _multiply(self, axis: int, factor: float) -> None:
-        self.factors = self.factors.copy()
-        self.factors[axis] *= factor
 
 
 class CoilMonitor:
@@ -515,6 +431,8 @@ class CoilMonitor:
         self._weak = ""  # text about a coil without the expected torque
         self._weak_ns = -_AGAIN_NS  # time (ns) of the last probes for missing torque
         self._prime: int | None = None  # axis to probe first
+        # Fault that the motion contradicts, while another coil is probed for comparison.
+        self._compared: tuple[int, CoilFault] | None = None
         self._verdicts: dict[int, CoilVerdict] = {}
         self.correction = CoilCorrection()
         self._news: list[str] = []  # texts of the changes of the correction
@@ -706,7 +624,7 @@ class CoilMonitor:
     def _end_rests(self, now_ns: int, speed: float) -> None:
         """Use the axes at zero current again, if the body is slow or after a long time."""
         oldest_ns = min(since_ns for since_ns, _ in self._rests.values())
-        if speed <= self.tumble_rate or now_ns - oldest_ns > _LONGEST_REST_NS:
+        if speed <= self.tumble_rate or now_ns - oldest_ns > LONGEST_REST_NS:
             self._rests.clear()
             for response in self._responses:
                 response.reset()
@@ -836,6 +754,10 @@ class CoilMonitor:
             return
         axes = {axis for axis, _ in left}
         waited = now_ns >= self._judge_ns
+        if self._compared is not None:
+            if waited:
+                self._conclude(*self._compared, now_ns)
+            return
         # The only axis left may be healthy, if the fault has ended or only the motion raised the suspicion.
         certain = len(axes) == 1 and evidence.rejects_healthy_now(self._known)
         if certain and (len(left) == 1 or waited):
@@ -851,6 +773,8 @@ class CoilMonitor:
             return
         works = self._evidence.shows_working_monitor(self._known)
         if not works and self._is_contradicted(axis, fault):
+            if self._begin_comparison(axis, fault, now_ns):
+                return
             why = f"{self._strangeness}; yet the motion shows no change of coil {AXES[axis]}"
             self._witness.doubt_monitor(why, now_ns)
         else:
@@ -859,6 +783,20 @@ class CoilMonitor:
                 self._proof.add(axis)
                 self._fresh = 0
         self._reset()
+
+    def _begin_comparison(self, axis: int, fault: CoilFault, now_ns: int) -> bool:
+        """Probe another coil, and return whether the probe began.
+
+        If the current monitor measures the current of the other coil, the monitor works, and its reading of
+        the suspected coil is believed.
+        """
+        ends_ns = self._probe.begin(set(range(3)) - {axis} - self._known.keys(), now_ns)
+        if ends_ns is None or self._compared is not None:
+            return False
+        self._compared = axis, fault
+        self._evidence.begin_segment()
+        self._judge_ns = ends_ns + _READING_NS
+        return True
 
     def _is_contradicted(self, axis: int, fault: CoilFault) -> bool:
         if self._suspected_ns is None:
@@ -889,5 +827,5 @@ class CoilMonitor:
         self._suspected_ns = None
         self._evidence.clear()
         self._probe.stop()
-        self._prime = None
+        self._prime = self._compared = None
         self._strangeness = ""

@@ -1,9 +1,4 @@
-"""Responses of the coils to commands: supply current and angular acceleration, with and without faults.
-
-For each hypothesis, which is that all coils are healthy or that one axis has one fault, the supply current is
-predicted from the commands. Each H-bridge has two inputs, A and B. The input A is pulsed for positive
-currents, the input B for negative currents. If an output leg is stuck high, it drives its coil continuously,
-except while the other input is pulsed.
+"""Responses of the coils to commands, as the body's motion and the supply current show them.
 
 The class `CoilResponse` estimates the torque gain of each coil from the body's angular acceleration over some
 seconds. The measured rate and the commanded rate change, which is the integral of J^-1 (m x B), are averaged
@@ -39,11 +34,11 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
+from flight.loop.coil_currents import ELECTRICAL, NEWEST, Bounds, CoilFault, Predicted, Supplied, fits
 from hal.interfaces.devices import NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import FloatArray, cross_matrices
 from knightcube.gnc.estimation.rigid_body import (
@@ -52,189 +47,6 @@ from knightcube.gnc.estimation.rigid_body import (
     gyroscopic_coefficients,
     rate_products,
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Supplied:
-    """An ADC sample during which the braking did not change, with the current that healthy coils would draw.
-
-    Attributes:
-        current: measured supply current, A.
-        least, most: bounds (A) of the total current that healthy coils would draw.
-        spread: range (A) of the total commanded current within the time window of the sample.
-        at_rest: indices of the axes that were not driven and have no known fault.
-        driven: whether any axis was driven during the sample.
-    """
-
-    current: float
-    least: float
-    most: float
-    at_rest: Sequence[int]
-    driven: bool
-    spread: float = 0.0
-
-
-class CoilFault(Enum):
-    """A fault of a coil axis; the values are the texts in the flight log."""
-
-    OPEN = "open: no current when driven"
-    SHORTED = "shorted: too much current when driven"
-    A_LOW = "input A's leg stuck low: no current in the positive direction"
-    B_LOW = "input B's leg stuck low: no current in the negative direction"
-    A_HIGH = "input A's leg stuck high: current at zero command"
-    B_HIGH = "input B's leg stuck high: current at zero command"
-    HIGH = "a leg stuck high: current at zero command, gone while its bridge is braked"
-    UNCERTAIN = "broken in one of several ways"
-
-
-ELECTRICAL = (
-    CoilFault.OPEN,
-    CoilFault.SHORTED,
-    CoilFault.A_LOW,
-    CoilFault.B_LOW,
-    CoilFault.A_HIGH,
-    CoilFault.B_HIGH,
-)
-_VARIANTS: tuple[CoilFault | None, ...] = (None, *ELECTRICAL)
-PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
-"""Index of each fault variant in a prediction, where the variant None is a healthy bridge."""
-_SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)[:, None]
-_SHORTED_SLACK = 0.04
-_OUTLIERS = 0.15
-"""Fraction of the readings that a hypothesis may leave unexplained, because the fault began within them."""
-
-
-@dataclass(frozen=True, slots=True)
-class Bounds:
-    """Error bounds of a predicted supply current.
-
-    Attributes:
-        full_current: current (A) of each coil when it is fully on.
-        uncertainty: error bound (A) of the current of each driven coil.
-        gain: relative error bound that is common to all readings.
-        noise: error bound (A) of the current monitor.
-    """
-
-    full_current: tuple[float, float, float]
-    uncertainty: float
-    gain: float
-    noise: float
-
-
-@dataclass(frozen=True, slots=True)
-class Sampling:
-    """Error bounds of a reading of a chopped current that changes within the reading's time window.
-
-    Attributes:
-        scatter: error due to chopping, as a fraction of the bridge's current or, if smaller, of the
-            difference from the full current. A bridge that is fully on is not chopped.
-        range_share: error of the mean, as a fraction of the current's range within the time window.
-    """
-
-    scatter: float
-    range_share: float
-
-
-NEWEST = Sampling(0.2, 1.0)
-"""Error bounds of one ADC sample at an unknown time in its window: 18 % by chopping (`hal.drivers.ina219`).
-"""
-MEAN = Sampling(0.02, 0.25)
-"""Error bounds of the mean of five ADC samples.
-
-An error of 7 % that is common to all readings is included in the gain error.
-"""
-
-
-@dataclass(frozen=True, slots=True)
-class Predicted:
-    """A reading (A) of the supply current, and the current (3, v), A, predicted for each axis and variant.
-
-    The prediction consists of the mean over the time window (`mean`), its error bound without chopping
-    (`slack`) and the error bound due to chopping (`chopped`). A reading that is `clipped` is a lower bound of
-    the current.
-    """
-
-    current: float
-    mean: FloatArray
-    slack: FloatArray
-    chopped: FloatArray
-    clipped: bool = False
-
-
-def predict(
-    current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling, clipped: bool = False
-) -> Predicted:
-    """Predict the current of each variant for the commands (k, 3), A, in the time window of a reading."""
-    full = np.array(bounds.full_current)[:, None]
-    drawn = supply_currents(commands.T, full)
-    count = len(commands)
-    chopped = sampling.scatter * np.minimum(drawn, full[:, None] - drawn).clip(0.0).sum(axis=2) / count
-    slack = bounds.uncertainty * ((drawn != 0.0).sum(axis=2) / count)
-    slack += sampling.range_share * (drawn.max(axis=2) - drawn.min(axis=2))
-    return Predicted(current, drawn.sum(axis=2) / count, slack, chopped, clipped)
-
-
-def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
-    """Return the supply currents (n, v, k), A, of n bridges in v variants for the commands (n, k), A.
-
-    The current of each coil that is fully on is `full` (n, 1), A. Shorts are not
-    modelled: the result for a shorted coil is the current of a healthy coil.
-    """
-    forward, backward = np.maximum(commands, 0.0), np.maximum(-commands, 0.0)
-    drawn = np.empty((len(commands), len(_VARIANTS), commands.shape[1]))
-    drawn[:, PLACE[None]] = drawn[:, PLACE[CoilFault.SHORTED]] = forward + backward
-    drawn[:, PLACE[CoilFault.OPEN]] = 0.0
-    drawn[:, PLACE[CoilFault.A_LOW]] = backward
-    drawn[:, PLACE[CoilFault.B_LOW]] = forward
-    drawn[:, PLACE[CoilFault.A_HIGH]] = np.maximum(full - backward, 0.0)
-    drawn[:, PLACE[CoilFault.B_HIGH]] = np.maximum(full - forward, 0.0)
-    return drawn
-
-
-def fits(
-    evidence: Sequence[Predicted],
-    bounds: Bounds,
-    known: Mapping[int, CoilFault],
-    axis: int | None = None,
-    fault: CoilFault | None = None,
-) -> bool:
-    """Return whether `fault` on `axis`, together with the known faults, explains nearly all readings."""
-    variants: list[CoilFault | None] = [known.get(number) for number in range(3)]
-    if axis is not None:
-        variants[axis] = fault
-    current = np.array([one.current for one in evidence])
-    means, slacks = np.array([one.mean for one in evidence]), np.array([one.slack for one in evidence])
-    chops = np.array([one.chopped for one in evidence])
-    mean, own, chopped, own_chopped = np.zeros((4, len(evidence)))
-    slack: FloatArray = np.full(len(evidence), bounds.noise)
-    free = 0.0  # largest current (A) that axes in an unknown state may add
-    for number, variant in enumerate(variants):
-        if variant is CoilFault.UNCERTAIN or (variant is CoilFault.SHORTED and number != axis):
-            free += bounds.full_current[number]
-            continue
-        place = PLACE.get(variant, 0)
-        slack += slacks[:, number, place]
-        if variant is CoilFault.SHORTED:
-            own, own_chopped = means[:, number, place], chops[:, number, place]
-        else:
-            mean += means[:, number, place]
-            chopped += chops[:, number, place]
-    scales = _scales(bounds.gain)
-    explained, spare = scales * mean, slack + scales * chopped
-    if own.any():
-        explained = explained + _SHORTED_FACTORS * own
-        spare = spare + _SHORTED_FACTORS * (own_chopped + _SHORTED_SLACK * own)
-    clipped = np.array([one.clipped for one in evidence])
-    inside = (clipped | (current >= explained - spare)) & (current <= explained + spare + free)
-    misses = len(evidence) - int(inside.sum(axis=2).max())
-    return misses <= _OUTLIERS * len(evidence)
-
-
-@cache
-def _scales(gain: float) -> FloatArray:
-    """Return nine factors (9, 1, 1) that cover the range of the gain error."""
-    return np.linspace(1.0 - gain, 1.0 + gain, 9)[:, None, None]
-
 
 _SAMPLES_NS = 25_000_000
 _NOTED_LATE_NS = 25_000_000
@@ -378,6 +190,9 @@ _STRONG_GAIN = 1.25
 """Lower limit of the gain of a coil that is stronger than assumed."""
 LEAST_GAIN, _EXACT = 0.1, 0.1
 """Smallest gain of a weak coil that is worth using, and largest standard deviation of a gain to be used."""
+_STEADY = 2.0
+"""Largest difference between the gain of the newest half of the bins and that of all bins, in standard
+deviations of the former."""
 _CLEARLY, _CERTAINLY, _WORSE = 9.0, 20.0, 25.0
 """Thresholds for the differences of weighted sums of squares between hypotheses. A fault of one coil must
 explain the motion better than a fault of another coil by the first threshold, and a reversed coil better than
@@ -587,12 +402,16 @@ class CoilResponse:
         while count >= self._settings.least_bins:
             fits.append(self._solved(list(self._rows)[-count:], span))
             count //= 2
+        # The gain of a coil that has just failed differs between the whole window and its newest half.
+        newest = fits[min(1, len(fits) - 1)]
+        steady = np.abs(newest.gain - whole.gain) < _STEADY * newest.sigma
         for axis in range(3):
             shown = [fit for fit in fits if fit.possible and fit.is_reversed[axis]]
             shown = [fit for fit in shown if fit.gain[axis] < self._settings.highest_reversed]
             if shown:
                 self.gain[axis], self.sigma[axis] = shown[0].gain[axis], shown[0].sigma[axis]
-            self._count(axis, whole.possible, alone=bool(whole.alone[axis]), is_reversed=bool(shown))
+            alone, is_steady = bool(whole.alone[axis]), bool(steady[axis])
+            self._count(axis, whole.possible, alone=alone, is_reversed=bool(shown), is_steady=is_steady)
 
     def _solved(self, rows: Sequence[FloatArray], span: float) -> MotionFit:
         """Fit all gains freely, and fit each gain with the other two coils assumed healthy.
@@ -642,7 +461,7 @@ class CoilResponse:
             tuple(is_reversed),
         )
 
-    def _count(self, axis: int, possible: bool, *, alone: bool, is_reversed: bool) -> None:
+    def _count(self, axis: int, possible: bool, *, alone: bool, is_reversed: bool, is_steady: bool) -> None:
         """Count the fits in a row that agree on an axis.
 
         Args:
@@ -651,13 +470,14 @@ class CoilResponse:
             alone: whether a fault of this axis explains the motion, clearly better than that of another axis.
             is_reversed: whether a reversed coil on this axis explains the motion clearly better than a fault
                 of another axis, and far better than healthy coils.
+            is_steady: whether the newest half of the bins shows the gain of all bins.
         """
         settings, gain, sigma = self._settings, float(self.gain[axis]), float(self.sigma[axis])
         judged = possible and abs(gain) <= float(self.largest[axis])
         sure = judged and sigma < settings.sure
         wrong = is_reversed
         weak = alone and gain + _SIGMAS * sigma < _WEAK_GAIN and gain < settings.highest_feeble
-        exact = judged and alone and sigma < _EXACT
+        exact = judged and alone and is_steady and sigma < _EXACT
         findings = {
             Finding.REVERSED: wrong,
             Finding.FEEBLE: wrong or (sure and weak),
@@ -749,6 +569,95 @@ class GainEquations(NamedTuple):
 
 
 _EACH = np.arange(3)
+
+
+LONGEST_REST_NS = 600_000_000_000
+"""Longest time (ns) for which a coil whose sign changes repeatedly is kept at zero current."""
+_MOST_CHANGES = 2
+"""Largest number of changes of a coil's sign within ten minutes."""
+
+
+class CoilCorrection:
+    """Sign and gain of each coil relative to its description, and the reviews that are due.
+
+    Attributes:
+        factors: dipole (3,) of each coil relative to the described dipole at the same current: 1 for a
+            healthy coil, -1 for a reversed coil.
+        deviations: relative standard deviations (3,) of the estimated gains; zero for coils without an
+            estimated gain.
+    """
+
+    def __init__(self) -> None:
+        self.factors: FloatArray = np.ones(3)
+        self.deviations: FloatArray = np.zeros(3)
+        self._changes: list[list[int]] = [[], [], []]  # times (ns) of the changes of sign
+        self._unreviewed: set[int] = set()
+
+    def effective(self, wire: FloatArray) -> FloatArray:
+        """Return the currents (3,), A, with which healthy coils would have the same dipole as the coils."""
+        return self.factors * wire
+
+    def wire(self, effective: FloatArray) -> FloatArray:
+        """Return the currents (3,), A, of the coils that cause the dipole of the effective currents (3,)."""
+        return effective / self.factors
+
+    @property
+    def unreviewed(self) -> frozenset[int]:
+        """The axes whose sign was changed in a tumble and has not been reviewed while the body is slow."""
+        return frozenset(self._unreviewed)
+
+    def reverse(self, axis: int, now_ns: int, *, in_tumble: bool) -> bool:
+        """Change the sign of a coil, and return whether it was changed.
+
+        The sign is not changed if it has changed too often in the last ten minutes.
+        """
+        recent = [time_ns for time_ns in self._changes[axis] if now_ns - time_ns < LONGEST_REST_NS]
+        self._changes[axis] = recent
+        if len(recent) >= _MOST_CHANGES:
+            return False
+        recent.append(now_ns)
+        self._multiply(axis, -1.0)
+        if in_tumble:
+            self._unreviewed.add(axis)
+        else:
+            self._unreviewed.discard(axis)
+        return True
+
+    def weigh(self, axis: int, gain: float, sigma: float = 0.0) -> bool:
+        """Multiply the gain of a coil by `gain` +- `sigma`, to at most 1, and return whether it changed."""
+        size = abs(float(self.factors[axis]))
+        factor = min(gain, 1.0 / size)
+        if factor == 1.0:
+            return False
+        self._multiply(axis, factor)
+        self.deviations = self.deviations.copy()
+        self.deviations[axis] = sigma / gain
+        return True
+
+    def restore(self, factors: FloatArray, deviations: FloatArray) -> str:
+        """Start from the factors (3,) of an earlier boot; return why they were rejected, or "".
+
+        Args:
+            factors: signs and gains of the coils.
+            deviations: relative standard deviations of the gains.
+        """
+        sizes = np.abs(factors)
+        if factors.shape != (3,) or not ((sizes >= LEAST_GAIN) & (sizes <= 1.0)).all():
+            return f"{factors.tolist()}: not three factors from {LEAST_GAIN:g} to 1 or with the opposite sign"
+        self.factors, self.deviations = factors.copy(), deviations.copy()
+        return ""
+
+    def confirm(self, axis: int) -> None:
+        """End the review of a coil, because the motion of the slow body shows its torque."""
+        self._unreviewed.discard(axis)
+
+    def text(self, axis: int) -> str:
+        """Return the factor of a coil as text."""
+        return f"flown with {self.factors[axis]:+.2f} of its described dipole"
+
+    def _multiply(self, axis: int, factor: float) -> None:
+        self.factors = self.factors.copy()
+        self.factors[axis] *= factor
 
 
 _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}

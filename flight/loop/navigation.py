@@ -17,7 +17,7 @@ from flight.link import events
 from flight.link.telemetry.definitions import FIX, IMU
 from flight.loop import facts
 from flight.loop.body import BodyEstimation
-from flight.loop.coil_monitor import CoilCorrection
+from flight.loop.coil_response import CoilCorrection
 from flight.loop.facts import Services
 from hal.interfaces.devices import (
     CoilState,

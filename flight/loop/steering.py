@@ -20,7 +20,8 @@ import numpy as np
 from flight.link import events
 from flight.loop import facts
 from flight.loop.body import CoilCommand, FlightBody, Steered, SteeringState, WindowedLaw
-from flight.loop.coil_monitor import CoilCorrection, CoilMonitor
+from flight.loop.coil_monitor import CoilMonitor
+from flight.loop.coil_response import CoilCorrection
 from flight.loop.facts import Services
 from flight.schema.sections import Modes
 from hal.interfaces.devices import NO_AXES, Axes, CoilState, ImuReading, PowerMonitor, TorqueCoils

@@ -8,20 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings, StuckLeg
-from flight.loop.coil_response import (
+from flight.loop.coil_currents import (
     MEAN,
     NEWEST,
     PLACE,
     Bounds,
     CoilFault,
-    Evidence,
     Predicted,
     Supplied,
     fits,
     predict,
     supply_currents,
 )
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings, StuckLeg
+from flight.loop.coil_response import Evidence
 from hal.interfaces.devices import NO_AXES, ImuReading, PowerReading
 from knightcube.astro.arrays import FloatArray
 from tests.sim_hal.faults.coil_bench import hold, observe
@@ -392,6 +392,34 @@ def test_the_motion_overrules_the_current_monitor_unless_a_probe_shows_that_the_
     watch._evidence.add([_alone(1, 0.04 if probed else 0.0)])
     watch._evidence.begin_segment()
     watch._evidence.add([_alone(0, 0.0)])
-    watch._conclude(0, CoilFault.OPEN, 0)
+    for _ in range(1 if probed else 2):  # the second time, another coil has been probed as well
+        watch._conclude(0, CoilFault.OPEN, 0)
     assert bool(watch.verdicts) is probed
     assert bool(watch.monitor_doubted) is not probed
+
+
+@pytest.mark.parametrize("works", [False, True])
+def test_a_verdict_that_the_motion_contradicts_waits_for_the_probe_of_a_healthy_coil(
+    works: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first coil that is probed alone is the open one, so that no reading has shown a working monitor."""
+    watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
+    monkeypatch.setattr(watch._witness, "contradicts", lambda *_: True)
+    gains, fails = np.array([0.0, 1.0, 1.0]), False
+    probed: list[int] = []
+    drawn: list[float] = []
+    for cycle in range(40 * 16):
+        now_ns, time = cycle * 25_000_000, cycle / 40
+        wanted = np.full(3, 0.1) if watch.probe is None else watch.probe
+        probed += [int(np.argmax(np.abs(wanted)))] * int(np.count_nonzero(wanted) == 1)
+        watch.commanded(now_ns, np.where(watch.available, wanted, 0.0))
+        # A monitor that fails during the probe of coil x measures nothing from then on.
+        fails = not works and (fails or np.count_nonzero(wanted) == 1)
+        drawn.append(float(np.abs(wanted) @ (np.ones(3) if time < 4.0 else gains)) * (not fails))
+        if cycle % 8 == 0:
+            watch.measured(replace(reading(time, drawn[-1]), current=float(np.mean(drawn[-44:]))))
+        if watch.verdicts or watch.monitor_doubted:
+            break
+    assert list(dict.fromkeys(probed)) == [0, 1], "the suspected coil is probed, and then another coil"
+    assert [verdict.axis for verdict in watch.verdicts] == ([0] if works else [])
+    assert bool(watch.monitor_doubted) is not works

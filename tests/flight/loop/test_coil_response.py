@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from flight.loop.coil_monitor import CoilCorrection, CoilMonitor, CoilMonitorSettings
+from flight.loop.coil_currents import CoilFault
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import (
-    CoilFault,
+    CoilCorrection,
     CoilResponse,
     Finding,
     MotionFit,
@@ -186,7 +188,7 @@ def test_a_coil_stronger_than_possible_is_neither_sound_nor_strong(gain: float, 
     response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
     response.gain, response.sigma = np.array([gain, 1.0, 1.0]), np.full(3, 0.01)
     for _ in range(3):
-        response._count(0, True, alone=True, is_reversed=False)
+        response._count(0, True, alone=True, is_reversed=False, is_steady=True)
     assert response.axes(Finding.SOUND) == response.axes(Finding.STRONG) == found
 
 
@@ -254,6 +256,25 @@ def test_a_weak_coil_is_used_with_its_gain(axis: int) -> None:
     body.fly(60.0)
     assert body.watch.correction.factors == pytest.approx(gains, abs=0.1)
     assert body.watch.suspicion == ""
+
+
+@pytest.mark.parametrize(("newest", "found"), [(0.5, [1]), (0.3, []), (0.8, [])])
+def test_a_gain_that_changed_within_the_bins_is_not_used(
+    newest: float, found: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The mean over a coil's fault is the gain of neither state."""
+    response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
+    alone, never = (False, True, False), (False, False, False)
+    fits = {
+        bins: MotionFit(np.array([1.0, gain, 1.0]), np.full(3, sigma), np.zeros(0), True, alone, never)
+        for bins, gain, sigma in ((16, 0.45, 0.05), (8, newest, 0.07))
+    }
+    response._rows = deque([np.zeros((3, 6))] * 16)
+    response._speeds.append(0.1)
+    monkeypatch.setattr(response, "_solved", lambda rows, _: fits[len(rows)])
+    for _ in range(3):
+        response._fit(0.2)
+    assert response.axes(Finding.WEAK) == found
 
 
 def test_a_coil_assumed_too_weak_gets_its_gain_back() -> None:

@@ -8,8 +8,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flight.loop.coil_monitor import CoilCorrection, CoilMonitor, CoilMonitorSettings
-from flight.loop.coil_response import CoilFault
+from flight.loop.coil_currents import CoilFault
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
+from flight.loop.coil_response import CoilCorrection
 from flight.loop.facts import EventLog, Facts, Services
 from flight.loop.steering import CoilDrive, CoilDriveSettings
 from flight.schema.sections import Modes
