@@ -211,7 +211,9 @@ def _add_command(layout: Layout, types: Element, listed: Element) -> Element:
     packet = layout.packet
     command = SubElement(listed, "MetaCommand", {"name": packet.name})
     _describe(command, packet.meaning)
-    arguments = SubElement(command, "ArgumentList")
+    arguments = Element("ArgumentList")
+    if packet.fields:  # XTCE has no empty argument list
+        command.append(arguments)
     container = SubElement(command, "CommandContainer", {"name": f"{packet.name}_packet"})
     entries = SubElement(container, "EntryList")
     header = layout.identifier << 32 | 0xC000 << 16 | layout.length - HEADER_BYTES - 1
@@ -246,7 +248,8 @@ def _add_verifiers(command: Element, layout: Layout) -> None:
             _add_condition(either, "verification_stage", dict(STAGES)[stage])
         window_of = {"timeToStopChecking": window, "timeWindowIsRelativeTo": "commandRelease"}
         SubElement(verifier, "CheckWindow", window_of)
-        SubElement(verifier, "ReturnParmRef", {"parameterRef": "verification_text"})
+        if kind in {"Complete", "Failed"}:  # XTCE allows a returned parameter for these verifiers only
+            SubElement(verifier, "ReturnParmRef", {"parameterRef": "verification_text"})
 
 
 def _add_condition(parent: Element, name: str, value: int | str) -> None:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from xml.etree.ElementTree import Element, fromstring
 
 import pytest
+import space_packet_parser
+from lxml import etree
 
 from flight.bodies.orbit.body import LEVELS
 from flight.link.commands import COMMANDS
@@ -40,6 +44,33 @@ def found(root: Element, path: str) -> Element:
     element = root.find(path, SPACE)
     assert element is not None, path
     return element
+
+
+XML_SCHEMA = (
+    '<schema xmlns="http://www.w3.org/2001/XMLSchema" targetNamespace="http://www.w3.org/XML/1998/namespace">'
+    '<attribute name="base" type="anyURI"/></schema>'
+)
+"""The only declaration that XTCE needs of the schema `xml.xsd`, whose original is on a web server."""
+
+
+@pytest.fixture(scope="module")
+def schema(tmp_path_factory: pytest.TempPathFactory) -> etree.XMLSchema:
+    """Return the OMG's schema of XTCE 1.2, a copy of which comes with space-packet-parser."""
+    original = Path(space_packet_parser.__file__).parent / "xtce" / "schemas" / "SpaceSystem.xsd"
+    folder = tmp_path_factory.mktemp("schema")
+    (folder / "xml.xsd").write_text(XML_SCHEMA, encoding="utf-8")
+    local = re.sub(r'schemaLocation="[^"]*/xml.xsd"', 'schemaLocation="xml.xsd"', original.read_text("utf-8"))
+    (folder / "SpaceSystem.xsd").write_text(local, encoding="utf-8")
+    return etree.XMLSchema(etree.parse(str(folder / "SpaceSystem.xsd")))
+
+
+@pytest.mark.parametrize("verified", [False, True])
+def test_the_document_is_valid_by_the_schema_of_the_omg(schema: etree.XMLSchema, verified: bool) -> None:
+    root = etree.fromstring(document(verified=verified).encode())
+    assert schema.validate(root), str(schema.error_log)
+    argument = next(root.iter("{*}Argument"))
+    argument.attrib.pop("argumentTypeRef")
+    assert not schema.validate(root), "the schema notices a missing attribute"
 
 
 def test_a_field_with_states_appears_everywhere_from_its_row_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from fastcrc import crc32
 
 from flight.link.files.store import Ending, FileError, Incoming, Outgoing, Store, problem_of_name
 from flight.link.files.units import (
@@ -45,8 +46,8 @@ from flight.link.files.units import (
     unpack,
 )
 
-MODULAR, CRC32, NO_CHECKSUM = 0, 3, 15
-TYPES = (MODULAR, CRC32, NO_CHECKSUM)
+MODULAR, CRC32C, CRC32, NO_CHECKSUM = 0, 2, 3, 15
+TYPES = (MODULAR, CRC32C, CRC32, NO_CHECKSUM)
 """Supported checksum types (SANA registry of CFDP checksum identifiers)."""
 _PORTION = 1 << 20
 
@@ -83,6 +84,8 @@ def add(kind: int, value: int, data: bytes) -> int:
     """
     if kind == CRC32:
         return zlib.crc32(data, value)
+    if kind == CRC32C:
+        return crc32.iscsi(data, value)
     words = np.frombuffer(data + bytes(-len(data) % 4), dtype=">u4")
     return (value + int(words.sum(dtype=np.uint64))) % (1 << 32)
 

@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 
 from flight.link.files.store import FileError, Store, problem_of_name
-from flight.link.files.transfer import CRC32, GROUND, MODULAR, MOST_OPEN, NO_CHECKSUM, SATELLITE, Ranges, add
+from flight.link.files.transfer import (
+    CRC32,
+    CRC32C,
+    GROUND,
+    MODULAR,
+    MOST_OPEN,
+    NO_CHECKSUM,
+    SATELLITE,
+    Ranges,
+    add,
+)
 from flight.link.files.units import (
     MOST_REQUESTS,
     Eof,
@@ -34,7 +44,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", [MODULAR, CRC32, NO_CHECKSUM])
+@pytest.mark.parametrize("kind", [MODULAR, CRC32C, CRC32, NO_CHECKSUM])
 @pytest.mark.parametrize("source", [SATELLITE, GROUND])
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.3])
 def test_a_file_comes_whole_and_is_closed_at_both_ends(

@@ -32,7 +32,7 @@ from spacepackets.cfdp.pdu import (  # type: ignore[import-untyped]
 from spacepackets.cfdp.pdu.file_data import FileDataParams  # type: ignore[import-untyped]
 from spacepackets.util import ByteFieldU16, ByteFieldU32  # type: ignore[import-untyped]
 
-from flight.link.files.transfer import CRC32, MODULAR, FileSum
+from flight.link.files.transfer import CRC32, CRC32C, MODULAR, FileSum, add
 from flight.link.files.units import (
     MOST_REQUESTS,
     SEGMENT_BYTES,
@@ -174,7 +174,7 @@ def test_the_longest_units_fit_into_a_telecommand_frame() -> None:
 
 @pytest.mark.parametrize("size", [0, 1, 7, (1 << 20) + 3])
 def test_checksums_are_those_of_the_standard(tmp_path: Path, size: int) -> None:
-    """Sum up words by hand, CCSDS 727.0-B-5 4.2.5; CRC-32 of "123456789" is the published check value."""
+    """Sum up words by hand, CCSDS 727.0-B-5 4.2.5; the CRCs of "123456789" are published."""
     data = bytes(i * 37 % 256 for i in range(size))
     path = tmp_path / "file"
     path.write_bytes(data)
@@ -183,6 +183,9 @@ def test_checksums_are_those_of_the_standard(tmp_path: Path, size: int) -> None:
     assert summed(path, MODULAR, size) == sum(words) % 2**32
     path.write_bytes(b"123456789")
     assert summed(path, CRC32, 9) == 0xCBF43926
+    assert summed(path, CRC32C, 9) == 0xE3069283
+    halves = add(CRC32C, add(CRC32C, 0, b"1234"), b"56789")
+    assert halves == 0xE3069283
 
 
 def summed(path: Path, kind: int, size: int) -> int:
