@@ -1,4 +1,4 @@
-"""Command `flight elements`, which makes two-line elements of an orbit or fits them to positions."""
+"""Command `flight elements`, which makes or reads two-line elements, or fits them to positions."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ from ground.commands.satellite_questions import check_values, read_value
 from ground.telemetry import read_run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.mean_elements import FittedElements, fit_elements
+from knightcube.astro.earth.omm import read_elements
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from knightcube.errors import UsageError
@@ -31,6 +33,8 @@ from sim_hal.worlds.orbit import elements, julian_date, propagate
 
 _SPAN, _STEP = 86_400.0, 600.0
 """Span and interval (s) of the positions to which the elements of an orbit are fitted."""
+_LISTED = 5
+"""Maximum number of satellites that a message lists."""
 _ECCENTRICITY = OrbitSection().eccentricity
 """Default eccentricity of an orbit."""
 _COLUMNS, _VELOCITY = ("utc", "x", "y", "z"), ("vx", "vy", "vz")
@@ -42,7 +46,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flight elements` to the parser."""
     parser.description = textwrap.fill(
         "Make two-line elements for the section `elements` of a satellite's configuration: of an orbit that "
-        "is given by its altitude, of the simulated orbit of a configuration, or by a fit to positions. "
+        "is given by its altitude, of the simulated orbit of a configuration, or by a fit to "
+        "positions, or read them from a file of CelesTrak or Space-Track. "
         "Prints the elements, the distances of the positions from them, and the standard deviation of the "
         "error along the track that builds up in a day according to these distances. Positions far outside "
         "are rejected. The elements of an orbit are fitted to one day of it with the oblateness J2, without "
@@ -52,7 +57,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         f"  {PROGRAM} elements --altitude 500 --inclination 97.4 --epoch 2026-03-20T12:00:00\n"
         f"  {PROGRAM} elements --config my_satellite.yaml\n"
-        f"  {PROGRAM} elements --fixes runs/mine"
+        f"  {PROGRAM} elements --fixes runs/mine\n"
+        f"  {PROGRAM} elements --read gp.json --satellite 25544"
     )
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     source = parser.add_mutually_exclusive_group(required=True)
@@ -68,6 +74,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="CSV file of GPS fixes with the columns utc (ISO 8601), x, y, z (m, ITRS) and, if known, vx, "
         "vy, vz (m/s relative to the ground, ITRS), or the folder of a run, whose logged fixes are fitted",
+    )
+    source.add_argument(
+        "--read",
+        type=Path,
+        metavar="FILE",
+        help="file of two-line elements, or of OMM in JSON, XML, KVN or CSV, as CelesTrak and Space-Track "
+        "publish them; the elements are checked",
+    )
+    parser.add_argument(
+        "--satellite", type=int, metavar="NUMBER", help="with --read: satellite number, if there are several"
     )
     orbit = parser.add_argument_group("with --altitude")
     orbit.add_argument("--inclination", type=finite, metavar="DEG", help="required")
@@ -90,6 +106,10 @@ def run(options: argparse.Namespace) -> int:
         given = [name for name in _ORBIT if getattr(options, name) is not None]
         if given:
             raise UsageError(f"--{given[0].replace('_', '-')}: goes with --altitude")
+    if options.read is not None:
+        return _print_read(options)
+    if options.satellite is not None:
+        raise UsageError("--satellite: goes with --read")
     velocities = None
     if options.fixes is not None:
         fixes = read_fixes(options.fixes)
@@ -100,6 +120,31 @@ def run(options: argparse.Namespace) -> int:
         dates, positions = _positions(*_given_orbit(options))
     made = fit_elements(dates, positions, velocities)
     sys.stdout.write(json.dumps(_facts(made, dates)) + "\n" if options.json else _text(made, dates))
+    return 0
+
+
+def _print_read(options: argparse.Namespace) -> int:
+    """Print the elements of one satellite in a file. Raises UsageError."""
+    path: Path = options.read
+    try:
+        found = read_elements(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: cannot be read: {error}") from error
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from error
+    chosen = [each for each in found if options.satellite in {None, each.number}]
+    if len({each.number for each in chosen}) != 1:
+        numbers = ", ".join(f"{each.number} {each.name}".strip() for each in found[:_LISTED])
+        cure = f"give one of them by --satellite: {numbers}{', ...' if len(found) > _LISTED else ''}"
+        raise UsageError(f"{path}: {len(chosen)} of {len(found)} element sets match: {cure}")
+    # The element set with the newest epoch counts, if a file holds several of one satellite.
+    newest = max(chosen, key=lambda each: TwoLineElements(*each.lines).epoch)
+    facts = {"elements": list(newest.lines), "name": newest.name, "number": newest.number}
+    name = f"{newest.number} {newest.name}".strip()
+    text = f"elements:  # [read from {path.name}: {name}]\n" + "".join(
+        f"  - '{line}'\n" for line in newest.lines
+    )
+    sys.stdout.write(json.dumps(facts) + "\n" if options.json else text)
     return 0
 
 

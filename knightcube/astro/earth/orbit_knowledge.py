@@ -8,10 +8,12 @@ of at most 30 s. Two-line elements are propagated by SGP4 (Vallado, Crawford, Hu
 from __future__ import annotations
 
 import math
+import re
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from sgp4.api import SGP4_ERRORS, Satrec
+from sgp4.api import SGP4_ERRORS, WGS72, Satrec
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
@@ -24,6 +26,12 @@ from knightcube.astro.earth.sun import DAY
 from knightcube.errors import FlightError, UsageError
 
 _LONGEST_STEP = 30.0
+_SGP4_EPOCH, _MINUTES_PER_DAY = 2_433_281.5, 1440.0
+"""Julian date from which SGP4 counts days, and number of its units of time in a day."""
+_DRAG_FRACTION, _LEAST_DRAG = 0.5, 2.5e-4
+"""Standard deviation of B*, as a fraction of B* and at least in 1/Earth radius, that of a small satellite."""
+_DRAG_TIME, _DECAYING = 0.25, 1e7
+"""Time (days) over which the effect of B* is computed, and effect (m per day squared) if the orbit decays."""
 
 
 class OrbitError(FlightError):
@@ -86,7 +94,7 @@ class GpsFix:
         numbers = np.array([self.julian_date, *self.position, *self.velocity])
         if numbers.shape != (7,) or not np.all(np.isfinite(numbers)):
             raise OrbitError(f"fix at {self.julian_date}: position and velocity must be (3,) and finite")
-        if np.linalg.norm(self.position) < 0.98 * EARTH_RADIUS:
+        if np.linalg.norm(self.position) < LOWEST_RADIUS:
             raise OrbitError(f"fix at {self.julian_date}: {self.position} m is within the Earth")
 
     def at(self, julian_date: float) -> OrbitState:
@@ -104,12 +112,17 @@ class GpsFix:
 
 
 class TwoLineElements:
-    """Two-line element set, whose assumed position error grows linearly with the time since its epoch."""
+    """Two-line element set, with a standard deviation that grows with the time since its epoch.
+
+    An error of the drag term B* shifts the satellite along its track by an amount that grows with the square
+    of the time. SGP4 computes the shift for the standard deviation of B*.
+    """
 
     def __init__(self, first: str, second: str, sigma: float = 1500.0, growth: float = 1500.0) -> None:
         """Read a two-line element set.
 
-        Raises UsageError for invalid lines and for elements that do not describe an orbit.
+        Raises UsageError with line and columns for invalid lines (`check_lines`), and for elements that do
+        not describe an orbit.
 
         Args:
             first: first line of the element set.
@@ -117,19 +130,20 @@ class TwoLineElements:
             sigma: standard deviation of the position per axis at the epoch of the elements, m.
             growth: growth of the standard deviation with the time from the epoch, m per day.
         """
-        for number, line in (("1", first), ("2", second)):
-            _check_line(number, line.rstrip())
-        self._satellite = Satrec.twoline2rv(first.rstrip(), second.rstrip())
-        if not 1.0 <= self._satellite.epochdays < 367.0:
-            # SGP4 steps through resonant orbits by half a day, which would take forever from an absurd epoch.
-            raise UsageError(f"{first.rstrip()!r}: the day of the year of its epoch must be from 1 to 366")
+        first, second = first.rstrip(), second.rstrip()
+        check_lines(first, second)
+        self._satellite = Satrec.twoline2rv(first, second)
         code, *state = self._satellite.sgp4_tsince(0.0)
         if code or not np.all(np.isfinite(state)):
-            reason = SGP4_ERRORS[code] if code else "a column holds no number"
-            raise UsageError(
-                f"{second.rstrip()!r}: these elements describe no orbit at their epoch: {reason}"
-            )
+            reason = SGP4_ERRORS[code] if code else "its position is not finite"
+            raise UsageError(f"{second!r}: these elements describe no orbit at their epoch: {reason}")
         self._sigma, self._growth = sigma, growth
+        self._drag_growth = _drag_growth(self._satellite)
+
+    @property
+    def epoch(self) -> float:
+        """Julian date UTC of the epoch of the elements."""
+        return float(self._satellite.jdsatepoch + self._satellite.jdsatepochF)
 
     def at(self, julian_date: float) -> OrbitState:
         """Return the orbit state at a Julian date UTC. Raises OrbitError if SGP4 fails."""
@@ -138,11 +152,38 @@ class TwoLineElements:
         if code:
             raise OrbitError(f"SGP4 at {julian_date}: {SGP4_ERRORS[code]}")
         to_icrs = mean_equator_to_celestial(julian_date)
-        age = abs(julian_date - self._satellite.jdsatepoch - self._satellite.jdsatepochF)
-        sigma = self._sigma + self._growth * age
+        age = abs(julian_date - self.epoch)
+        sigma = math.hypot(self._sigma + self._growth * age, self._drag_growth * age**2)
         return OrbitState(
             julian_date, 1e3 * (to_icrs @ np.array(position)), 1e3 * (to_icrs @ np.array(velocity)), sigma
         )
+
+
+def _drag_growth(satellite: Satrec) -> float:
+    """Return the standard deviation of the position along the track that drag causes, m per day squared."""
+    found = []
+    for drag in (0.0, max(_DRAG_FRACTION * abs(satellite.bstar), _LEAST_DRAG)):
+        made = Satrec()
+        made.sgp4init(
+            WGS72,
+            "i",
+            0,
+            satellite.jdsatepoch - _SGP4_EPOCH + satellite.jdsatepochF,
+            drag,
+            0.0,
+            0.0,
+            satellite.ecco,
+            satellite.argpo,
+            satellite.inclo,
+            satellite.mo,
+            satellite.no_kozai,
+            satellite.nodeo,
+        )
+        code, position, _ = made.sgp4_tsince(_DRAG_TIME * _MINUTES_PER_DAY)
+        found.append(np.array(position))
+        if code:
+            return _DECAYING
+    return 1e3 * float(np.linalg.norm(found[1] - found[0])) / _DRAG_TIME**2
 
 
 def propagated(state: FloatArray, duration: float) -> FloatArray:
@@ -172,14 +213,149 @@ def _flow(state: FloatArray) -> FloatArray:
     return np.concatenate([state[3:], scale * position])
 
 
-def _check_line(number: str, line: str) -> None:
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """Field of a line of a two-line element set.
+
+    Attributes:
+        first, last: numbers of the first and last column, counted from 1.
+        name: name of the quantity.
+        form: regular expression of the whole field.
+        example: example of a valid field.
+        low, high: bounds of the value, if the field holds a number.
+        unit: unit of the value, with a leading blank.
+    """
+
+    first: int
+    last: int
+    name: str
+    form: str
+    example: str
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+
+
+_RATE = r"[ +-]\d{5}[ +-]\d"
+ANGLES = {"inclination": 180.0, "right ascension of the node": 360.0, "argument of perigee": 360.0}
+"""Largest values (deg) of the angles of mean elements; their smallest value is 0."""
+FASTEST_MOTION, SLOWEST_MOTION, LARGEST_DRAG = 17.5, 0.01, 10.0
+"""Bounds of the mean motion (revolutions per day), and largest absolute value of B* (1/Earth radius)."""
+SGP4_TYPES = " 02"
+"""Ephemeris types of mean elements for SGP4; type 4, for example, belongs to SGP4-XP."""
+_LINES: tuple[tuple[_Field, ...], ...] = (
+    (
+        _Field(3, 7, "satellite number", r" *\d+|[A-HJ-NP-Z]\d{4}", "25544, or A0001 for 100001"),
+        _Field(8, 8, "classification", "[A-Z ]", "U"),
+        _Field(19, 20, "year of the epoch", r"\d\d", "26"),
+        _Field(21, 32, "day of the year of the epoch", r" *\d+\.\d+ *", "320.51782528"),
+        _Field(34, 43, "derivative of the mean motion", r"[ +\-0]\.\d{8}", " .00012182"),
+        _Field(45, 52, "second derivative of the mean motion", _RATE, " 00000-0"),
+        _Field(54, 61, "B*", _RATE, " 21606-3", -LARGEST_DRAG, LARGEST_DRAG, " per Earth radius"),
+        _Field(63, 63, "ephemeris type", r"[\d ]", "0"),
+        _Field(65, 68, "number of the element set", r" *\d*", " 292"),
+    ),
+    (
+        _Field(3, 7, "satellite number", r" *\d+|[A-HJ-NP-Z]\d{4}", "25544, or A0001 for 100001"),
+        *(
+            _Field(first, first + 7, name, r" *\d*\.\d{4}", " 51.6416", 0.0, high, " deg")
+            for first, (name, high) in zip((9, 18, 35), ANGLES.items(), strict=True)
+        ),
+        _Field(27, 33, "eccentricity without its point", r"\d{7}", "0006703"),
+        _Field(44, 51, "mean anomaly", r" *\d*\.\d{4}", "325.0288", 0.0, 360.0, " deg"),
+        _Field(
+            *(53, 63, "mean motion", r" *\d+\.\d{8}", "15.49125391"),
+            *(SLOWEST_MOTION, FASTEST_MOTION, " revolutions per day"),
+        ),
+        _Field(64, 68, "number of revolutions", r" *\d*", "56353"),
+    ),
+)
+_BLANKS = (2, 9, 18, 33, 44, 53, 62, 64), (2, 8, 17, 26, 34, 43, 52)
+"""Numbers of the columns of both lines that are blank."""
+
+
+def check_lines(first: str, second: str) -> None:
+    """Raise UsageError, with line and columns, unless both lines are a valid two-line element set for SGP4.
+
+    The fields stand in fixed columns, their values are in range, the checksums fit, and the satellite numbers
+    and the ephemeris type are those of one element set for SGP4. A satellite number may begin with a letter
+    (Alpha-5, in which A is 10 and the letters I and O are omitted).
+    """
+    for number, line in enumerate((first, second), 1):
+        _check_line(number, line)
+    if first[2:7] != second[2:7]:
+        raise UsageError(
+            f"{second!r}: line 2, columns 3 to 7: satellite number {second[2:7]}, but line 1 has "
+            f"{first[2:7]}: take both lines from one element set"
+        )
+    days = 366.0 if int(first[18:20]) % 4 == 0 else 365.0
+    if not 1.0 <= float(first[20:32]) < days + 1.0:
+        # SGP4 steps through resonant orbits by half a day, which would take forever from an absurd epoch.
+        raise UsageError(
+            f"{first!r}: line 1, columns 21 to 32: the day of the year of the epoch, {first[20:32].strip()}, "
+            f"must be from 1 to {days:g}"
+        )
+    if first[62] not in SGP4_TYPES:
+        raise UsageError(
+            f"{first!r}: line 1, column 63: ephemeris type {first[62]} must be 0: take elements for SGP4"
+        )
+    eccentricity, motion = float(f"0.{second[26:33]}"), float(second[52:63])
+    low = perigee_radius(motion, eccentricity)
+    if low < LOWEST_RADIUS:
+        raise UsageError(
+            f"{second!r}: line 2, columns 27 to 33 and 53 to 63: eccentricity {eccentricity:g} and mean "
+            f"motion {motion:g} give a perigee within the Earth, {1e-3 * low:.0f} km from its centre"
+        )
+
+
+LOWEST_RADIUS = 0.98 * EARTH_RADIUS
+"""Smallest radius (m) of a perigee or of a fix."""
+
+
+def perigee_radius(motion: float, eccentricity: float) -> float:
+    """Return the radius (m) of the perigee for a mean motion in revolutions per day."""
+    rate = 2.0 * math.pi * motion / DAY
+    return float(math.cbrt(GRAVITATIONAL_PARAMETER / rate**2) * (1.0 - eccentricity))
+
+
+def _check_line(number: int, line: str) -> None:
     """Raise UsageError unless `line` is valid as line `number` of a two-line element set."""
     if len(line) != 69 or not line.startswith(f"{number} "):
         raise UsageError(
-            f"{line!r}: line {number} of a two-line element set has 69 columns and starts with {number}"
+            f"{line!r}: line {number} of a two-line element set has 69 columns and starts with {number}, but "
+            f"this line has {len(line)} columns"
         )
     if not (line.isascii() and line.isprintable()):
-        raise UsageError(f"{line!r}: a two-line element set has printable ASCII characters only")
+        raise UsageError(
+            f"{line!r}: line {number} of a two-line element set has printable ASCII characters only"
+        )
+    for column in _BLANKS[number - 1]:
+        if line[column - 1] != " ":
+            raise UsageError(
+                f"{line!r}: line {number}, column {column}: must be blank, but is {line[column - 1]!r}: the "
+                "fields stand in fixed columns"
+            )
+    for field in _LINES[number - 1]:
+        _check_field(number, line, field)
     total = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
     if str(total) != line[68]:
-        raise UsageError(f"{line!r}: checksum {line[68]}, the sum of its columns gives {total}")
+        raise UsageError(
+            f"{line!r}: line {number}, column 69: checksum {line[68]}, the sum of its columns gives {total}"
+        )
+
+
+def _check_field(number: int, line: str, field: _Field) -> None:
+    """Raise UsageError unless a field has its form, and a value within its bounds."""
+    text = line[field.first - 1 : field.last]
+    columns = (
+        f"columns {field.first} to {field.last}" if field.last > field.first else f"column {field.first}"
+    )
+    place = f"{line!r}: line {number}, {columns}: {field.name} {text.strip()!r}"
+    valid = re.fullmatch(field.form, text)
+    packed = field.form == _RATE and valid
+    value = f"{text[0].strip()}.{text[1:6]}e{text[6:].strip()}" if packed else text
+    with suppress(ValueError):
+        if field.high < math.inf and not field.low <= float(value) <= field.high:
+            raise UsageError(f"{place} must be from {field.low:g} to {field.high:g}{field.unit}")
+    if valid is None:
+        raise UsageError(f"{place} must have the form {field.example!r}")

@@ -92,6 +92,8 @@ def test_elements_are_fitted_to_the_fixes_in_a_flight_log(tmp_path: Path) -> Non
         (("--config", "step_demo"), "this needs the configuration of a satellite in orbit"),
         (("--config", "orbit", "--anomaly", "3"), "--anomaly: goes with --altitude"),
         (("--fixes", "absent.csv"), "absent.csv: cannot be read"),
+        (("--read", "absent.json"), "absent.json: cannot be read"),
+        (("--config", "orbit_3u", "--satellite", "5"), "--satellite: goes with --read"),
     ],
 )
 def test_wrong_use_is_reported_in_one_line(words: tuple[str, ...], complaint: str) -> None:
@@ -115,6 +117,36 @@ def test_a_wrong_file_is_reported_with_its_line(tmp_path: Path, text: str, compl
     path.write_text(text, encoding="utf-8")
     done = command("elements", "--fixes", path)
     assert (done.returncode, complaint in done.stderr) == (2, True), done.stderr
+
+
+def test_an_omm_is_read_into_a_configuration(tmp_path: Path) -> None:
+    known = {
+        **{"OBJECT_NAME": "MINE", "OBJECT_ID": "2026-001A", "EPOCH": "2026-03-20T12:00:00.5", "BSTAR": 3e-4},
+        **{"MEAN_MOTION": 15.3, "ECCENTRICITY": 0.001, "INCLINATION": 97.464, "RA_OF_ASC_NODE": 337.4},
+        **{"ARG_OF_PERICENTER": 295.8, "MEAN_ANOMALY": 64.4, "NORAD_CAT_ID": 123_456},
+    }
+    path = tmp_path / "gp.json"
+    path.write_text(
+        json.dumps([known, known | {"NORAD_CAT_ID": 5, "OBJECT_NAME": "OTHER"}]), encoding="utf-8"
+    )
+    several = command("elements", "--read", path)
+    assert several.returncode == 2
+    assert (
+        "2 of 2 element sets match: give one of them by --satellite: 123456 MINE, 5 OTHER" in several.stderr
+    )
+    absent = command("elements", "--read", path, "--satellite", "7")
+    assert (absent.returncode, "0 of 2 element sets match" in absent.stderr) == (2, True)
+    made = command("elements", "--read", path, "--satellite", "123456")
+    assert (made.returncode, made.stderr) == (0, "")
+    assert made.stdout.startswith(
+        "elements:  # [read from gp.json: 123456 MINE]\n  - '1 C3456U 26001A   26079.5000"
+    )
+    facts = json.loads(command("elements", "--read", path, "--satellite", "123456", "--json").stdout)
+    assert all(f"  - '{line}'\n" in made.stdout for line in facts["elements"])
+    path.write_text(json.dumps(known | {"INCLINATION": 200}), encoding="utf-8")
+    wrong = command("elements", "--read", path)
+    assert "gp.json: OMM 1 (MINE): INCLINATION 200 must be from 0 to 180 deg" in wrong.stderr
+    assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1)
 
 
 def test_check_refuses_elements_that_do_not_fit_and_accepts_those_that_are_made(tmp_path: Path) -> None:

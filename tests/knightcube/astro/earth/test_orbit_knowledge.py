@@ -120,7 +120,7 @@ def test_an_epoch_on_no_day_of_the_year_is_refused(day: str) -> None:
     """In an orbit of half a day a place 1e12 days from the epoch is found in half days, and so never."""
     first = FIRST[:20] + day + FIRST[32:]
     high = SECOND[:26] + "7000000" + SECOND[33:52] + " 2.00000000" + SECOND[63:]
-    with pytest.raises(UsageError, match="day of the year of its epoch must be from 1 to 366"):
+    with pytest.raises(UsageError, match="day of the year of the epoch"):
         TwoLineElements(_summed(first), _summed(high))
 
 
