@@ -28,6 +28,8 @@ COMMANDS = {
         "write the configuration of a satellite of one's own",
         "new_satellite:configure",
     ),
+    "passes": ("plan", "predict the passes of a satellite over ground stations", "passes:configure_passes"),
+    "day": ("plan", "draw targets, passes and eclipses of a day", "passes:configure_day"),
     "elements": (
         "plan",
         "make two-line elements of an orbit, or fit them to positions",

@@ -7,7 +7,7 @@ import json
 import math
 import sys
 import time
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +17,7 @@ from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from flight.schema.document import config_path
 from flight.schema.orbit import OrbitConfig, as_orbit
-from ground.commands.options import finite, positive
+from ground.commands.options import finite, positive, utc
 from knightcube import plan_slew, plan_step
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply
@@ -198,7 +198,7 @@ def _add_orbit_options(parser: argparse.ArgumentParser) -> None:
         help="plan a slew of this satellite, a file or an installed name; --from and --to are then targets: "
         "nadir, velocity, sun, 'inertial QX QY QZ QW', 'ground LAT LON', each with 'roll DEG' or a free roll",
     )
-    group.add_argument("--at", metavar="UTC", help="start of the slew, such as 2026-03-01T12:00:00")
+    group.add_argument("--at", type=utc, metavar="UTC", help="start of the slew, such as 2026-03-01T12:00:00")
     group.add_argument("--within", type=positive, metavar="S", help="duration of the slew, s")
     group.add_argument(
         "--longest",
@@ -230,7 +230,7 @@ def _run_orbit(options: argparse.Namespace) -> int:
     if options.at is None or options.within is None:
         raise UsageError("--orbit needs --at UTC and --within S")
     config = as_orbit(configuration.load(options.orbit))
-    at = _utc(options.at)
+    at = options.at
     if config.elements is None:
         raise UsageError(f"{options.orbit}: `elements` is missing: the orbit is not known")
     begun = time.process_time()
@@ -317,15 +317,6 @@ def _target(option: str, text: str) -> PointingTarget:
         return PointingTarget(goal, tuple(numbers), roll)
     except (UsageError, argparse.ArgumentTypeError) as error:
         raise UsageError(f"{option} {text!r}: {error}") from error
-
-
-def _utc(text: str) -> datetime:
-    """Return the time in a text, in UTC unless the text has a time zone. Raises UsageError."""
-    try:
-        found = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise UsageError(f"--at {text!r}: give a time such as 2026-03-01T12:00:00") from error
-    return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
 
 
 def _orbit_facts(made: OrderedSlew, at: datetime, solved_s: float) -> dict[str, object]:

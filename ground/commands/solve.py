@@ -8,7 +8,6 @@ import math
 import sys
 import time
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from ground.commands.options import (
     finite,
     positive,
     read_picture,
+    utc,
     write_new,
 )
 from ground.pictures import draw_solution
@@ -70,7 +70,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
         "--date",
-        type=_date,
+        type=utc,
         metavar="UTC",
         help="time of the picture, such as 2026-11-21, for proper motion, aberration and planets",
     )
@@ -103,15 +103,6 @@ def _add_methods(parser: argparse.ArgumentParser) -> None:
         help="of points: psf fits the point spread (default), window is the centre of mass, the others weigh "
         "its pixels otherwise",
     )
-
-
-def _date(text: str) -> datetime:
-    """Return the time in an argument, in UTC unless the text has a time zone. Raises ArgumentTypeError."""
-    try:
-        instant = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r}: give a date such as 2026-11-21T20:15:00") from error
-    return instant.replace(tzinfo=UTC) if instant.tzinfo is None else instant
 
 
 def run(options: argparse.Namespace) -> int:

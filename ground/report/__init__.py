@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,11 +15,21 @@ from knightcube.errors import UsageError
 if TYPE_CHECKING:
     from ground.identification.fit import PlantFit
     from ground.identification.record import Record
+    from ground.passes import OrbitPrediction, Station
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
     from knightcube.gnc.guidance.one_axis.vmc import StepPlan
     from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder
 
-__all__ = ["draw", "draw_both", "draw_fit", "draw_path", "draw_slew", "format_report", "summarise"]
+__all__ = [
+    "draw",
+    "draw_both",
+    "draw_day",
+    "draw_fit",
+    "draw_path",
+    "draw_slew",
+    "format_report",
+    "summarise",
+]
 
 
 def draw(run: Run, folder: Path) -> list[Path]:
@@ -49,6 +59,17 @@ def draw_path(plan: StepPlan, plant: SingleAxisPlant, file: Path) -> None:
         from ground.report.figures import path_figure, save  # noqa: PLC0415
 
         save(path_figure(plan, plant), file)
+
+
+def draw_day(
+    prediction: OrbitPrediction, stations: Sequence[Station], targets: Sequence[tuple[float, str]], file: Path
+) -> None:
+    """Draw passes and eclipses of a span as a PNG, with the targets (start in s, name). Raises UsageError."""
+    with _drawing(file):
+        from ground.report.figures import save  # noqa: PLC0415
+        from ground.report.orbit_figures import day_figure  # noqa: PLC0415
+
+        save(day_figure(prediction, stations, targets), file)
 
 
 def draw_slew(made: OrderedSlew, order: SlewOrder, file: Path) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from datetime import timedelta
+from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.dates import DateFormatter
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -13,6 +16,7 @@ from matplotlib.patches import Patch
 from flight.link import events
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import PacketArray, to_text
+from ground.passes import OrbitPrediction, Station
 from ground.report import panels
 from ground.report.orbit import (
     AttitudeErrors,
@@ -380,3 +384,54 @@ def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
         label = "limit of one coil across the field"
         ax.plot(times, largest, color=panels.GREY, linestyle=panels.DASHED, label=label)
     panels.style(ax, "torque, µN m", "Torque of the coils", "")
+
+
+def day_figure(
+    prediction: OrbitPrediction, stations: Sequence[Station], targets: Sequence[tuple[float, str]]
+) -> Figure:
+    """Return the picture of a day: elevations above the stations, their passes, eclipses and targets.
+
+    Args:
+        prediction: orbit of the satellite over the span that is drawn.
+        stations: ground stations.
+        targets: start, s after the begin of the span, and name of each target.
+    """
+    rows = len(stations) + bool(targets)
+    figure = Figure(figsize=(13.0, 3.6 + 0.45 * rows), layout="constrained")
+    sky, bars = figure.subplots(2, 1, sharex=True, height_ratios=[4.0, max(1, rows)])
+    colours = dict(zip((one.name for one in stations), cycle(panels.PATH_COLOURS), strict=False))
+    for station in stations:
+        at, elevation = prediction.elevations(station)
+        above = np.where(elevation > 0.0, elevation, np.nan)
+        sky.plot(at, above, color=colours[station.name], linewidth=1.4, label=station.name)
+    for one in prediction.passes(stations):
+        colour = colours[one.station.name]
+        level = rows - 1 - stations.index(one.station)
+        bars.barh(level, one.set - one.rise, left=one.rise, height=0.6, color=colour)
+        text = f"{one.elevation_deg:.0f}°"
+        bars.annotate(text, (one.top, level + 0.32), ha="center", va="bottom", fontsize=7, color=panels.BLACK)
+    names = [station.name for station in stations]
+    if targets:
+        names.append("targets")
+        starts = [prediction.begin + timedelta(seconds=start) for start, _ in targets]
+        for number, (start, (_, name)) in enumerate(zip(starts, targets, strict=True)):
+            stop = starts[number + 1] if number + 1 < len(starts) else prediction.end
+            shade = panels.SKY if number % 2 else panels.GREY
+            bars.barh(0, stop - start, left=start, height=0.6, color=shade, alpha=0.6)
+            bars.annotate(
+                name, (start, 0), xytext=(3, 0), textcoords="offset points", va="center", fontsize=8
+            )
+    for number, (begin, end) in enumerate(prediction.eclipses()):
+        label = "" if number else "eclipse"
+        sky.axvspan(begin, end, color=panels.BLACK, alpha=0.12, linewidth=0, label=label)
+        bars.axvspan(begin, end, color=panels.BLACK, alpha=0.12, linewidth=0)
+    sky.set_ylim(0.0, 90.0)
+    bars.set_yticks(range(rows - 1, -1, -1), names)
+    bars.set_ylim(-0.6, rows - 0.2)
+    sky.set_xlim(prediction.begin, prediction.end)
+    sky.xaxis.set_major_formatter(DateFormatter("%H:%M"))  # type: ignore[no-untyped-call]
+    panels.style(sky, "elevation, deg", f"From {prediction.begin:%Y-%m-%d %H:%M} UTC", "")
+    panels.style(bars, "", "Passes above the mask, with the highest elevation", "UTC")
+    sky.margins(x=0.0)
+    panels.legend(sky)
+    return figure

@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from ground.commands import calibrate, solve
+from ground.commands.options import utc
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import Lens, Pinhole
@@ -132,10 +133,10 @@ def test_a_picture_without_stars_has_a_reason() -> None:
 
 
 def test_a_date_without_a_zone_is_in_utc() -> None:
-    assert solve._date("2026-11-21T20:15:00").isoformat() == "2026-11-21T20:15:00+00:00"
-    assert solve._date("2026-11-21T20:15:00+01:00").isoformat() == "2026-11-21T20:15:00+01:00"
+    assert utc("2026-11-21T20:15:00").isoformat() == "2026-11-21T20:15:00+00:00"
+    assert utc("2026-11-21T20:15:00+01:00").isoformat() == "2026-11-21T19:15:00+00:00"
     with pytest.raises(Exception, match="yesterday"):
-        solve._date("yesterday")
+        utc("yesterday")
 
 
 def lens(omitted: bool = False) -> DeterminedLens:

@@ -1,0 +1,203 @@
+"""Commands `knightcube passes` and `knightcube day`: when a ground station sees the satellite."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flight.app.cli import PROGRAM
+from flight.schema import reader as configuration
+from flight.schema.document import config_path, read_text
+from flight.schema.orbit import OrbitConfig, as_orbit
+from ground.commands.options import finite, positive, utc
+from ground.report.text import number, table
+from knightcube.errors import FlightError, UsageError
+
+if TYPE_CHECKING:
+    from ground.passes import OrbitPrediction, Pass, Station
+
+_LONGEST_DAYS = 30.0
+"""Longest span, days: elements of an older epoch do not predict times to a useful accuracy."""
+_UNCERTAIN_S = 10.0
+"""Standard deviation of the predicted times (s) above which a warning is printed."""
+_LEAD_S = 120.0
+"""Default time (s) between the command to point to the station and the rise, for the slew."""
+
+
+def configure_passes(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `knightcube passes` to the parser."""
+    parser.description = (
+        "Predict the passes of a satellite over ground stations from its two-line elements: rise, highest "
+        "elevation and set, whether the satellite is in sunlight, and the Sun's elevation at the station. "
+        "With --schedule, print the commands that point the satellite to the station during each pass. "
+        "Exit status 1 if there is no pass. Needs the extra `ground`."
+    )
+    parser.epilog = (
+        f"example: {PROGRAM} passes orbit_3u --from 2026-03-20T12:00:00 --station Berlin,52.5,13.4 --days 2"
+    )
+    _add_orbit(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument(
+        "--schedule",
+        action="store_true",
+        help="print only the commands for each pass, to be sent by `command --link ADDRESS --keys FOLDER`",
+    )
+    text = "with --schedule: time to point before the rise (default %(default)g s)"
+    parser.add_argument("--lead", type=finite, default=_LEAD_S, metavar="S", help=text)
+    parser.set_defaults(command=run_passes)
+
+
+def configure_day(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `knightcube day` to the parser."""
+    parser.description = (
+        "Draw a day of a satellite: its elevation above the ground stations, passes, eclipses, and the "
+        "targets of the configuration, whose mission time begins at the start of the picture. Needs the "
+        "extras `ground` and `plots`."
+    )
+    parser.epilog = f"example: {PROGRAM} day orbit_3u --from 2026-03-20T12:00:00 --station Berlin,52.5,13.4"
+    _add_orbit(parser)
+    parser.add_argument(
+        "--picture", type=Path, default=Path("day.png"), metavar="PNG", help="the picture (default day.png)"
+    )
+    parser.set_defaults(command=run_day)
+
+
+def _add_orbit(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that select satellite, span and stations."""
+    parser.add_argument(
+        "config",
+        type=config_path,
+        metavar="CONFIG",
+        help="configuration of the satellite with `elements`, or a text file with two lines of elements",
+    )
+    parser.add_argument(
+        "--station",
+        action="append",
+        default=[],
+        metavar="NAME,LAT,LON[,HEIGHT[,MASK]]",
+        help="a ground station: degrees, metres, and the elevation (deg, default 5) from which it sees the "
+        "satellite; may be repeated",
+    )
+    parser.add_argument(
+        "--stations", type=Path, metavar="FILE", help="YAML file with a list `stations` of ground stations"
+    )
+    parser.add_argument("--from", dest="begin", type=utc, metavar="UTC", help="start (default now)")
+    text = "length of the prediction (default %(default)g days)"
+    parser.add_argument("--days", type=positive, default=1.0, metavar="N", help=text)
+
+
+def run_passes(options: argparse.Namespace) -> int:
+    """Predict the passes and print them."""
+    prediction, stations, _ = _prediction(options)
+    found = prediction.passes(stations)
+    if options.json:
+        facts = {"timing_error_s": prediction.timing_error_s, "passes": [_facts(one) for one in found]}
+        sys.stdout.write(json.dumps(facts) + "\n")
+    elif options.schedule:
+        sys.stdout.writelines(f"{line}\n" for one in found for line in _commands(one, options.lead))
+    else:
+        sys.stdout.write("\n".join(_lines(found)) + "\n" if found else "no pass\n")
+    return 0 if found else 1
+
+
+def run_day(options: argparse.Namespace) -> int:
+    """Draw the day and print the name of the picture."""
+    from ground.report import draw_day  # noqa: PLC0415
+
+    prediction, stations, config = _prediction(options)
+    span = (prediction.end - prediction.begin).total_seconds()
+    steps = [] if config is None else [step for step in config.targets if step.at < span]
+    draw_day(prediction, stations, [(step.at, step.target().text) for step in steps], options.picture)
+    sys.stdout.write(f"picture: {options.picture}\n")
+    return 0
+
+
+def _prediction(
+    options: argparse.Namespace,
+) -> tuple[OrbitPrediction, tuple[Station, ...], OrbitConfig | None]:
+    """Return the predicted orbit, the stations, and the configuration if one is given. Raises UsageError."""
+    try:
+        from ground.passes import OrbitPrediction, read_stations, station_of  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        needed = "pip install 'knightcube-flight[ground]'"
+        raise FlightError(f"predicting passes needs {error.name}: {needed}") from error
+    if options.days > _LONGEST_DAYS:
+        raise UsageError(f"--days {options.days:g}: must be at most {_LONGEST_DAYS:g}")
+    stations = tuple(map(station_of, options.station))
+    stations += read_stations(options.stations) if options.stations is not None else ()
+    if not stations:
+        raise UsageError("give a ground station: --station Berlin,52.5,13.4, or --stations FILE")
+    names = [station.name for station in stations]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"two stations are called {name!r}: give each its own name")
+    lines, config = _elements(options.config)
+    begin = options.begin or datetime.now(UTC).replace(microsecond=0)
+    prediction = OrbitPrediction(lines, begin, options.days)
+    if prediction.timing_error_s > _UNCERTAIN_S:
+        sys.stderr.write(
+            f"{PROGRAM}: the elements are old: the times at the end have a standard deviation of "
+            f"{prediction.timing_error_s:.0f} s\n"
+        )
+    return prediction, stations, config
+
+
+def _elements(path: Path) -> tuple[tuple[str, str], OrbitConfig | None]:
+    """Return the two-line elements in a file, and the configuration that contains them. Raises UsageError."""
+    lines = [line.rstrip() for line in read_text(path).splitlines() if line[:2] in {"1 ", "2 "}]
+    if len(lines) == 2:
+        return (lines[0], lines[1]), None
+    config = as_orbit(configuration.load(path))
+    if config.elements is None:
+        raise UsageError(f"{path}: `elements` is missing: the orbit is not known")
+    return config.elements, config
+
+
+def _lines(found: list[Pass]) -> list[str]:
+    """Return the table of the passes."""
+    rows = [
+        [
+            one.station.name,
+            f"{one.rise:%Y-%m-%d %H:%M:%S}",
+            number(one.azimuths_deg[0], 0),
+            f"{one.top:%H:%M:%S}",
+            number(one.azimuths_deg[1], 0),
+            number(one.elevation_deg, 1),
+            number(one.range, 0, 1e-3),
+            f"{one.set:%H:%M:%S}",
+            number(one.azimuths_deg[2], 0),
+            number((one.set - one.rise).total_seconds(), 0),
+            "sunlit" if one.sunlit > 0.5 else "shadow",
+            number(one.sun_elevation_deg, 0),
+        ]
+        for one in found
+    ]
+    head = ["station", "rise UTC", "az", "top", "az", "elevation", "km", "set", "az", "s", "satellite", "Sun"]
+    note = "  az: azimuth, deg; km: distance at the top; Sun: its elevation at the station, deg"
+    return [*table(head, rows), note]
+
+
+def _commands(one: Pass, lead: float) -> list[str]:
+    """Return the scheduled commands that point to the station during a pass, and back to nadir."""
+    place = f"{one.station.latitude_deg:g} {one.station.longitude_deg:g}"
+    begin = one.rise - timedelta(seconds=lead)
+    return [
+        f"schedule {begin:%Y-%m-%dT%H:%M:%S} point ground {place}",
+        f"schedule {one.set:%Y-%m-%dT%H:%M:%S} point nadir",
+    ]
+
+
+def _facts(one: Pass) -> dict[str, object]:
+    return {
+        "station": one.station.name,
+        **{f"{name}_utc": getattr(one, name).isoformat() for name in ("rise", "top", "set")},
+        "azimuths_deg": list(one.azimuths_deg),
+        "elevation_deg": one.elevation_deg,
+        "range_m": one.range,
+        "sunlit": one.sunlit,
+        "sun_elevation_deg": one.sun_elevation_deg,
+    }

@@ -1,0 +1,220 @@
+"""Passes of a satellite over ground stations, and its eclipses, predicted from two-line elements.
+
+Skyfield propagates the elements (SGP4) and finds rise, culmination and set; the Sun, the Earth's shadow and
+the uncertainty of the elements are those of `knightcube.astro.earth`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from skyfield.api import EarthSatellite, load, wgs84
+from skyfield.toposlib import GeographicPosition
+
+from flight.schema.document import read_document, read_text
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
+from knightcube.astro.earth.orientation import celestial_to_terrestrial, terrestrial_time
+from knightcube.astro.earth.sun import DAY, earth_from_sun, julian_date, sunlit_share
+from knightcube.errors import UsageError
+
+_SEARCH_S = 3600.0
+"""Time (s) searched before and after the span, so that a pass in progress at its ends is found whole."""
+_STEP_S = 10.0
+"""Interval (s) of the positions between which the begin and the end of an eclipse are interpolated."""
+_SPEED = 7.6e3
+"""Speed (m/s) of a satellite in a low orbit, which converts an error along the track to one in time."""
+_RISE, _CULMINATION, _SET = range(3)
+"""Numbers of the events that Skyfield reports."""
+
+
+class Station(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Ground station.
+
+    Attributes:
+        name: name in tables and pictures.
+        latitude_deg: geodetic latitude, degrees.
+        longitude_deg: longitude, degrees, positive to the east.
+        height: height above the WGS 84 ellipsoid, m.
+        mask_deg: elevation, degrees, from which the station sees the satellite.
+    """
+
+    name: Annotated[str, Meta(min_length=1, max_length=40)]
+    latitude_deg: Annotated[float, Meta(ge=-90.0, le=90.0)]
+    longitude_deg: Annotated[float, Meta(ge=-180.0, le=360.0)]
+    height: Annotated[float, Meta(ge=-500.0, le=9000.0)] = 0.0
+    mask_deg: Annotated[float, Meta(ge=0.0, lt=90.0)] = 5.0
+
+    def on_earth(self) -> GeographicPosition:
+        """Return the position of the station for Skyfield."""
+        return wgs84.latlon(self.latitude_deg, self.longitude_deg, self.height)
+
+
+class _Stations(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    stations: Annotated[tuple[Station, ...], Meta(min_length=1)]
+
+
+@dataclass(frozen=True, slots=True)
+class Pass:
+    """Pass of a satellite over a ground station, from the mask of the station to the mask.
+
+    Attributes:
+        station: the ground station.
+        rise: UTC at which the satellite rises above the mask.
+        top: UTC of the highest elevation.
+        set: UTC at which the satellite sets below the mask.
+        azimuths_deg: azimuths at rise, top and set, degrees, from north to east.
+        elevation_deg: highest elevation, degrees.
+        range: distance at the highest elevation, m.
+        sunlit: visible fraction of the Sun's disc at the satellite at the highest elevation.
+        sun_elevation_deg: elevation of the Sun at the station at that time, degrees.
+    """
+
+    station: Station
+    rise: datetime
+    top: datetime
+    set: datetime
+    azimuths_deg: tuple[float, float, float]
+    elevation_deg: float
+    range: float
+    sunlit: float
+    sun_elevation_deg: float
+
+
+def read_stations(path: Path) -> tuple[Station, ...]:
+    """Return the stations in a YAML file with the list `stations`.
+
+    Raises ConfigError for a file that cannot be read, and UsageError for a wrong value.
+    """
+    values = read_document(read_text(path), str(path)).values
+    try:
+        return msgspec.convert(values, _Stations).stations
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{path}: {error}") from error
+
+
+def station_of(text: str) -> Station:
+    """Return the station in a text NAME,LATITUDE,LONGITUDE[,HEIGHT[,MASK]], in degrees and metres.
+
+    Raises UsageError for a wrong value.
+    """
+    form = "give NAME,LATITUDE,LONGITUDE[,HEIGHT[,MASK]], such as Berlin,52.5,13.4"
+    name, *numbers = text.split(",")
+    keys = ("latitude_deg", "longitude_deg", "height", "mask_deg")
+    if not 2 <= len(numbers) <= len(keys):
+        raise UsageError(f"station {text!r}: {form}")
+    try:
+        values = dict(zip(keys, map(float, numbers), strict=False))
+        return msgspec.convert({"name": name.strip(), **values}, Station)
+    except ValueError as error:  # also the error of msgspec
+        raise UsageError(f"station {text!r}: {error}; {form}") from error
+
+
+class OrbitPrediction:
+    """Passes and eclipses of a satellite within a span of time."""
+
+    def __init__(self, lines: tuple[str, str], begin: datetime, days: float) -> None:
+        """Propagate two-line elements over a span of `days` days from the UTC `begin`.
+
+        Raises UsageError for invalid elements, and for elements that describe no orbit in the span.
+        """
+        self.begin, self.end = begin, begin + timedelta(days=days)
+        self._elements = TwoLineElements(*lines)
+        self._scale = load.timescale(builtin=True)
+        self._satellite = EarthSatellite(*lines, "satellite", self._scale)
+        count = math.ceil(days * DAY / _STEP_S) + 1
+        seconds = np.linspace(0.0, days * DAY, count)
+        self._at = [begin + timedelta(seconds=float(time)) for time in seconds]
+        times = self._scale.from_datetimes(self._at)
+        self._positions = np.asarray(self._satellite.at(times).position.m, dtype=float).T
+        try:
+            for edge in (self.begin, self.end):
+                self._elements.at(julian_date(edge))
+        except OrbitError as error:
+            raise UsageError(f"the elements describe no orbit from {begin:%Y-%m-%d} on: {error}") from error
+
+    @property
+    def timing_error_s(self) -> float:
+        """Standard deviation of the predicted times, s, at the end of the span, by the elements' age."""
+        return self._elements.at(julian_date(self.end)).sigma / _SPEED
+
+    def passes(self, stations: Sequence[Station]) -> list[Pass]:
+        """Return the passes over all stations that lie at least in part in the span, in order of rise."""
+        found = [one for station in stations for one in self._over(station)]
+        return sorted(found, key=lambda one: (one.rise, one.station.name))
+
+    def _over(self, station: Station) -> Iterator[Pass]:
+        place = station.on_earth()
+        around = timedelta(seconds=_SEARCH_S)
+        first, last = (self._scale.from_datetime(at) for at in (self.begin - around, self.end + around))
+        times, events = self._satellite.find_events(place, first, last, altitude_degrees=station.mask_deg)
+        own: list[datetime] = []
+        for time, event in zip(times, events, strict=True):
+            at = time.utc_datetime()
+            own = [at] if event == _RISE else [*own, at]
+            if event != _SET or len(own) < 3:  # a pass that was in progress before the search began
+                continue
+            if own[-1] > self.begin and own[0] < self.end:
+                yield self._described(station, place, own)
+
+    def _described(self, station: Station, place: GeographicPosition, own: list[datetime]) -> Pass:
+        """Return the pass with rise, culminations and set at the times `own`."""
+        elevations, azimuths, ranges = self._seen_from(place, own)
+        top = 1 + int(np.argmax(elevations[1:-1]))
+        sun = -earth_from_sun(float(terrestrial_time(julian_date(own[top]))))[0]
+        position = np.asarray(self._satellite.at(self._scale.from_datetime(own[top])).position.m, dtype=float)
+        up = np.array(
+            [
+                math.cos(math.radians(station.latitude_deg)) * math.cos(math.radians(station.longitude_deg)),
+                math.cos(math.radians(station.latitude_deg)) * math.sin(math.radians(station.longitude_deg)),
+                math.sin(math.radians(station.latitude_deg)),
+            ]
+        )
+        towards = celestial_to_terrestrial(julian_date(own[top])) @ (sun / np.linalg.norm(sun))
+        return Pass(
+            station,
+            own[0],
+            own[top],
+            own[-1],
+            (float(azimuths[0]), float(azimuths[top]), float(azimuths[-1])),
+            float(elevations[top]),
+            float(ranges[top]),
+            float(sunlit_share(position, sun)),
+            math.degrees(math.asin(float(np.clip(up @ towards, -1.0, 1.0)))),
+        )
+
+    def _seen_from(
+        self, place: GeographicPosition, at: Sequence[datetime]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return elevations, azimuths (n,), degrees, and distances (n,), m, seen from a place."""
+        times = self._scale.from_datetimes(list(at))
+        elevation, azimuth, distance = (self._satellite - place).at(times).altaz()
+        return np.asarray(elevation.degrees), np.asarray(azimuth.degrees), np.asarray(distance.m)
+
+    def elevations(self, station: Station) -> tuple[list[datetime], FloatArray]:
+        """Return times of the span, and the satellite's elevations above the station at them, degrees."""
+        return self._at, self._seen_from(station.on_earth(), self._at)[0]
+
+    def eclipses(self) -> list[tuple[datetime, datetime]]:
+        """Return begin and end of the eclipses in the span, at which half of the Sun's disc is visible."""
+        dates = np.array([julian_date(at) for at in self._at])
+        # The Sun's direction changes slowly, so that 25 ephemeris values a day are sufficient.
+        knots = np.linspace(dates[0], dates[-1], 2 + math.ceil(24.0 * (dates[-1] - dates[0])))
+        known = np.array([-earth_from_sun(float(terrestrial_time(date)))[0] for date in knots])
+        sun = np.column_stack([np.interp(dates, knots, column) for column in known.T])
+        shade = 0.5 - sunlit_share(self._positions, sun)
+        seconds = (dates - dates[0]) * DAY
+        change = np.flatnonzero((shade[1:] > 0.0) != (shade[:-1] > 0.0))
+        between = shade[change] / (shade[change] - shade[change + 1])
+        edges = list(seconds[change] + between * (seconds[change + 1] - seconds[change]))
+        edges = ([0.0] if shade[0] > 0.0 else []) + edges + ([seconds[-1]] if shade[-1] > 0.0 else [])
+        at = [self.begin + timedelta(seconds=float(edge)) for edge in edges]
+        return list(zip(at[::2], at[1::2], strict=True))

@@ -1,0 +1,141 @@
+"""Predicted passes and eclipses agree with the project's own model of orbit, Earth and Sun."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ground.passes import OrbitPrediction, Station, read_stations, station_of
+from knightcube.astro.earth.figure import semi_axes
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
+from knightcube.astro.earth.orientation import celestial_to_terrestrial, north_east_down, terrestrial_time
+from knightcube.astro.earth.sun import earth_from_sun, julian_date, sunlit_share
+from knightcube.errors import UsageError
+from tests.support.orbit_elements import POLAR_ORBIT
+
+BEGIN = datetime(2026, 3, 20, 12, tzinfo=UTC)
+BERLIN = Station(name="Berlin", latitude_deg=52.5, longitude_deg=13.4, height=40.0)
+STATIONS = (BERLIN, Station(name="Tromso", latitude_deg=69.66, longitude_deg=18.94, mask_deg=12.0))
+
+
+@pytest.fixture(scope="module")
+def prediction() -> OrbitPrediction:
+    """Return a day of a satellite in a polar orbit."""
+    return OrbitPrediction(POLAR_ORBIT, BEGIN, 1.0)
+
+
+def seen(station: Station, at: datetime) -> tuple[float, float, float]:
+    """Return elevation and azimuth, deg, and distance, m, of the satellite seen from a station."""
+    date = julian_date(at)
+    satellite = celestial_to_terrestrial(date) @ TwoLineElements(*POLAR_ORBIT).at(date).position
+    latitude, longitude = math.radians(station.latitude_deg), math.radians(station.longitude_deg)
+    equatorial, _, polar = semi_axes()
+    squared = 1.0 - (polar / equatorial) ** 2
+    normal = equatorial / math.sqrt(1.0 - squared * math.sin(latitude) ** 2)
+    across = (normal + station.height) * math.cos(latitude)
+    up = (normal * (1.0 - squared) + station.height) * math.sin(latitude)
+    place = np.array([across * math.cos(longitude), across * math.sin(longitude), up])
+    north, east, down = north_east_down(longitude, latitude) @ (satellite - place)
+    elevation = math.degrees(math.atan2(-down, math.hypot(north, east)))
+    return elevation, math.degrees(math.atan2(east, north)) % 360.0, math.sqrt(north**2 + east**2 + down**2)
+
+
+def test_a_pass_begins_and_ends_at_the_mask_and_culminates_between(prediction: OrbitPrediction) -> None:
+    found = prediction.passes(STATIONS)
+    assert {one.station.name for one in found} == {"Berlin", "Tromso"}
+    for one in found:
+        for at, azimuth in zip((one.rise, one.top, one.set), one.azimuths_deg, strict=True):
+            elevation, own, distance = seen(one.station, at)
+            expected = one.elevation_deg if at is one.top else one.station.mask_deg
+            assert elevation == pytest.approx(expected, abs=0.02)
+            if elevation < 80.0:  # azimuths change quickly near the zenith
+                assert (own - azimuth + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.1)
+        assert distance > one.range
+        assert seen(one.station, one.top)[2] == pytest.approx(one.range, abs=500.0)
+        around = [seen(one.station, one.top + timedelta(seconds=shift))[0] for shift in (-5.0, 5.0)]
+        assert max(around) <= one.elevation_deg + 1e-3
+
+
+def test_every_pass_of_the_day_is_found(prediction: OrbitPrediction) -> None:
+    found = prediction.passes((BERLIN,))
+    for minute in np.arange(0.0, 1440.0, 0.5):
+        at = BEGIN + timedelta(minutes=float(minute))
+        elevation = seen(BERLIN, at)[0]
+        if abs(elevation - BERLIN.mask_deg) > 0.1:
+            assert any(one.rise < at < one.set for one in found) == (elevation > BERLIN.mask_deg), at
+
+
+def test_a_pass_in_progress_at_the_start_is_whole(prediction: OrbitPrediction) -> None:
+    first = prediction.passes((BERLIN,))[0]
+    middle = first.rise + 0.5 * (first.set - first.rise)
+    (same,) = OrbitPrediction(POLAR_ORBIT, middle, 0.01).passes((BERLIN,))
+    assert abs((same.rise - first.rise).total_seconds()) < 0.5
+
+
+def test_the_sun_at_satellite_and_station_is_that_of_the_ephemeris(prediction: OrbitPrediction) -> None:
+    for one in prediction.passes(STATIONS):
+        date = julian_date(one.top)
+        sun = -earth_from_sun(float(terrestrial_time(date)))[0]
+        position = TwoLineElements(*POLAR_ORBIT).at(date).position
+        assert one.sunlit == pytest.approx(float(sunlit_share(position, sun)), abs=0.05)
+        latitude, longitude = math.radians(one.station.latitude_deg), math.radians(one.station.longitude_deg)
+        down = north_east_down(longitude, latitude)[2] @ celestial_to_terrestrial(date) @ sun
+        expected = math.degrees(math.asin(-down / float(np.linalg.norm(sun))))
+        assert one.sun_elevation_deg == pytest.approx(expected, abs=0.01)
+
+
+def test_eclipses_begin_and_end_where_half_of_the_sun_is_visible(prediction: OrbitPrediction) -> None:
+    eclipses = prediction.eclipses()
+    assert 14 <= len(eclipses) <= 16
+    elements = TwoLineElements(*POLAR_ORBIT)
+    for begin, end in eclipses:
+        assert 0.0 < (end - begin).total_seconds() < 2400.0
+        for edge, sign in ((begin, 1.0), (end, -1.0)):
+            if edge in {prediction.begin, prediction.end}:
+                continue
+            for shift, dark in ((-15.0, sign < 0.0), (15.0, sign > 0.0)):
+                date = julian_date(edge + timedelta(seconds=shift))
+                sun = -earth_from_sun(float(terrestrial_time(date)))[0]
+                assert (float(sunlit_share(elements.at(date).position, sun)) < 0.5) == dark
+
+
+def test_the_claimed_error_of_the_times_grows_with_the_age_of_the_elements() -> None:
+    fresh, old = (OrbitPrediction(POLAR_ORBIT, BEGIN + timedelta(days=age), 0.1) for age in (0.0, 20.0))
+    assert fresh.timing_error_s < 1.0
+    assert old.timing_error_s > 3.0
+
+
+def test_stations_are_read_from_text_and_file(tmp_path: Path) -> None:
+    assert station_of("Berlin,52.5,13.4,40") == BERLIN
+    file = tmp_path / "stations.yaml"
+    file.write_text("stations:\n  - {name: Berlin, latitude_deg: 52.5, longitude_deg: 13.4, height: 40}\n")
+    assert read_stations(file) == (BERLIN,)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("Berlin", "give NAME,LATITUDE,LONGITUDE"),
+        ("Berlin,52.5,x", "could not convert"),
+        ("Berlin,95,13", "<= 90.0"),
+        ("Berlin,52,13,0,90", "< 90.0"),
+        ("Berlin,nan,13", "latitude_deg"),
+        (",52,13", "length >= 1"),
+        ("Berlin,1,2,3,4,5", "give NAME,LATITUDE,LONGITUDE"),
+    ],
+)
+def test_a_wrong_station_is_refused_with_the_reason(text: str, reason: str) -> None:
+    with pytest.raises(UsageError, match="station") as refused:
+        station_of(text)
+    assert reason in str(refused.value)
+
+
+def test_a_wrong_file_of_stations_names_file_and_key(tmp_path: Path) -> None:
+    file = tmp_path / "stations.yaml"
+    file.write_text("stations:\n  - {name: Berlin, latitude_deg: 52.5, longitude_deg: 13.4, hight: 40}\n")
+    with pytest.raises(UsageError, match=r"stations.yaml: .*hight"):
+        read_stations(file)
