@@ -23,7 +23,7 @@ from ground.commands.satellite_questions import check_values, read_value
 from ground.telemetry import read_run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.mean_elements import FittedElements, fit_elements
-from knightcube.astro.earth.omm import read_elements
+from knightcube.astro.earth.omm import NamedElements, read_elements
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
@@ -123,22 +123,29 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _print_read(options: argparse.Namespace) -> int:
-    """Print the elements of one satellite in a file. Raises UsageError."""
-    path: Path = options.read
+def read_file(path: Path, satellite: int | None) -> NamedElements:
+    """Return the newest elements of a satellite in a file of two-line elements or OMM. Raises UsageError.
+
+    The satellite number may be None if the file contains only one satellite.
+    """
     try:
         found = read_elements(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: cannot be read: {error}") from error
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from error
-    chosen = [each for each in found if options.satellite in {None, each.number}]
+    chosen = [each for each in found if satellite in {None, each.number}]
     if len({each.number for each in chosen}) != 1:
         numbers = ", ".join(f"{each.number} {each.name}".strip() for each in found[:_LISTED])
         cure = f"give one of them by --satellite: {numbers}{', ...' if len(found) > _LISTED else ''}"
         raise UsageError(f"{path}: {len(chosen)} of {len(found)} element sets match: {cure}")
-    # The element set with the newest epoch counts, if a file holds several of one satellite.
-    newest = max(chosen, key=lambda each: TwoLineElements(*each.lines).epoch)
+    return max(chosen, key=lambda each: TwoLineElements(*each.lines).epoch)
+
+
+def _print_read(options: argparse.Namespace) -> int:
+    """Print the elements of one satellite in a file. Raises UsageError."""
+    path: Path = options.read
+    newest = read_file(path, options.satellite)
     facts = {"elements": list(newest.lines), "name": newest.name, "number": newest.number}
     name = f"{newest.number} {newest.name}".strip()
     text = f"elements:  # [read from {path.name}: {name}]\n" + "".join(

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 from flight.app.cli import PROGRAM
 from flight.schema import reader as configuration
-from flight.schema.document import config_path, read_text
+from flight.schema.document import config_path
 from flight.schema.orbit import OrbitConfig, as_orbit
+from ground.commands.elements import read_file
 from ground.commands.options import finite, positive, utc
 from ground.report.text import number, table
 from knightcube.errors import FlightError, UsageError
@@ -72,7 +73,10 @@ def _add_orbit(parser: argparse.ArgumentParser) -> None:
         "config",
         type=config_path,
         metavar="CONFIG",
-        help="configuration of the satellite with `elements`, or a text file with two lines of elements",
+        help="configuration of the satellite with `elements`, or a file of two-line elements or OMM",
+    )
+    parser.add_argument(
+        "--satellite", type=int, metavar="NUMBER", help="satellite number, if the file has several satellites"
     )
     parser.add_argument(
         "--station",
@@ -135,7 +139,7 @@ def _prediction(
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"two stations are called {name!r}: give each its own name")
-    lines, config = _elements(options.config)
+    lines, config = _elements(options.config, options.satellite)
     begin = options.begin or datetime.now(UTC).replace(microsecond=0)
     prediction = OrbitPrediction(lines, begin, options.days)
     if prediction.timing_error_s > _UNCERTAIN_S:
@@ -146,11 +150,10 @@ def _prediction(
     return prediction, stations, config
 
 
-def _elements(path: Path) -> tuple[tuple[str, str], OrbitConfig | None]:
+def _elements(path: Path, satellite: int | None) -> tuple[tuple[str, str], OrbitConfig | None]:
     """Return the two-line elements in a file, and the configuration that contains them. Raises UsageError."""
-    lines = [line.rstrip() for line in read_text(path).splitlines() if line[:2] in {"1 ", "2 "}]
-    if len(lines) == 2:
-        return (lines[0], lines[1]), None
+    if path.suffix not in {".yaml", ".yml"}:
+        return read_file(path, satellite).lines, None
     config = as_orbit(configuration.load(path))
     if config.elements is None:
         raise UsageError(f"{path}: `elements` is missing: the orbit is not known")
