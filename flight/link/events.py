@@ -104,6 +104,7 @@ COIL_TRUSTED = _info(35, "coil-trusted", "an isolated coil is used again, by com
 COIL_CORRECTED = _warning(
     143, "coil-corrected", "a coil is used with another sign or gain, because the motion shows it"
 )
+COIL_TESTED = _info(144, "coil-tested", "short currents have tested coils that pointing hardly uses")
 COIL_SUSPECT = _warning(
     36, "coil-suspect", "the supply current does not match the commanded currents; the faulty coil is unknown"
 )

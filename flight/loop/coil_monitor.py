@@ -65,6 +65,7 @@ from flight.loop.coil_currents import (
     predict,
 )
 from flight.loop.coil_response import (
+    AXES,
     LARGEST_GAIN,
     LONGEST_REST_NS,
     CoilCommands,
@@ -75,6 +76,7 @@ from flight.loop.coil_response import (
     MotionWitness,
     ResponseSettings,
 )
+from flight.loop.coil_self_test import SelfTest, SelfTestSettings
 from hal.interfaces.devices import NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import BoolArray, FloatArray
 
@@ -314,6 +316,7 @@ class CoilMonitorSettings:
         tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
         trial_after_ns: time (ns) from the verdict on a coil to its next trial.
         trials: largest number of trials of each coil.
+        self_test: settings of the self-test; None if the coils are not tested.
         absent: axes without a coil.
     """
 
@@ -332,6 +335,7 @@ class CoilMonitorSettings:
     tumble_rate: float = math.inf
     trial_after_ns: int = 600_000_000_000
     trials: int = 3
+    self_test: SelfTestSettings | None = None
     absent: frozenset[int] = frozenset()
 
 
@@ -380,8 +384,6 @@ class Probe:
         return wave
 
 
-AXES = "xyz"
-
 _BRAKED = {CoilFault.A_HIGH, CoilFault.B_HIGH, CoilFault.HIGH}
 _STUCK_EXCESS = 0.3
 """Smallest excess current of a leg stuck high, as a fraction of the current of a coil that is fully on."""
@@ -428,6 +430,9 @@ class CoilMonitor:
         self._probe = Probe(settings.probe_current, settings.probe_half_ns)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
+        self._self_test: SelfTest | None = None
+        if self._slow is not None and settings.slow is not None and settings.self_test is not None:
+            self._self_test = SelfTest(self._slow, settings.slow.rate_noise, settings.self_test)
         self._weak = ""  # text about a coil without the expected torque
         self._weak_ns = -_AGAIN_NS  # time (ns) of the last probes for missing torque
         self._prime: int | None = None  # axis to probe first
@@ -602,6 +607,8 @@ class CoilMonitor:
         if self._prime is not None:
             self._reset()
         self._adopt_correction()
+        if self._self_test is not None:
+            self._self_test.stop()
         for response in self._responses:
             response.interrupted(now_ns)
 
@@ -666,6 +673,27 @@ class CoilMonitor:
     def probe(self) -> FloatArray | None:
         """Currents (3,), A, on the wire that replace all commands during a probe; None without a probe."""
         return self._probe.wave(self._commands.newest_ns) if self._commands else None
+
+    def test_wave(self, wanted: FloatArray) -> FloatArray | None:
+        """Return the currents (3,), A, on the wire that test a coil now; None without a test.
+
+        The test replaces the `wanted` effective currents (3,), A, which are small.
+        """
+        if self._self_test is None or not self._commands:
+            return None
+        if self.suspicion or self._leg.is_searching:
+            self._self_test.stop()
+            return None
+        return self._self_test.wave(wanted, self.available & ~self.resting, self._commands.newest_ns)
+
+    def test_soon(self) -> None:
+        """Test all coils as soon as possible."""
+        if self._self_test is not None:
+            self._self_test.request()
+
+    def tested(self, now_ns: int) -> str:
+        """Return the results of the last self-test as text, once they are known; otherwise "" ."""
+        return "" if self._self_test is None else self._self_test.report(now_ns)
 
     @property
     def monitor_doubted(self) -> str:

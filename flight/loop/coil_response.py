@@ -345,6 +345,17 @@ class CoilResponse:
         change = np.mean(residuals, axis=0) - np.mean(before[-10:], axis=0)
         return float(change @ expected) / size
 
+    @property
+    def strength(self) -> FloatArray | None:
+        """Angular acceleration (3,), rad/s^2 per ampere, by each coil in the field of the coils' last pause.
+
+        The result is None before the first pause.
+        """
+        if self._quiet_field is None:
+            return None
+        per_ampere = self._directions @ cross_matrices(self._quiet_field[None])[0] @ self._per_field
+        return np.asarray(np.linalg.norm(per_ampere, axis=1))
+
     def text(self, axis: int) -> str:
         """Return the gain of an axis as text."""
         return f"the motion shows {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its torque"
@@ -568,6 +579,7 @@ class GainEquations(NamedTuple):
         return GainFit(gains, np.asarray(covariance.diagonal(), dtype=np.float64), cost)
 
 
+AXES = "xyz"
 _EACH = np.arange(3)
 
 

@@ -134,6 +134,7 @@ class Navigation:
         self._agreed_ns = 0
         self._link = unit.link()
         self._bytes_since_ns = 0
+        self._doubted = False
         self._coil_factors = estimation.coil_monitor.correction.factors
         self.speed = 0.0
         """Body rate (rad/s) of the newest reading, including the gyro bias."""
@@ -179,6 +180,9 @@ class Navigation:
             self.speed = math.hypot(*reading.rate.tolist())
         self._watch_line(now_ns)
         doubted = self._filter.doubts_commands
+        if doubted and not self._doubted:
+            self._estimation.coil_monitor.test_soon()
+        self._doubted = doubted
         text = "the body rate contradicts the commands" if doubted else "the rate follows the commands"
         self._facts.update(facts.COMMANDS_DOUBTED, doubted, now_ns, text)
         return readings

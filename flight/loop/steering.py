@@ -118,6 +118,8 @@ class CoilDrive:
         answer = self._power.latest() if self._power is not None and not self._power.error() else None
         if answer is not None:
             watch.measured(answer)
+        if text := watch.tested(now_ns):
+            self._events.report(events.COIL_TESTED, now_ns, text)
         for text in watch.news():
             self._events.report(events.COIL_CORRECTED, now_ns, text)
         self._report_verdicts(now_ns)
@@ -160,8 +162,10 @@ class CoilDrive:
         self.isolate()
         self._events.report(events.COIL_TRUSTED, now_ns, text)
 
-    def send(self, currents: FloatArray, field: Callable[[], FloatArray | None]) -> None:
-        """Command effective currents (3,) A.
+    def send(
+        self, currents: FloatArray, field: Callable[[], FloatArray | None], *, testable: bool = False
+    ) -> None:
+        """Command effective currents (3,) A, or those of a self-test if the coils are `testable`.
 
         The function `field` returns the magnetic field (3,), T, in body axes, for the reallocation of
         currents.
@@ -189,6 +193,8 @@ class CoilDrive:
                     settings.free_axis,
                 ).currents
         probe = watch.probe
+        if probe is None and testable:
+            probe = watch.test_wave(currents)
         wire = watch.correction.wire(currents) if probe is None else probe
         if watch.at_rest:
             wire = np.zeros(3)
@@ -242,7 +248,8 @@ class Steering:
             state = SteeringState.FOLLOWING if following else SteeringState.HOLDING
             wanted: CoilCommand = control.tracker.command(estimate, reference)
             dipole, saturated = wanted.dipole, wanted.saturated
-            self._drive.send(wanted.currents, lambda: self._body.estimation.field(estimate))
+            field = self._body.estimation.field
+            self._drive.send(wanted.currents, lambda: field(estimate), testable=True)
             adrift = not following and control.paths.is_adrift(now_ns)
         self._facts.update(
             facts.HOLDING, adrift, now_ns, "no newer path: holding the attitude at the end of the last"

@@ -170,7 +170,8 @@ class PointingSection(Section, frozen=True, kw_only=True):
     of `dipole` A m^2 have equal cost. A roll error of `roll` rad about `axis` has the same cost; without
     `roll`, a roll error costs as much as any other attitude error. The coils act for `act` s between pauses
     for the magnetometer, which last as long as those of detumbling. Plans are renewed every `replan_period`
-    s. A slew to a distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones`
+    s. A coil that pointing hardly uses is tested by a short current every `coil_test` s; 0 switches the tests
+    off. A slew to a distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones`
     of the star camera. Without `dipole` or `slew`, the value is computed (`OrbitConfig.dipole_weight`,
     `OrbitConfig.slew_duration`).
     """
@@ -183,6 +184,7 @@ class PointingSection(Section, frozen=True, kw_only=True):
     roll: Positive | None = None
     act: Annotated[float, Meta(ge=0.1, le=10.0)] = 1.8
     replan_period: Annotated[float, Meta(ge=10.0, le=900.0)] = 300.0
+    coil_test: Annotated[float, Meta(ge=0.0, le=86400.0)] = 600.0
     slew: Annotated[float, Meta(ge=60.0, le=1500.0)] | None = None
     cones: ExclusionCones = ExclusionCones()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +34,11 @@ def flown(fault: str, folder: Path, duration: float, initial: str = "testbed-dem
         drive = rigged.loop._tasks.drive
         send, zero = drive.send, drive.zero
 
-        def sent(currents: FloatArray, field: object) -> None:
+        def sent(
+            currents: FloatArray, field: Callable[[], FloatArray | None], *, testable: bool = False
+        ) -> None:
             wishes.append(currents.copy())
-            send(currents, field)  # type: ignore[arg-type]  # as it came
+            send(currents, field, testable=testable)
 
         def zeroed() -> None:
             wishes.append(np.zeros(3))

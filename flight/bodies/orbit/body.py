@@ -34,6 +34,7 @@ from flight.loop import facts
 from flight.loop.body import BodyControl, BodyEstimation, BodyKind, ControlOutput, FlightBody, Target
 from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import ResponseSettings
+from flight.loop.coil_self_test import SelfTestSettings
 from flight.loop.facts import Services
 from flight.loop.state import Learned
 from flight.schema.devices import SolarStringsSection, camera_model
@@ -490,7 +491,13 @@ def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
     )
     slow = replace(response, bin_samples=40, least_bins=8, model_error=3.0e-5)
     tumble = config.modes.tumble_rate
+    interval_ns, limits = round(config.pointing.coil_test * SECOND_NS), np.array(config.coils.limits)
     settings = CoilMonitorSettings(
-        (x, y, z), response=response, slow=slow, tumble_rate=tumble, absent=config.coils.absent
+        (x, y, z),
+        response=response,
+        slow=slow,
+        tumble_rate=tumble,
+        self_test=SelfTestSettings(interval_ns, limits) if interval_ns else None,
+        absent=config.coils.absent,
     )
     return CoilMonitor(settings)

@@ -43,6 +43,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "PidSettings": (testbed.PidGains,),
     "PlanningSettings": (testbed.Guidance,),
     "ResponseSettings": (testbed.Plant, devices.InertialUnitSection),
+    "SelfTestSettings": (orbit.PointingSection, devices.Coils),
     "ObjectMeasurementSettings": (devices.ObjectTracking,),
     "SolveSettings": OF_CAMERA,
     "StationSettings": (sections.Link,),

@@ -21,15 +21,19 @@ def test_a_broken_coil_misleads_the_estimate_for_less_than_a_quarter_of_a_second
     assert result["beyond_before_s"] == 0.0
 
 
-@pytest.mark.parametrize("key", ["orbit tumble reversed 0", "orbit_3u tumble open 0"])
+@pytest.mark.parametrize(
+    "key",
+    ["orbit tumble reversed 0", "orbit_3u tumble open 0", "orbit slow reversed 1", "orbit_3u slow open 0"],
+)
 def test_a_broken_coil_of_an_unlike_body_is_handled_soon_and_no_healthy_coil_is_judged(
     key: str, tmp_path: Path
 ) -> None:
-    (case,) = (case for case in unlike_inertia.cases(1, 7) if case.key == key)
+    (case,) = (case for case in unlike_inertia.cases(2, 7) if case.key == key)
     result = unlike_inertia.run(case)
     assert result["handled_s"] is not None
-    assert result["handled_s"] <= unlike_inertia.SOON
+    slow = " slow " in key
+    assert result["handled_s"] <= unlike_inertia.SOON + (2.0 * unlike_inertia.TEST_INTERVAL if slow else 0.0)
     facts = unlike_inertia.summarise([result], tmp_path).facts
     assert facts["with_healthy_isolated"] == facts["with_healthy_suspected"] == 0
     assert facts["with_healthy_corrected"] == 0
-    assert facts[f"{key[:-2]}: handled_within_30_s"] == 1
+    assert facts[f"{key[:-2]}: handled"] == 1

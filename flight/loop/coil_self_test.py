@@ -1,0 +1,121 @@
+"""Self-test of coils that are hardly used, by short currents to which the motion of the body responds.
+
+While a satellite points, currents of a few mA show neither an open nor a reversed coil. A coil about which
+the motion has shown nothing for an interval is therefore driven alone by a known current with the signs
++, -, -, + in four equal quarters. After these four quarters, neither the rate nor the attitude has changed.
+Duration and current of a test follow from the gyro's noise, so that the gain of a healthy coil is `_SHOWN`
+standard deviations. The largest rotation during a test is the angular acceleration times the square of the
+duration of a quarter. `CoilResponse` judges the response, with the errors of the inertia as nuisance
+parameters. The current monitor compares the supply current with the command, as at any other time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.loop.coil_response import AXES, CoilResponse
+from knightcube.astro.arrays import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class SelfTestSettings:
+    """Settings of the coils' self-test.
+
+    Attributes:
+        interval_ns: longest time (ns) without evidence about a coil, after which the coil is tested.
+        limits: largest currents (3,), A, of a test.
+    """
+
+    interval_ns: int
+    limits: FloatArray
+
+
+_SHOWN = 8.0
+"""Gain of a healthy coil in a self-test, in standard deviations of the gain."""
+_EFFICIENCY = 0.7
+"""Fraction of a test's information that remains after the fit of a constant torque."""
+_GYRO_HZ = 40.0
+_SHORTEST_QUARTER, _LONGEST_QUARTER = 1.0, 4.0
+"""Range of the quarter of a test (s). A coil that would need a longer test is nearly along the field."""
+_GAP_NS = 400_000_000
+"""Time (ns) with zero current before a test, in which the field is measured."""
+_CALM_NS = 10_000_000_000
+"""Time (ns) for which the commands must be small before a test."""
+_QUIET = 0.25
+"""Largest current that is commanded around a test, as a fraction of the largest current of the test."""
+_REPORT_NS = 5_000_000_000
+"""Time (ns) from the last test to its report, in which the fits of the motion follow."""
+_NEAR_FIELD_NS = 60_000_000_000
+"""Time (ns) after which the test of a coil nearly along the field is tried again."""
+
+
+class SelfTest:
+    """The self-test of all coils."""
+
+    def __init__(self, response: CoilResponse, rate_noise: float, settings: SelfTestSettings) -> None:
+        """Set the standard deviation `rate_noise` (rad/s) of a gyro sample."""
+        self._response, self._settings = response, settings
+        self._least = _SHOWN * rate_noise / (_EFFICIENCY * math.sqrt(4.0 * _GYRO_HZ / 3.0))
+        self._shown_ns: list[int | None] = [None] * len(settings.limits)
+        self._running: tuple[int, int, int, float] | None = None
+        self._loud_ns = 0
+        self._tested: dict[int, int] = {}  # axes whose test is not reported, and end of the test (ns)
+
+    def request(self) -> None:
+        """Test all coils as soon as possible, because the body does not move as commanded."""
+        self._shown_ns = [-self._settings.interval_ns] * len(self._shown_ns)
+
+    def stop(self) -> None:
+        """End the tests, because a coil is suspected or its correction has changed."""
+        self._running = None
+        self._tested.clear()
+
+    def wave(self, wanted: FloatArray, usable: BoolArray, now_ns: int) -> FloatArray | None:
+        """Return the currents (3,), A, of a test instead of the `wanted` effective currents (3,), or None.
+
+        Only coils that are `usable` (3,) are tested.
+        """
+        if (np.abs(wanted) > _QUIET * self._settings.limits).any():
+            self._loud_ns, self._running = now_ns, None
+        for axis, shown_ns in enumerate(self._shown_ns):
+            if shown_ns is None or self._response.is_healthy(axis):
+                self._shown_ns[axis] = now_ns
+        if self._running is None and now_ns - self._loud_ns >= _CALM_NS:
+            self._begin(usable, now_ns)
+        if self._running is None:
+            return None
+        axis, since_ns, quarter_ns, current = self._running
+        quarter = (now_ns - since_ns) // quarter_ns
+        currents = np.zeros(len(self._shown_ns))
+        if quarter >= 4:
+            self._running, self._tested[axis], self._shown_ns[axis] = None, now_ns, now_ns
+        elif now_ns >= since_ns:
+            currents[axis] = current if quarter in {0, 3} else -current
+        return currents
+
+    def report(self, now_ns: int) -> str:
+        """Return the results of the last tests as text, once the motion has been evaluated, or ""."""
+        if not self._tested or self._running or now_ns - max(self._tested.values()) < _REPORT_NS:
+            return ""
+        tested, self._tested = sorted(self._tested), {}
+        return "; ".join(f"coil {AXES[axis]}: {self._response.text(axis)}" for axis in tested)
+
+    def _begin(self, usable: BoolArray, now_ns: int) -> None:
+        """Begin the test of the next coil that is due."""
+        interval_ns, strength = self._settings.interval_ns, self._response.strength
+        if strength is None:
+            return
+        for axis in np.flatnonzero(usable).tolist():
+            shown_ns = self._shown_ns[axis]
+            if shown_ns is None or now_ns - shown_ns < interval_ns:
+                continue
+            current, limit = self._least / float(strength[axis]), float(self._settings.limits[axis])
+            quarter = max(_SHORTEST_QUARTER, (current / limit) ** (2.0 / 3.0))
+            if quarter > _LONGEST_QUARTER:
+                self._shown_ns[axis] = now_ns - interval_ns + _NEAR_FIELD_NS
+                continue
+            self._running = axis, now_ns + _GAP_NS, round(quarter * 1e9), min(current, limit)
+            return
