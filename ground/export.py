@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import os
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,21 +56,27 @@ def _columns(layout: Layout, packets: PacketArray) -> Iterator[PacketColumn]:
 
 
 def write_csv(run: Run, folder: Path) -> list[Path]:
-    """Write `<packet>.csv` for each packet type and return the files. Raises OSError.
+    """Write `<packet>.csv` for each packet type, and return the files. Raises OSError.
 
-    The first row contains the names of the columns. The second row begins with '#' and contains the units.
+    The first row contains the names of the columns, and all other rows contain values. The file `fields.csv`
+    has one row for each column of each packet type, with its unit and meaning.
     """
-    paths = []
+    paths, described = [], []
     for name, columns in tables(run):
         paths.append(folder / f"{name}.csv")
+        described += [(name, column.name, column.unit, column.meaning) for column in columns]
         values = [v if isinstance(v, list) else v.tolist() for v in (column.values for column in columns)]
-        units = [column.unit for column in columns]
-        with paths[-1].open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow([column.name for column in columns])
-            writer.writerow([f"# {units[0]}", *units[1:]])
-            writer.writerows(zip(*values, strict=True))
+        _write_rows(paths[-1], [column.name for column in columns], zip(*values, strict=True))
+    paths.append(folder / "fields.csv")
+    _write_rows(paths[-1], ["packet", "name", "unit", "meaning"], described)
     return paths
+
+
+def _write_rows(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(head)
+        writer.writerows(rows)
 
 
 _TYPES = {"f": "REAL", "i": "INTEGER", "u": "INTEGER"}

@@ -1,6 +1,7 @@
-"""Tracked objects as CCSDS messages.
+"""Tracked objects, the observer's orbit and the attitude as CCSDS messages.
 
-Tracking Data Messages (503.0-B-2) and Orbit Parameter Messages (502.0-B-3) are in keyword = value notation.
+Tracking Data Messages (503.0-B-2), Orbit Parameter and Ephemeris Messages (502.0-B-3), and Attitude Ephemeris
+Messages (504.0-B-1) are in keyword = value notation.
 Initial orbits are determined from the sightings and the satellite's positions in the `track` packets.
 """
 
@@ -34,8 +35,10 @@ _SECOND_NS = 1_000_000_000
 
 
 def write_tracking_data(run: Run, path: Path) -> list[Path]:
-    """Write the measured tracks of a run to the file `path`, and return a list of this path.
+    """Write the measured tracks of a run to the file `path`, and return the written files.
 
+    If the satellite's own orbit was known, the file with the suffix `.oem` beside it has the positions of the
+    camera at the sightings, as an Orbit Ephemeris Message.
     Each object has one segment, with right ascension and declination measured in each frame, in ICRS at
     mid-exposure. The aberration of the camera is corrected, and the light time is not corrected. Standard
     deviations are written as comments, because the message format has no keyword for them. MAG is the mean
@@ -46,19 +49,102 @@ def write_tracking_data(run: Run, path: Path) -> list[Path]:
     if not len(measured) or not len(run["run"]):
         raise _no_object(run)
     start_ns = int(run["run"]["utc_ns"][-1])
-    lines = [
-        "CCSDS_TDM_VERS = 2.0",
-        f"CREATION_DATE = {ccsds_date(round(datetime.now(UTC).timestamp() * 1e9))}",
-        f"ORIGINATOR = {ORIGINATOR}",
-    ]
+    lines = _header("CCSDS_TDM_VERS = 2.0")
     for number in sorted(set(measured["number"].tolist())):
         lines += _segment(number, measured[measured["number"] == number], start_ns)
+    _write(path, lines)
+    _, first = np.unique(measured["middle_ns"], return_index=True)
+    placed = measured[first]
+    placed = placed[np.isfinite(np.hstack([placed["place"], placed["velocity"]])).all(axis=1)]
+    if len(placed) < 2:  # one state is not an ephemeris
+        return [path]
+    observer = path.with_suffix(".oem")
+    _write(observer, _ephemeris(placed, start_ns))
+    return [path, observer]
+
+
+def _ephemeris(placed: PacketArray, start_ns: int) -> list[str]:
+    """Return the lines of an Orbit Ephemeris Message of the camera, from `track` packets in order of time."""
+    dates = [ccsds_date(start_ns + int(time)) for time in placed["middle_ns"]]
+    states = 1e-3 * np.hstack([placed["place"], placed["velocity"]])
+    return [
+        *_header("CCSDS_OEM_VERS = 2.0"),
+        "",
+        "META_START",
+        "COMMENT Orbit as the satellite knew it at each sighting; standard deviation per axis "
+        f"{1e-3 * float(np.max(placed['place_sigma'])):.3f} km or less.",
+        *_of_satellite(),
+        "REF_FRAME = ICRF",
+        "TIME_SYSTEM = UTC",
+        f"START_TIME = {dates[0]}",
+        f"STOP_TIME = {dates[-1]}",
+        "META_STOP",
+        "",
+        *(
+            f"{date} " + " ".join(f"{value:.9f}" for value in state)
+            for date, state in zip(dates, states, strict=True)
+        ),
+    ]
+
+
+def write_attitudes(run: Run, path: Path) -> list[Path]:
+    """Write the estimated attitudes of a satellite as an Attitude Ephemeris Message, and return its file.
+
+    The quaternions rotate from ICRS into the body frame. Raises UsageError for a run without attitudes in
+    ICRS, such as a testbed's, and if `path` cannot be written.
+    """
+    packets = run["attitude"]
+    packets = packets[np.isfinite(packets["quaternion"]).all(axis=1)]
+    # Two packets of one time would be refused by readers.
+    packets = packets[np.unique(packets["time_ns"], return_index=True)[1]]
+    if not len(packets) or not len(run["navigation"]) or not len(run["run"]):
+        raise UsageError(f"{run.folder}: it has no attitudes of a satellite with respect to the stars")
+    start_ns = int(run["run"]["utc_ns"][-1])
+    dates = [ccsds_date(start_ns + int(time)) for time in packets["time_ns"]]
+    lines = [
+        *_header("CCSDS_AEM_VERS = 1.0"),
+        "",
+        "META_START",
+        "COMMENT Largest standard deviation about a body axis "
+        f"{math.degrees(float(np.nanmax(packets['angle_sigma']))):.4f} deg.",
+        *_of_satellite(),
+        "REF_FRAME_A = ICRF",
+        "REF_FRAME_B = SC_BODY_1",
+        "ATTITUDE_DIR = A2B",
+        "TIME_SYSTEM = UTC",
+        f"START_TIME = {dates[0]}",
+        f"STOP_TIME = {dates[-1]}",
+        "ATTITUDE_TYPE = QUATERNION",
+        "QUATERNION_TYPE = LAST",
+        "META_STOP",
+        "",
+        "DATA_START",
+        *(
+            f"{date} " + " ".join(f"{value:.10f}" for value in quaternion)
+            for date, quaternion in zip(dates, packets["quaternion"], strict=True)
+        ),
+        "DATA_STOP",
+    ]
+    _write(path, lines)
+    return [path]
+
+
+def _header(version: str) -> list[str]:
+    now = ccsds_date(round(datetime.now(UTC).timestamp() * 1e9))
+    return [version, f"CREATION_DATE = {now}", f"ORIGINATOR = {ORIGINATOR}"]
+
+
+def _of_satellite() -> list[str]:
+    return [f"OBJECT_NAME = {ORIGINATOR}", "OBJECT_ID = UNKNOWN", "CENTER_NAME = EARTH"]
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    """Write a message. Raises UsageError if the file cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("\n".join(lines) + "\n", encoding="ascii")
     except OSError as error:
         raise UsageError(f"{path}: the message cannot be written: {error.strerror or error}") from error
-    return [path]
 
 
 def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
@@ -194,17 +280,12 @@ def write_orbit_messages(found: list[ObjectOrbit], folder: Path) -> list[Path]:
         if item.orbit is None:
             continue
         path = folder / f"object-{item.number}.opm"
-        lines = _message(item, datetime.now(UTC))
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            path.write_text("\n".join(lines) + "\n", encoding="ascii")
-        except OSError as error:
-            raise UsageError(f"{path}: the message cannot be written: {error.strerror or error}") from error
+        _write(path, _message(item))
         paths.append(path)
     return paths
 
 
-def _message(item: ObjectOrbit, now: datetime) -> list[str]:
+def _message(item: ObjectOrbit) -> list[str]:
     orbit = item.orbit
     assert orbit is not None
     assert item.utc_ns is not None
@@ -219,12 +300,12 @@ def _message(item: ObjectOrbit, now: datetime) -> list[str]:
         for column, second in enumerate(_AXES[: row + 1]):
             unit = ("km**2", "km**2/s", "km**2/s**2")[(row > 2) + (column > 2)]
             covariance.append(f"C{first}_{second} = {1e-6 * orbit.covariance[row, column]:.9e} [{unit}]")
+    version, *header = _header("CCSDS_OPM_VERS = 3.0")
     return [
-        "CCSDS_OPM_VERS = 3.0",
+        version,
         f"COMMENT First orbit by angles only: {item.sightings} sightings in {item.span:.0f} s.",
         f"COMMENT Distance {1e-3 * orbit.distance:.1f} km at the epoch, {low:.1f} to {high:.1f} km by 95 %.",
-        f"CREATION_DATE = {ccsds_date(round(now.timestamp() * 1e9))}",
-        f"ORIGINATOR = {ORIGINATOR}",
+        *header,
         f"OBJECT_NAME = OBJECT-{item.number}",
         "OBJECT_ID = UNKNOWN",
         "CENTER_NAME = EARTH",

@@ -12,7 +12,7 @@ import numpy as np
 from flight.link.telemetry.log import find_runs
 from ground import report as reporting
 from ground.export import FORMATS, export
-from ground.messages import ObjectOrbit, orbits_of, write_orbit_messages, write_tracking_data
+from ground.messages import ObjectOrbit, orbits_of, write_attitudes, write_orbit_messages, write_tracking_data
 from ground.report.comparison import compare, format_archive, format_comparison, summarise_archive
 from ground.telemetry import read_run
 from knightcube.errors import UsageError
@@ -83,7 +83,7 @@ def configure_export(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flight export` to the parser."""
     parser.description = (
         "Write one CSV or Parquet file (extra `parquet`) per packet type, or one SQLite file with a table "
-        "per packet type; fields and units are in docs/telemetry.md."
+        "per packet type. Units and meanings are in the table or file `fields`, in Parquet the metadata."
     )
     parser.epilog = "example: python -m flight export runs/demo --format sqlite"
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
@@ -95,11 +95,19 @@ def configure_export(parser: argparse.ArgumentParser) -> None:
         metavar="PLACE",
         help=f"folder of the files, or the SQLite file (default {places})",
     )
-    parser.add_argument(
+    message = parser.add_mutually_exclusive_group()
+    message.add_argument(
         "--tdm",
         type=Path,
         metavar="FILE",
-        help="write only the tracks of objects, as a CCSDS Tracking Data Message",
+        help="write only the tracks of objects, as a CCSDS Tracking Data Message, and beside it the orbit of "
+        "the camera (suffix .oem), as an Orbit Ephemeris Message",
+    )
+    message.add_argument(
+        "--aem",
+        type=Path,
+        metavar="FILE",
+        help="write only the estimated attitudes of a satellite, as a CCSDS Attitude Ephemeris Message",
     )
     parser.add_argument("--json", action="store_true", help="print the files as one JSON object")
     parser.set_defaults(command=run_export)
@@ -109,6 +117,8 @@ def run_export(options: argparse.Namespace) -> int:
     """Write the exported files and print their paths."""
     if options.tdm is not None:
         paths = write_tracking_data(read_run(options.run), options.tdm)
+    elif options.aem is not None:
+        paths = write_attitudes(read_run(options.run), options.aem)
     else:
         place = options.out or options.run / FORMATS[options.format]
         paths = export(read_run(options.run), place, options.format)

@@ -22,10 +22,10 @@ from tests.ground.report.synthetic import Recipe, make_run
 from tests.manual_clock import ManualClock
 
 
-def read(path: Path) -> tuple[list[str], list[str], list[list[str]]]:
+def read(path: Path) -> tuple[list[str], list[list[str]]]:
     with path.open(newline="", encoding="utf-8") as file:
-        names, units, *rows = csv.reader(file)
-    return names, units, rows
+        names, *rows = csv.reader(file)
+    return names, rows
 
 
 def test_every_kind_of_packet_that_came_has_its_file(tmp_path: Path) -> None:
@@ -33,7 +33,7 @@ def test_every_kind_of_packet_that_came_has_its_file(tmp_path: Path) -> None:
     files = export(run, tmp_path / "csv")
     kinds = {
         *("run", "control", "target", "plan", "streak", "stars", "event", "truth"),
-        *("cycle_timing", "rate_group", "job_timing", "housekeeping"),
+        *("cycle_timing", "rate_group", "job_timing", "housekeeping", "fields"),
     }
     assert {path.stem for path in files} == kinds
     assert sorted(files) == sorted((tmp_path / "csv").iterdir())
@@ -42,9 +42,13 @@ def test_every_kind_of_packet_that_came_has_its_file(tmp_path: Path) -> None:
 def test_numbers_come_back_exactly_under_their_names_and_units(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path / "run", Recipe(duration=20.0, hold=10.0, rate_hz=10.0)))
     export(run, tmp_path / "csv")
-    names, units, rows = read(tmp_path / "csv" / "truth.csv")
+    names, rows = read(tmp_path / "csv" / "truth.csv")
     assert names[:6] == ["time_s", "quaternion_1", "quaternion_2", "quaternion_3", "quaternion_4", "rate_1"]
-    assert units[:6] == ["# s", "-", "-", "-", "-", "rad/s"]
+    _, fields = read(tmp_path / "csv" / "fields.csv")
+    own = [field for field in fields if field[0] == "truth"]
+    assert [field[1] for field in own] == names
+    assert [field[2] for field in own[:6]] == ["s", "-", "-", "-", "-", "rad/s"]
+    assert own[1][3] == "rotation of reference frame into body, scalar last"
     table = np.array(rows, dtype=float)
     np.testing.assert_array_equal(table[:, 0], np.arange(201) / 10.0)
     np.testing.assert_array_equal(table[:, 1:5], run["truth"]["quaternion"])
@@ -58,13 +62,21 @@ def test_numpy_reads_a_file_by_its_column_names(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table["q2"], run["control"]["q2"])
 
 
+def test_a_reader_of_other_authors_needs_no_options(tmp_path: Path) -> None:
+    csv_reader = pytest.importorskip("pyarrow.csv", reason="needs the extra `parquet`")
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=5.0, rate_hz=10.0)))
+    export(run, tmp_path / "csv")
+    table = csv_reader.read_csv(tmp_path / "csv" / "truth.csv")
+    np.testing.assert_array_equal(table["rate_2"].to_numpy(), run["truth"]["rate"][:, 1])
+
+
 def test_texts_with_commas_quotes_and_accents_survive(tmp_path: Path) -> None:
     text = 'said "no, thank you", été\nsecond line'
     log = FlightLog(tmp_path, clock=ManualClock())
     log.write(Packer().pack(EVENT, 1, code=1, severity=0, suppressed=0, name="a", text=text))
     log.close()
-    (path,) = export(read_run(tmp_path), tmp_path / "csv")
-    names, _, rows = read(path)
+    path, _ = export(read_run(tmp_path), tmp_path / "csv")
+    names, rows = read(path)
     assert dict(zip(names, rows[0], strict=True))["text"] == text
 
 
@@ -128,7 +140,9 @@ def test_all_formats_have_the_same_columns(tmp_path: Path) -> None:
     export(run, tmp_path / "one.sqlite", "sqlite")
     with closing(sqlite3.connect(tmp_path / "one.sqlite")) as database:
         for path in (tmp_path / "csv").iterdir():
-            names, _, rows = read(path)
+            names, rows = read(path)
+            if path.stem == "fields":
+                continue
             assert parquet.read_schema(tmp_path / "parquet" / f"{path.stem}.parquet").names == names
             cursor = database.execute(f'SELECT * FROM "{path.stem}"')
             assert [column[0] for column in cursor.description] == names

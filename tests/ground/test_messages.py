@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ground import messages
@@ -17,11 +18,20 @@ START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 ARCSECOND = math.radians(1.0 / 3600.0)
 
 
+UNPLACED = {"place": [math.nan] * 3, "velocity": [math.nan] * 3}
+"""Values of a track packet whose camera has no known orbit."""
+
+
 def sighting(time: float, number: int, ra: float, dec: float, **values: Any) -> tuple[float, dict[str, Any]]:
     """Return a track packet of a sighting at angles in degrees."""
     a, d = math.radians(ra), math.radians(dec)
     direction = [math.cos(d) * math.cos(a), math.cos(d) * math.sin(a), math.sin(d)]
-    known = {"measured_sigma": 10.0 * ARCSECOND, "magnitude": math.nan, "magnitude_sigma": math.nan}
+    known = {
+        "measured_sigma": 10.0 * ARCSECOND,
+        "magnitude": math.nan,
+        "magnitude_sigma": math.nan,
+        **UNPLACED,
+    }
     found = {"number": number, "middle_ns": round(time * 1e9), "measured": direction, **known}
     return time, {**found, **values}
 
@@ -70,6 +80,60 @@ def test_a_tracking_message_has_the_angles_of_every_sighting_by_object(tmp_path:
     assert "COMMENT 10.00 to 30.00 arcsec, including the attitude error." in text
     assert "COMMENT Standard deviation of MAG 0.200 in the median, 0.300 at most:" in text
     assert text.count("Standard deviation of MAG") == 1, "the first object has no magnitude"
+
+
+def test_the_orbit_of_the_camera_stands_beside_the_tracks(tmp_path: Path) -> None:
+    """Two objects of one frame share its state; a sighting without a known orbit has none."""
+    states = [([7e6 + k, -1e6, 2e6], [1e3, 7e3 - k, -5e2]) for k in range(3)]
+    track = [
+        sighting(1.0 + k, number, 10.0, 5.0, place=place, velocity=velocity, place_sigma=20.0 + k)
+        for k, (place, velocity) in enumerate(states)
+        for number in (1, 2)
+    ]
+    track.append(sighting(9.0, 1, 11.0, 5.0, place=[math.nan] * 3, velocity=[math.nan] * 3))
+    path = tmp_path / "tracks.tdm"
+    run = packed_run(run=[LABEL], track=track)
+    assert messages.write_tracking_data(run, path) == [path, tmp_path / "tracks.oem"]
+    text = (tmp_path / "tracks.oem").read_text(encoding="ascii")
+    assert "STOP_TIME = 2026-01-01T00:00:03.000000" in text
+    assert "standard deviation per axis 0.022 km or less" in text
+    rows = [line.split() for line in text.splitlines() if line.startswith("2026")]
+    assert [row[0] for row in rows] == [f"2026-01-01T00:00:0{k}.000000" for k in (1, 2, 3)]
+    read = np.array([row[1:] for row in rows], dtype=float) * 1e3
+    np.testing.assert_allclose(read, [[*place, *velocity] for place, velocity in states], atol=1e-5)
+    reader = pytest.importorskip("ccsds_ndm.ndm_io").NdmIo()
+    (segment,) = reader.from_path(tmp_path / "tracks.oem").body.segment
+    assert [float(one.x.value) for one in segment.data.state_vector] == pytest.approx(read[:, 0] * 1e-3)
+
+
+def test_the_attitudes_are_read_by_a_reader_of_other_authors(tmp_path: Path) -> None:
+    turned = [[0.6, 0.0, 0.0, 0.8], [0.0, -0.6, 0.0, 0.8]]
+    run = packed_run(
+        run=[LABEL],
+        navigation=[(0.0, {})],
+        attitude=[
+            (0.5, {"quaternion": [math.nan] * 4}),
+            *((1.0 + k, {"quaternion": one, "angle_sigma": [0.01] * 3}) for k, one in enumerate(turned)),
+        ],
+    )
+    path = tmp_path / "attitude.aem"
+    assert messages.write_attitudes(run, path) == [path]
+    text = path.read_text(encoding="ascii")
+    assert "START_TIME = 2026-01-01T00:00:01.000000" in text
+    assert "about a body axis 0.5730 deg" in text
+    rows = [line.split()[1:] for line in text.splitlines() if line.startswith("2026")]
+    np.testing.assert_allclose(np.array(rows, dtype=float), turned, atol=1e-9)
+    reader = pytest.importorskip("ccsds_ndm.ndm_io").NdmIo()
+    (segment,) = reader.from_path(path).body.segment
+    read = [one.quaternion_state.quaternion for one in segment.data.attitude_state]
+    found = [[float(getattr(one, name)) for name in ("q1", "q2", "q3", "qc")] for one in read]
+    np.testing.assert_allclose(found, turned, atol=1e-9)
+
+
+def test_a_testbed_has_no_attitudes_in_icrs(tmp_path: Path) -> None:
+    run = packed_run(run=[LABEL], attitude=[(1.0, {"quaternion": [0.0, 0.0, 0.0, 1.0]})])
+    with pytest.raises(UsageError, match="no attitudes of a satellite"):
+        messages.write_attitudes(run, tmp_path / "attitude.aem")
 
 
 def test_a_run_without_sightings_has_no_message(tmp_path: Path) -> None:

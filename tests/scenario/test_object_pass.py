@@ -111,7 +111,9 @@ def test_its_track_is_where_the_object_is_to_what_it_claims(flown: Run) -> None:
 
 def test_the_message_of_the_pass_is_read_by_a_reader_of_other_authors(flown: Run, tmp_path: Path) -> None:
     reader = pytest.importorskip("ccsds_ndm.ndm_io").NdmIo()
-    (path,) = write_tracking_data(flown, tmp_path / "pass.tdm")
+    path, observer = write_tracking_data(flown, tmp_path / "pass.tdm")
+    (orbit,) = reader.from_path(observer).body.segment
+    assert len(orbit.data.state_vector) > 30
     (segment,) = reader.from_path(path).body.segment
     one, two = (
         [getattr(item, name) for item in segment.data.observation if getattr(item, name)]
