@@ -149,7 +149,7 @@ def _bus(config: Config) -> list[str]:
     ]
 
 
-def _check_single(path: Path) -> None:
+def check_single(path: Path) -> None:
     """Raise ConfigError for a configuration that extends another file, which its checksum does not cover."""
     if len(read_document(read_text(path), str(path)).chain) > 1:
         problem = "its checksum covers one file: write it as one file by `flight check FILE --merged NEW`"
@@ -161,7 +161,7 @@ def main(words: list[str]) -> int:
     make = {"--safe": safe_dropin, "--link": link_dropin}.get(words[0], dropin)
     try:
         path = Path(words[-1])
-        _check_single(path)
+        check_single(path)
         sys.stdout.write(make(load(path)))
     except UsageError as error:
         sys.stderr.write(f"install: {error}\n")

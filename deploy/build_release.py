@@ -23,6 +23,8 @@ from releases import MANIFEST, linked, manifest_text
 
 SOURCE = "source"
 """File of a release with the SHA-256 digest of its sources and build options."""
+LOCK = "requirements.lock"
+"""File of a release with the lock file from which its packages were installed."""
 SELF_TEST_S = 10
 _PARTS = ("knightcube", "flight", "hal", "sim_hal", "deploy", "config/step_demo.yaml", "pyproject.toml")
 _BOARD_LOCK = "deploy/requirements.lock"
@@ -53,6 +55,7 @@ class Build:
         self._test(python)
         if not self._options.dry_run:
             (release / SOURCE).write_text(wanted, encoding="ascii")
+            shutil.copyfile(self._source / _BOARD_LOCK, release / LOCK)
             os.sync()  # the files listed in the manifest reach the disk first
             _write(release / MANIFEST, manifest_text(release))
         sys.stdout.write(f"{release.name}\n")
@@ -70,7 +73,10 @@ class Build:
         quiet = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
         self._run([options.python, "-m", "venv", venv])
         # The lock file also lists the build backend, so only packages with a verified hash build a release.
-        self._run([*quiet, *found, "--require-hashes", "--no-deps", "-r", self._source / _BOARD_LOCK])
+        if options.reuse:
+            self._copy_packages(self.releases / options.reuse, release)
+        else:
+            self._run([*quiet, *found, "--require-hashes", "--no-deps", "-r", self._source / _BOARD_LOCK])
         with tempfile.TemporaryDirectory() as folder:
             # A copy is built, because a killed build leaves files that a later build would include.
             source = Path(folder) / "source" if not options.dry_run else self._source
@@ -82,6 +88,18 @@ class Build:
         for ground in venv.glob("lib/python3*/site-packages/ground"):
             shutil.rmtree(ground)
         return python
+
+    def _copy_packages(self, old: Path, release: Path) -> None:
+        """Copy the packages of an older release, which must have been built from the same lock file."""
+        if _text(old / LOCK) != _text(self._source / _BOARD_LOCK) or not _text(old / LOCK):
+            sys.stderr.write(f"install: failed: {old.name} has other packages: add the folder wheels\n")
+            raise SystemExit(1)
+        ours = shutil.ignore_patterns(
+            "__pycache__", "flight", "hal", "sim_hal", "knightcube", "knightcube*.dist-info"
+        )
+        for packages in old.glob("venv/lib/python3*/site-packages"):
+            place = release / packages.relative_to(old)
+            shutil.copytree(packages, place, symlinks=True, ignore=ours, dirs_exist_ok=True)
 
     def _test(self, python: Path) -> None:
         """Test a release: import its modules, print its version, and fly ten seconds in lock-step."""
@@ -208,6 +226,7 @@ def main(words: list[str]) -> int:
     parser.add_argument("--python", default="python3")
     parser.add_argument("--wheels", default="")
     parser.add_argument("--venv", default="")
+    parser.add_argument("--reuse", default="", metavar="RELEASE", help="take the packages of this release")
     parser.add_argument("--dry-run", action="store_true")
     options = parser.parse_args(words)
     if options.action == "build":

@@ -184,7 +184,7 @@ build_release() {
 
 # Have the new release fly from the next start on. What starts it is placed first, and serves both releases.
 switch_release() {
-    for file in coils-off fly releases.py safe_state.py; do
+    for file in coils-off fly releases.py safe_state.py renewal.py open_bundle.py board_dropin.py; do
         place 755 "$deploy/$file" "$prefix/bin/$file"
     done
     place 644 "$source/hal/buses/smbus_byte.py" "$prefix/bin/smbus_byte.py"
@@ -264,11 +264,20 @@ install_modules() {
 }
 
 install_units() {
-    for unit in knightcube.service knightcube-safe.service; do
+    for unit in knightcube.service knightcube-safe.service knightcube-renewal.service knightcube-renewal.timer; do
         place 644 "$deploy/$unit" "$units/$unit"
     done
+    [ ! -e "$settings/root.json" ] || place 644 "$settings/root.json" "$prefix/share/root.json"
+    in_root is-enabled --quiet knightcube-renewal.timer 2>/dev/null ||
+        run in_root enable --quiet knightcube-renewal.timer
     in_root is-enabled --quiet knightcube.service 2>/dev/null ||
         run in_root enable --quiet knightcube.service
+}
+
+# What a person accepted on the ground is the last resort of the command-loss timer.
+keep_accepted() {
+    [ ! -x "$prefix/bin/renewal.py" ] || [ -n "$dry" ] ||
+        python3 -I -S "$prefix/bin/renewal.py" --root "${root:-/}" --accepted
 }
 
 install_all() {
@@ -278,6 +287,7 @@ install_all() {
     switch_release
     install_units
     link_venv
+    keep_accepted
     install_rules
     install_modules
     reload
@@ -290,6 +300,7 @@ accept_settings() {
     flown=$settings/flight.yaml
     release=$prefix/current
     install_settings
+    keep_accepted
     reload
     say_next accepted
 }
@@ -311,12 +322,16 @@ say_next() {
 uninstall_all() {
     remove_link
     if systemd_runs; then
-        run systemctl stop knightcube.service knightcube-safe.service || true
+        run systemctl stop knightcube-renewal.timer knightcube.service knightcube-safe.service || true
+    fi
+    if in_root is-enabled --quiet knightcube-renewal.timer 2>/dev/null; then
+        run in_root disable --quiet knightcube-renewal.timer
     fi
     if in_root is-enabled --quiet knightcube.service 2>/dev/null; then
         run in_root disable --quiet knightcube.service
     fi
     run rm -rf "$units/knightcube.service" "$units/knightcube-safe.service" \
+        "$units/knightcube-renewal.service" "$units/knightcube-renewal.timer" "$root$logs-renewal" \
         "$units/knightcube.service.d" "$units/knightcube-safe.service.d" "$rules" "$modules" "$prefix" "$cache"
     if [ -n "$purge" ]; then
         run rm -rf "$settings" "$root$logs" "$root$logs-link"

@@ -8,7 +8,6 @@ The function `open_flight` opens logs, guardian, devices, workers and channels, 
 
 from __future__ import annotations
 
-import importlib
 import math
 import os
 import sys
@@ -70,7 +69,7 @@ from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
 from flight.loop.worker_processes import ProcessRunner
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_settings
-from flight.schema.document import ConfigError, merged_text, read_text
+from flight.schema.document import ConfigError, imported, merged_text, read_text
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.buses.clock import SystemClock
 from hal.buses.linux_process import worker_cores
@@ -308,15 +307,7 @@ BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED", "orbit": "flight.bodi
 
 def body_kind(config: Config) -> BodyKind:
     """Return the kind of body that the configuration names. Raises ConfigError."""
-    place = BODIES.get(config.body, config.body)
-    module, colon, name = place.partition(":")
-    if not (module and colon and name):
-        known = ", ".join(BODIES)
-        raise ConfigError("body", f"is {config.body!r}: name one of {known}, or `module:object`")
-    try:
-        kind = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError("body", f"is {config.body!r}, which cannot be loaded: {error}") from error
+    kind = imported("body", config.body, BODIES, os.environ)
     if not isinstance(kind, BodyKind):
         raise ConfigError("body", f"is {config.body!r}: this object is not a BodyKind of flight.loop.body")
     return kind

@@ -111,7 +111,8 @@ class WorkerProcess:
         function = f"{worker.function.__module__}:{worker.function.__qualname__}"
         words = [function, str(line), str(memory), str(os.getpid()), ",".join(map(str, sorted(cores)))]
         return subprocess.Popen(
-            [sys.executable, "-m", MODULE, *words],
+            # A service runs isolated: its working folder and environment provide no modules.
+            [sys.executable, *(["-I"] if sys.flags.isolated else []), "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
             # A process group of its own protects the worker from Ctrl-C; the control process ends its worker.

@@ -8,10 +8,13 @@ Aliases, duplicate keys, application tags, infinite numbers and NaN are rejected
 from __future__ import annotations
 
 import difflib
+import importlib
 import math
 import os
 import re
-from collections.abc import Iterator
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -66,6 +69,44 @@ class Document:
             known = re.sub(r"(\.[^.\[]+|\[[^\]]*\]|^[^.\[]+)$", "", known)
         where = f"{self.files.get(known, self.name)}:{self.lines[known]}" if known else self.name
         return ConfigError(where, f"`{dotted or 'configuration'}` {problem}")
+
+
+MODULES = "KNIGHTCUBE_MODULES"
+"""Environment variable of a board, which names the file of further permitted objects `module:object`."""
+
+
+def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
+    """Return an object that a configuration names as `module:object`, or by a key of `known`.
+
+    On a board, only known objects and those in the file of the variable `KNIGHTCUBE_MODULES` are imported.
+
+    Raises ConfigError for an object that is not permitted or cannot be imported.
+    """
+    place = known.get(named, named)
+    module, colon, name = place.partition(":")
+    if not (module and colon and name):
+        raise ConfigError(key, f"is {named!r}: name one of {', '.join(known)}, or `module:object`")
+    file = environment.get(MODULES)
+    if file is not None and place not in known.values() and place not in _permitted(Path(file)):
+        raise ConfigError(key, f"is {named!r}: add it as a line to {file}, which belongs to root")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(key, f"is {named!r}, which cannot be imported: {error}") from error
+
+
+def _permitted(path: Path) -> list[str]:
+    """Return the lines of a file, or nothing if anybody but root could have written it."""
+    with suppress(OSError, UnicodeDecodeError), path.open(encoding="utf-8", opener=_without_waiting) as file:
+        found = os.fstat(file.fileno())
+        if stat.S_ISREG(found.st_mode) and found.st_uid == 0 and not found.st_mode & 0o022:
+            return file.read(_LONGEST).split()
+    return []
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a file; a FIFO at this path does not block."""
+    return os.open(path, flags | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
 
 
 class _Loader(yaml.SafeLoader):

@@ -174,7 +174,9 @@ class Link(Section, frozen=True, kw_only=True):
     Without `peers`, a loopback address accepts frames from this machine, any other address from its network
     of 256 addresses. The value `serial` describes the line of a radio. Telemetry is sent to authenticated
     senders, to `telemetry_to` (HOST:PORT, UDP), to all clients of `tcp` and to `serial`. Telemetry frames
-    have `frame_bytes` bytes, and each line carries at most `rate` bytes/s.
+    have `frame_bytes` bytes, and each line carries at most `rate` bytes/s. After `command_loss` s with power
+    without an authentic frame, a board returns to its previous release, after the same time again to its
+    previous configuration, then to the configuration accepted on the ground; 0 switches this off.
     """
 
     keys: Annotated[str, Meta(min_length=1)]
@@ -186,6 +188,7 @@ class Link(Section, frozen=True, kw_only=True):
     peers: Annotated[tuple[Peer, ...], Meta(min_length=1)] | None = None
     frame_bytes: Annotated[int, Meta(ge=128, le=2048)] = 1115
     rate: Annotated[float, Meta(ge=100.0, le=1.0e7)] = 50_000.0
+    command_loss: Annotated[float, Meta(ge=0.0, le=3.2e7)] = 0.0
 
 
 class Telemetry(Section, frozen=True, kw_only=True):

@@ -9,6 +9,7 @@ COMMANDS = {
     ),
     "keys": ("operate", "make the keys of an authenticated link", "station:configure_keys"),
     "files": ("operate", "list, get and put the files of a satellite", "satellite:configure_files"),
+    "renewal": ("operate", "sign, activate and confirm a renewal of a satellite", "renewal:configure"),
     "gateway": (
         "operate",
         "relay plain packets between a ground station and the link",

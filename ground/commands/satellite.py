@@ -40,6 +40,7 @@ from flight.link.modes import Mode
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import (
+    KINDS,
     CancelFile,
     DeleteFile,
     Deletion,
@@ -54,7 +55,7 @@ from flight.link.process.directives import (
     SuspendFile,
     UseFile,
 )
-from flight.link.process.filing import KINDS, LISTING
+from flight.link.process.filing import LISTING
 from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.telemetry.definitions import (
     COMMAND,

@@ -7,8 +7,8 @@ written `module:factory`, which takes `WorldInputs` and returns a `World`. A wor
 
 from __future__ import annotations
 
-import importlib
 import math
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -17,7 +17,7 @@ import numpy as np
 
 from flight.link.telemetry.definitions import ORBIT_TRUTH, TRUE_DESCRIPTION, TRUTH
 from flight.link.telemetry.packets import Packer
-from flight.schema.document import ConfigError
+from flight.schema.document import ConfigError, imported
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
@@ -121,15 +121,7 @@ class WorldInputs:
 def make_world(inputs: WorldInputs) -> World:
     """Return the world that a configuration names. Raises ConfigError for an unknown world."""
     named = inputs.section.world
-    module, colon, name = WORLDS.get(named, named).partition(":")
-    if not (module and colon and name):
-        raise ConfigError(
-            "simulation.world", f"is {named!r}: name one of {', '.join(WORLDS)}, or `module:factory`"
-        )
-    try:
-        factory = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError("simulation.world", f"is {named!r}, which cannot be imported: {error}") from error
+    factory = imported("simulation.world", named, WORLDS, os.environ)
     world = factory(inputs) if callable(factory) else None
     if not isinstance(world, World):
         raise ConfigError(

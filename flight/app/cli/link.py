@@ -138,7 +138,7 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
         tempfile.TemporaryDirectory(prefix="knightcube-")
     )
     control: ControlLine[Sent] = ControlLine(judged.socket, Path(folder))
-    settings = StationSettings(section.spacecraft, section.frame_bytes, section.rate)
+    settings = StationSettings(section.spacecraft, section.frame_bytes, section.rate, section.command_loss)
     station = Station(settings, vault, lines, control, LogFollower(log), clock)
     return _OpenedLink(station, ", ".join(line.name for line in lines))
 

@@ -20,6 +20,8 @@ from flight.link.telemetry.packets import (
     to_text,
 )
 
+KINDS = ("configuration", "elements", "catalogue", "release")
+"""Kinds of files that the satellite receives. Each kind is also the name of a folder."""
 SUM_BYTES = 32
 LONGEST_COMMAND = 96
 """Maximum length (bytes) of a command in words, including the terminating zero byte."""
@@ -61,6 +63,25 @@ USE_FILE = telecommand(
     hazard="the board may use the file from now on",
 )
 DELETE_FILE = telecommand("delete-file", 0x227, "Delete a received file", _NAME, hazard="deletes the file")
+_KIND = Field("kind", "u1", "-", "kind of the artefact", states=tuple(enumerate(KINDS)))
+ACTIVATE = telecommand(
+    "activate",
+    0x2B0,
+    "Try a received and signed artefact until it is confirmed, and return to the previous one otherwise",
+    _NAME,
+    Field("sum", "u1", "-", "SHA-256 of the bundle", SUM_BYTES),
+    Field("hours", "f4", "h", "time with power within which the ground must confirm"),
+    Field("despite_faults", "u1", "-", "1 if a reaction to SAFE does not end the trial"),
+    hazard="restarts flight and link with another configuration or release",
+)
+CONFIRM = telecommand("confirm", 0x2B1, "End the trial of an artefact, which stays", _KIND)
+WITHDRAW = telecommand(
+    "withdraw",
+    0x2B2,
+    "End the trial of an artefact, or return to the previous configuration or release",
+    _KIND,
+    hazard="restarts flight and link with another configuration or release",
+)
 PLAY = telecommand(
     "play",
     0x2A0,
@@ -150,6 +171,44 @@ class UseFile:
 
 
 @dataclass(frozen=True, slots=True)
+class Activate:
+    """Directive to try the received bundle `name` of a signed artefact (docs/fly/renewal.md).
+
+    Attributes:
+        name: name of the bundle in the list of files.
+        sum: SHA-256 of the bundle.
+        hours: time with power within which the ground must confirm the artefact, h.
+        despite_faults: 1 if a reaction to SAFE does not end the trial.
+    """
+
+    name: str
+    sum: bytes
+    hours: float
+    despite_faults: int
+
+    def __str__(self) -> str:
+        return f"activate {self.name} for {self.hours:g} h"
+
+
+@dataclass(frozen=True, slots=True)
+class _OnRenewal:
+    """Directive about the renewal of one kind of artefact, an index of `KINDS`."""
+
+    kind: int
+
+    def __str__(self) -> str:
+        return f"{type(self).__name__.lower()} {KINDS[self.kind]}"
+
+
+class Confirm(_OnRenewal):
+    """Directive to end a trial in favour of the new artefact."""
+
+
+class Withdraw(_OnRenewal):
+    """Directive to return to the previous configuration or release."""
+
+
+@dataclass(frozen=True, slots=True)
 class DeleteFile:
     """Directive to delete a received file."""
 
@@ -228,7 +287,9 @@ class Listing:
 
 
 FileDirective = ListFiles | SendFile | CancelFile | SuspendFile | ResumeFile | UseFile | DeleteFile
-Directive = Play | Stop | NewKey | Scheduled | Deletion | Listing | FileDirective
+Directive = (
+    Play | Stop | NewKey | Scheduled | Deletion | Listing | Activate | Confirm | Withdraw | FileDirective
+)
 
 _PACKETS: dict[type[Any], Packet] = {
     Play: PLAY,
@@ -244,6 +305,9 @@ _PACKETS: dict[type[Any], Packet] = {
     ResumeFile: RESUME_FILE,
     UseFile: USE_FILE,
     DeleteFile: DELETE_FILE,
+    Activate: ACTIVATE,
+    Confirm: CONFIRM,
+    Withdraw: WITHDRAW,
 }
 """Packet definition of each directive class. Packet fields and class attributes have the same names."""
 _KINDS = {packet.name: kind for kind, packet in _PACKETS.items()}
@@ -295,6 +359,8 @@ def unpack(data: bytes) -> Directive | None:
     directive: Directive = _KINDS[layout.packet.name](**values)
     if isinstance(directive, Play) and not directive.begin <= directive.end:  # NaN compares false
         raise CommandError(f"from {directive.begin:g} to {directive.end:g} s is not an interval of time")
+    if values.get("kind", 0) >= len(KINDS):
+        raise CommandError(f"kind {values['kind']} is unknown")
     if values.get("entity", GROUND) not in dict(_ENTITY.states):
         raise CommandError(f"entity {values['entity']} does not receive files")
     return directive

@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from flight.link.files.transfer import (
 from flight.link.files.units import DOWN, Metadata, PduError, UnitPacker, unit_of
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import (
+    KINDS,
     SEND_FILE,
     CancelFile,
     DeleteFile,
@@ -45,8 +46,6 @@ from flight.link.process.directives import (
 from flight.link.regular_files import make_lasting
 from knightcube.errors import UsageError
 
-KINDS = ("configuration", "elements", "catalogue", "release")
-"""Kinds of files that the satellite receives. Each kind is also the name of a folder."""
 LARGEST_UP = 64 << 20
 """Maximum size (bytes) of a received file."""
 MOST_RECEIVED = 256 << 20
@@ -148,12 +147,23 @@ class Filing:
                     self._entity.suspend(source, number, suspended=False)
                 case DeleteFile(name):
                     self._received(name).unlink()
-                case UseFile(name, wanted):
-                    self._checks.append((done, self._choosing(self._received(name), name, wanted)))
-                    return []
+                case UseFile():
+                    return self.select(directive, done, str)
         except (FileError, OSError) as error:
             return [replace(done, stage=Stage.FAILED, text=str(error))]
         return [done]
+
+    def select(self, use: UseFile, done: Report, then: Callable[[], str]) -> list[Report]:
+        """Check and select a received file in steps, and report `done` if the function `then` succeeds.
+
+        The function `then` returns its problem, or an empty text. Returns the reports due now.
+        """
+        try:
+            path = self._received(use.name)
+        except FileError as error:
+            return [replace(done, stage=Stage.FAILED, text=str(error))]
+        self._checks.append((done, self._choosing(path, use.name, use.sum, then)))
+        return []
 
     def close(self, now_ns: int) -> None:
         """Store the received data and close all files. Raises FileError if the disk fails."""
@@ -216,7 +226,9 @@ class Filing:
         write_whole(path, json.dumps({"free": free, "files": files}).encode())
         return path
 
-    def _choosing(self, path: Path, name: str, wanted: bytes) -> Iterator[str | None]:
+    def _choosing(
+        self, path: Path, name: str, wanted: bytes, then: Callable[[], str]
+    ) -> Iterator[str | None]:
         """Copy a received file in steps, check the SHA-256 of the copied bytes and select the copy.
 
         The received file may change meanwhile, but the selected file is the one that was checked. Yields None
@@ -243,7 +255,7 @@ class Filing:
         for other in folder.iterdir():
             if other.name != own:
                 other.unlink()
-        yield ""
+        yield then()
 
     def _go_on_checking(self) -> Iterator[Report]:
         for check in list(self._checks):

@@ -15,7 +15,9 @@ import struct
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from ipaddress import IPv4Address, IPv4Network
+from pathlib import Path
 from typing import Any, Protocol
 
 from flight.link import commands
@@ -44,9 +46,22 @@ from flight.link.process.commanding import (
     report,
     request_of,
 )
-from flight.link.process.directives import Deletion, Directive, Listing, NewKey, Play, Scheduled, Stop
+from flight.link.process.directives import (
+    Activate,
+    Confirm,
+    Deletion,
+    Directive,
+    Listing,
+    NewKey,
+    Play,
+    Scheduled,
+    Stop,
+    UseFile,
+    Withdraw,
+)
 from flight.link.process.downlink import Downlink, LogFollower, Playback, time_of
 from flight.link.process.filing import Filing, values_of
+from flight.link.process.renewal import STATUS, Renewal
 from flight.link.security import (
     COMMAND_SPIS,
     TELEMETRY_SPIS,
@@ -375,11 +390,15 @@ class StationSettings:
         spacecraft: spacecraft identifier in all frames.
         frame_bytes: length of a telemetry frame, bytes.
         rate: data rate of the telemetry, bytes/s.
+        command_loss: time without an authentic frame after which the board suspects itself, s; 0 for none.
+        renewal: status file of the privileged part of the renewal.
     """
 
     spacecraft: int
     frame_bytes: int
     rate: float
+    command_loss: float = 0.0
+    renewal: Path = STATUS
 
 
 class Station:
@@ -406,6 +425,8 @@ class Station:
             settings.spacecraft, settings.frame_bytes, settings.rate, self._seal, self._next_unit
         )
         self._filing = Filing(files_folder(vault.folder), log.place, clock.now_ns())
+        folder = vault.folder.absolute().parent / "renewal"
+        self._renewal = Renewal(folder, settings.renewal, settings.command_loss)
         self._verification = Verification()
         self._packer, self._commands = Packer(), CommandPacker()
         self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
@@ -478,6 +499,7 @@ class Station:
             self._report(*[ending] if ending else [])
         if now_ns >= self._status_ns:
             self._status_ns = now_ns + SECOND_NS
+            self._report(*self._renewal.turn(self._gate.admitted, now_ns))
             self._status()
         try:
             frames = self._downlink.frames(now_ns)
@@ -561,16 +583,28 @@ class Station:
             case NewKey():
                 problem = _change_key(directive, self._vault, self._gate, self._sealers)
                 return [replace(done, stage=Stage.FAILED, text=problem) if problem else done]
+            case Activate() | Confirm() | Withdraw():
+                return self._renew(directive, done)
             case Scheduled() | Deletion() | Listing():
                 return self._scheduling.obey(directive, done, self._clock.utc_ns())
             case _:
                 return self._filing.obey(directive, done, self._clock.utc_ns(), self._clock.now_ns())
+
+    def _renew(self, directive: Activate | Confirm | Withdraw, done: Report) -> list[Report]:
+        """Hand a directive over to the privileged part, which reports its completion."""
+        request = partial(self._renewal.request, directive, done)
+        handed_over = replace(done, stage=Stage.STARTED, text=f"{directive}: handed over")
+        if isinstance(directive, Activate):
+            return self._filing.select(UseFile(directive.name, directive.sum), handed_over, request)
+        problem = request()
+        return [replace(done, stage=Stage.FAILED, text=problem) if problem else handed_over]
 
     def _follow(self, now_ns: int) -> None:
         for packet in self._log.new():
             self._mission_ns, self._mission_at_ns = time_of(packet), now_ns
             self._downlink.live(packet)
             self._scheduling.followed(packet)
+            self._renewal.followed(packet)
             self._report(*self._verification.followed(packet))
         if self._log.label and now_ns >= self._label_ns:
             self._label_ns = now_ns + _LABEL_NS

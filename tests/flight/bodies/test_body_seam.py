@@ -57,8 +57,8 @@ def test_a_third_partys_body_is_flown_by_its_name(tmp_path: Path) -> None:
     ("name", "complaint"),
     [
         ("orbiter", "name one of testbed"),
-        ("no_such_module:BODY", "cannot be loaded"),
-        ("tests.flight.bodies.plain_body:MISSING", "cannot be loaded"),
+        ("no_such_module:BODY", "cannot be imported"),
+        ("tests.flight.bodies.plain_body:MISSING", "cannot be imported"),
         ("tests.flight.bodies.plain_body:NO_BODY", "not a BodyKind"),
     ],
 )

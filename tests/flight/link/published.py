@@ -101,6 +101,7 @@ COMMANDS: tuple[tuple[str, int, str, bool], ...] = (
 )
 """Name, APID, fields, and whether a hazard is stated, of each command."""
 
+_KINDS = "{0=configuration,1=elements,2=catalogue,3=release}"
 DIRECTIVES: tuple[tuple[str, int, str, bool], ...] = (
     ("schedule", 0x220, "at:S32 words:S96", True),
     ("unschedule", 0x221, "number:u4", False),
@@ -112,6 +113,9 @@ DIRECTIVES: tuple[tuple[str, int, str, bool], ...] = (
     ("resume-file", 0x22A, "source:u2 number:u4", False),
     ("use-file", 0x226, f"{_NAME} sum:32u1", True),
     ("delete-file", 0x227, _NAME, True),
+    ("activate", 0x2B0, f"{_NAME} sum:32u1 hours:f4 despite_faults:u1", True),
+    ("confirm", 0x2B1, f"kind:u1{_KINDS}", False),
+    ("withdraw", 0x2B2, f"kind:u1{_KINDS}", True),
     ("play", 0x2A0, "run:u4 begin:f8 end:f8", False),
     ("stop-playback", 0x2A1, "", False),
     ("new-key", 0x2A2, "spi:u2 generation:u4 key:32u1", False),

@@ -1,0 +1,190 @@
+"""Checks a signed bundle of a renewal, and prepares its content for installation.
+
+The program renewal.py runs `open_bundle.py TRUSTED ROOT BUNDLE KIND FOLDER PRESENT KEPT` as root with the
+Python of a release. A bundle is a compressed tar archive of TUF metadata and of one artefact, whose target
+path is its kind. The metadata are checked by python-tuf against the metadata in the folder TRUSTED, whose
+versions never decrease, and against the first root metadata in the file ROOT. The "network" of python-tuf is
+the folder of the unpacked bundle.
+
+The program writes the artefact to FOLDER/artefact. For a configuration, it also writes FOLDER/set with the
+configuration and the drop-ins of its units. Elements and a catalogue become a configuration by replacing one
+value in the configuration PRESENT; KEPT is the folder that will contain the catalogue. The program prints
+version, permission to go back and SHA-256 as one JSON object. A refused bundle gives one line and exit
+status 1.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import lzma
+import re
+import sys
+import tarfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from tuf.api.exceptions import DownloadError, DownloadHTTPError, RepositoryError
+from tuf.ngclient import FetcherInterface, Updater
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import board_dropin
+
+from flight.schema.document import ConfigError
+from flight.schema.reader import load
+from knightcube.errors import UsageError
+
+LARGEST_METADATA, LARGEST_TARGET, MOST_MEMBERS = 1 << 19, 1 << 28, 300
+"""Maximum sizes (bytes) of a metadata file and of an artefact, and maximum number of files in a bundle."""
+_METADATA = re.compile(r"metadata/(\d{1,6}\.root|timestamp|snapshot|targets)\.json")
+_VALUES = {"elements": ("elements",), "catalogue": ("camera", "star_tracker", "index")}
+"""Path of the configuration value that each kind of artefact replaces."""
+
+
+class Refused(Exception):
+    """Raised for a bundle that must not be installed. The text states the reason."""
+
+
+class FolderFetcher(FetcherInterface):  # type: ignore[misc]  # the package may be missing where types are checked
+    """Reads the files of an unpacked bundle in place of downloads."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def _fetch(self, url: str) -> Iterator[bytes]:
+        try:
+            data = (self._folder / url).read_bytes()
+        except OSError as error:
+            raise DownloadHTTPError(f"{url} is not in the bundle", 404) from error
+        return iter([data])
+
+
+def unpack(bundle: Path, kind: str, folder: Path) -> None:
+    """Unpack the metadata and the artefact of one kind into a folder. Raises Refused."""
+    (folder / "metadata").mkdir(parents=True)
+    (folder / "targets").mkdir()
+    try:
+        with tarfile.open(bundle, "r|xz") as archive:
+            for number, member in enumerate(archive):
+                largest = LARGEST_METADATA if _METADATA.fullmatch(member.name) else LARGEST_TARGET
+                known = largest == LARGEST_METADATA or member.name == f"targets/{kind}"
+                if number >= MOST_MEMBERS or not known or not member.isreg() or member.size > largest:
+                    raise Refused(f"the bundle contains {member.name!r}, which is not part of a {kind}")
+                content = archive.extractfile(member)
+                assert content is not None
+                with (folder / member.name).open("wb") as file:
+                    while data := content.read(1 << 20):
+                        file.write(data)
+    except (tarfile.TarError, lzma.LZMAError, EOFError, ValueError) as error:
+        raise Refused(f"the bundle is damaged: {error}") from error
+
+
+def verified(trusted: Path, root: bytes, unpacked: Path, kind: str, artefact: Path) -> dict[str, Any]:
+    """Verify an unpacked bundle, write its artefact, and return the signed description of the artefact.
+
+    Raises Refused.
+    """
+    trusted.mkdir(parents=True, exist_ok=True)
+    try:
+        updater = Updater(
+            str(trusted),
+            "metadata/",
+            str(artefact.parent),
+            "targets/",
+            FolderFetcher(unpacked),
+            bootstrap=root,
+        )
+        target = updater.get_targetinfo(kind)
+        if target is None:
+            raise Refused(f"the signed metadata name no {kind}")
+        updater.download_target(target, str(artefact))
+    except (RepositoryError, DownloadError) as error:
+        raise Refused(f"{type(error).__name__}: {error}") from error
+    custom = target.unrecognized_fields.get("custom")
+    if not isinstance(custom, dict) or not isinstance(custom.get("version"), int):
+        raise Refused("the signed metadata give no version of the artefact")
+    return {"version": custom["version"], "back": custom.get("back") is True}
+
+
+def replaced(text: str, path: Sequence[str], value: str) -> str:
+    """Return a configuration text in which the value at `path` is replaced by the YAML text `value`.
+
+    Raises Refused if the configuration has no such value.
+    """
+    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    for name in path:
+        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        node = next((child for key, child in pairs if key.value == name), None)
+    if node is None:
+        raise Refused(f"the present configuration has no `{'.'.join(path)}` that could be replaced")
+    begin, end = node.start_mark.index, node.end_mark.index
+    # The end mark of a block value is the beginning of the next line with content.
+    tail = text[begin:end]
+    return text[:begin] + value + tail[len(tail.rstrip()) :] + text[end:]
+
+
+def renewed_text(kind: str, artefact: Path, present: str, kept: str, digest: str) -> str:
+    """Return the configuration to install. Raises Refused for an artefact that does not fit its kind."""
+    try:
+        if kind == "configuration":
+            return artefact.read_text(encoding="utf-8")
+        if kind == "catalogue":
+            return replaced(present, _VALUES[kind], json.dumps(f"{kept}/index-{digest}"))
+        lines = artefact.read_text(encoding="ascii").split("\n")
+    except UnicodeDecodeError as error:
+        raise Refused(f"the {kind} is not text: {error}") from error
+    if len([line for line in lines if line.strip()]) != 2:
+        raise Refused("elements are two lines")
+    pair = [line.rstrip() for line in lines if line.strip()]
+    return replaced(present, _VALUES[kind], json.dumps(pair))
+
+
+def write_set(text: str, folder: Path) -> None:
+    """Write a configuration and the drop-ins of its units. Raises Refused for an invalid configuration."""
+    folder.mkdir()
+    path = folder / "flight.yaml"
+    path.write_text(text, encoding="utf-8")
+    try:
+        board_dropin.check_single(path)
+        config = load(path)
+        if config.link is None or config.commands.socket is None:
+            raise Refused("a configuration without `link` and `commands.socket` would end the contact")
+        made = {
+            "knightcube": board_dropin.dropin(config),
+            "knightcube-safe": board_dropin.safe_dropin(config),
+            "knightcube-link": board_dropin.link_dropin(config),
+        }
+    except (ConfigError, UsageError) as error:
+        raise Refused(str(error).replace(str(path), "configuration")) from error
+    for name, lines in made.items():
+        (folder / f"{name}.conf").write_text(lines, encoding="utf-8")
+    (folder / "flight.yaml.sha256").write_text(
+        f"{hashlib.sha256(path.read_bytes()).hexdigest()}  flight.yaml\n", encoding="ascii"
+    )
+
+
+def main(words: Sequence[str]) -> int:
+    """Check the bundle and prepare its content; return the exit status."""
+    trusted, root, bundle, kind, folder, present, kept = words
+    place = Path(folder)
+    try:
+        unpack(Path(bundle), kind, place / "unpacked")
+        artefact = place / "artefact"
+        facts = verified(Path(trusted), Path(root).read_bytes(), place / "unpacked", kind, artefact)
+        with artefact.open("rb") as file:
+            facts["sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+        if kind != "release":
+            before = Path(present).read_text(encoding="utf-8") if kind in _VALUES else ""
+            write_set(renewed_text(kind, artefact, before, kept, facts["sha256"]), place / "set")
+    except (Refused, OSError) as error:
+        sys.stderr.write(f"{str(error).splitlines()[0]}\n")
+        return 1
+    sys.stdout.write(json.dumps(facts) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

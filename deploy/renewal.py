@@ -1,0 +1,821 @@
+"""Renews configuration and release of a board, and supervises each renewal until the ground confirms it.
+
+The timer knightcube-renewal.timer runs `renewal.py` as root every ten seconds. Each run reads the state,
+executes at most one request of the link, judges the open trial, advances the command-loss timer, stores the
+state and ends. The state is stored before a step is executed, and each step may be executed again, so that a
+kill at any moment leaves the old or the new version, and the next run continues (docs/fly/renewal.md).
+
+The link is not trusted. Its requests are regular files of limited size; no symbolic link is followed. The
+program `open_bundle.py` checks signatures and content of an artefact before anything is installed. Times are
+measured with power only, by a clock that no command and no time server can set.
+
+Any Python interpreter can run this program, which needs only the standard library.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import fcntl
+import hashlib
+import itertools
+import json
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+import tarfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+DOWN_S = 180.0
+"""Longest time (s) in a trial during which flight or link may be down."""
+FIRST_CONTACT_S = 60.0
+"""Time (s) that a flight must last before its note about a renewal is deleted."""
+MOST_TRIES = 3
+"""Maximum number of attempts to build a release, each of which a kill or a power loss may have ended."""
+LARGEST_RECORD, LARGEST_BUNDLE = 1 << 16, 64 << 20
+"""Maximum sizes (bytes) of a request or state and of a bundle."""
+KEPT_REPORTS, KEPT_REQUESTS = 16, 64
+MOST_HOURS = 2400.0
+KINDS = ("configuration", "elements", "catalogue", "release")
+STEPS = ("release", "configuration", "ground")
+"""Steps of the command-loss timer."""
+FLIGHT, LINK, SAFE = "knightcube.service", "knightcube-link.service", "knightcube-safe.service"
+CONFIGURATION = "flight.yaml"
+GROUND = "ground"
+"""Name of the kept configuration that install.sh accepted."""
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,63}")
+_REQUEST = re.compile(r"\d{1,5}-\d{1,30}-\d{1,5}-\d{1,5}")
+_DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
+
+
+class Refused(Exception):
+    """Raised for a request that cannot be executed. The text states the reason."""
+
+
+@dataclasses.dataclass
+class Trial:
+    """Trial of a renewal.
+
+    Attributes:
+        what: exchanged version, `configuration` or `release`.
+        kind: kind of the artefact.
+        version: signed version of the artefact.
+        request: name of the request that began the trial.
+        old: name of the previous kept configuration or release.
+        new: name of the new one; empty until a release is built.
+        stage: `install`, `fly` or `revert`.
+        left_s: time (s) with power within which the ground must confirm.
+        despite_faults: whether a reaction to SAFE does not end the trial.
+        before: previous release before the trial.
+        session: session of the link at the installation, whose reports are ignored.
+        down_s: time (s) since flight and link were both up.
+        tries: number of attempts to install.
+        problem: reason of the reversion.
+    """
+
+    what: str
+    kind: str
+    version: int
+    request: str
+    old: str
+    new: str
+    stage: str
+    left_s: float
+    despite_faults: bool
+    before: str = ""
+    session: str = ""
+    down_s: float = 0.0
+    tries: int = 0
+    problem: str = ""
+
+
+@dataclasses.dataclass
+class State:
+    """Stored state of the renewal.
+
+    Attributes:
+        number: number of this record, by which the newer copy is recognised.
+        handled: names of the newest executed requests.
+        versions: highest confirmed version of each kind.
+        previous: name of the configuration that flew before the present one.
+        bad: releases that failed a trial.
+        trial: open trial.
+        reports: number, request, result, name and text of the newest reports.
+        note: text that the flight reports as an event at its start.
+        note_s: time (s) that the flight has been up since the note was made.
+        boot: identification of the boot at the last run.
+        at: time (s) since boot of the last run.
+        frames: authentic frames in the link's last record.
+        limit_s: command-loss time (s), 0 for none.
+        silent_s: time (s) with power since the last authentic frame.
+        steps: executed steps of the command-loss timer.
+    """
+
+    number: int = 0
+    handled: list[str] = dataclasses.field(default_factory=list)
+    versions: dict[str, int] = dataclasses.field(default_factory=dict)
+    previous: str = ""
+    bad: list[str] = dataclasses.field(default_factory=list)
+    trial: Trial | None = None
+    reports: list[list[Any]] = dataclasses.field(default_factory=list)
+    note: str = ""
+    note_s: float = 0.0
+    boot: str = ""
+    at: float = 0.0
+    frames: str = ""
+    limit_s: float = 0.0
+    silent_s: float = 0.0
+    steps: int = 0
+
+
+def encoded(values: object) -> bytes:
+    """Return values as a line of JSON and the SHA-256 of this line."""
+    line = json.dumps(values, sort_keys=True).encode() + b"\n"
+    return line + hashlib.sha256(line).hexdigest().encode() + b"\n"
+
+
+def decoded(data: bytes) -> Any:
+    """Return the values of a record. Raises ValueError for a damaged record."""
+    line, end, digest = data.partition(b"\n")
+    if hashlib.sha256(line + end).hexdigest().encode() + b"\n" != digest:
+        raise ValueError("its checksum is wrong")
+    return json.loads(line)
+
+
+def state_of(values: dict[str, Any]) -> State:
+    """Return the state in the values of a record. Raises one of the exceptions `_DAMAGED`."""
+    state = State(**{**values, "trial": None})
+    if values["trial"] is not None:
+        state.trial = Trial(**values["trial"])
+    return state
+
+
+def open_beneath(folder: Path, parts: Sequence[str], most: int) -> BinaryIO:
+    """Open a regular file of at most `most` bytes below a folder without following links. Raises OSError."""
+    place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        for part in parts[:-1]:
+            inner = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=place)
+            os.close(place)
+            place = inner
+        flags = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
+        file = open(os.open(parts[-1], flags, dir_fd=place), "rb")  # noqa: SIM115 - the caller closes it
+    finally:
+        os.close(place)
+    found = os.fstat(file.fileno())
+    if not stat.S_ISREG(found.st_mode) or found.st_size > most:
+        file.close()
+        raise OSError(f"{parts[-1]} is not a regular file of at most {most} bytes")
+    return file
+
+
+def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
+    """Write a file by one rename and sync it to disk. Raises OSError."""
+    beside = path.with_name(f".{path.name}.part")
+    beside.unlink(missing_ok=True)
+    with open(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        file.write(data)
+        os.fchmod(file.fileno(), mode)
+        file.flush()
+        os.fsync(file.fileno())
+    beside.replace(path)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Sync the names of a folder to disk. Raises OSError."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+class Board:
+    """Files and services of a board.
+
+    Attributes:
+        root: folder of all files.
+        prefix: folder of the software.
+        link: state folder of the link.
+        own: state folder of this program.
+        kept: folder of the kept configurations and catalogues.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.prefix = root / "opt/knightcube"
+        self._settings = root / "etc/knightcube"
+        self._units = root / "etc/systemd/system"
+        self.link = root / "var/lib/knightcube-link"
+        self.own = root / "var/lib/knightcube-renewal"
+        self.kept = self.own / "kept"
+
+    def configuration(self) -> Path:
+        """Return the path of the flown configuration."""
+        return self._settings / CONFIGURATION
+
+    def roots(self) -> list[Path]:
+        """Return the copies of the first root metadata that exist."""
+        copies = (self._settings / "root.json", self.prefix / "share/root.json")
+        return [path for path in copies if path.is_file()]
+
+    def _set(self) -> dict[str, Path]:
+        """Return the installed path of each file of a kept configuration; the configuration is the last."""
+        conf = {
+            f"{unit}.conf": self._units / f"{unit}.service.d/board.conf"
+            for unit in ("knightcube", "knightcube-safe", "knightcube-link")
+        }
+        digest = {f"{CONFIGURATION}.sha256": self._settings / f"{CONFIGURATION}.sha256"}
+        return {**conf, **digest, CONFIGURATION: self.configuration()}
+
+    def keep(self, name: str, folder: Path | None = None) -> str:
+        """Keep the installed configuration, or the one in a folder; return its name. Raises OSError.
+
+        An empty name stands for the SHA-256 of the configuration.
+        """
+        files = {one: (path if folder is None else folder / one) for one, path in self._set().items()}
+        contents = {one: path.read_bytes() for one, path in files.items() if path.is_file()}
+        name = name or hashlib.sha256(contents[CONFIGURATION]).hexdigest()
+        place, beside = self.kept / name, self.kept / f".{name}.part"
+        if self._read_set(place) != contents:
+            for old in (beside, place):
+                shutil.rmtree(old, ignore_errors=True)
+            beside.mkdir(parents=True)
+            for one, data in contents.items():
+                replace_file(beside / one, data)
+            sums = {one: hashlib.sha256(data).hexdigest() for one, data in contents.items()}
+            replace_file(beside / "sums", encoded(sums))
+            beside.replace(place)
+            sync_folder(self.kept)
+        return name
+
+    @staticmethod
+    def _read_set(place: Path) -> dict[str, bytes] | None:
+        """Return the files of a kept configuration, or None unless all of them are undamaged."""
+        with suppress(OSError, *_DAMAGED):
+            sums = decoded((place / "sums").read_bytes())
+            contents = {one: (place / one).read_bytes() for one in sums}
+            if all(hashlib.sha256(data).hexdigest() == sums[one] for one, data in contents.items()):
+                return contents
+        return None
+
+    def install(self, name: str) -> None:
+        """Install a kept configuration. Raises Refused if it is damaged, and OSError."""
+        contents = self._read_set(self.kept / name)
+        if contents is None:
+            raise Refused(f"the kept configuration {name[:12]} is missing or damaged")
+        for one, path in self._set().items():
+            if one in contents:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if not path.is_file() or path.read_bytes() != contents[one]:
+                    replace_file(path, contents[one])
+
+    def release(self, link: str) -> str:
+        """Return the name of the release behind the link `current` or `previous`, or an empty text."""
+        with suppress(OSError):
+            name = Path(os.readlink(self.prefix / link)).name
+            if (self.prefix / "releases" / name / "manifest").is_file():
+                return name
+        return ""
+
+    def point(self, link: str, name: str) -> None:
+        """Let a link name a release. Raises OSError."""
+        path = self.prefix / link
+        beside = path.with_name(f".{link}.part")
+        beside.unlink(missing_ok=True)
+        beside.symlink_to(Path("releases") / name)
+        beside.replace(path)
+        sync_folder(self.prefix)
+
+    def python(self, release: str) -> Path:
+        """Return the Python interpreter of a release."""
+        return self.prefix / "releases" / release / "venv/bin/python"
+
+    def builder(self, release: str) -> str:
+        """Return the Python with which a release was built."""
+        with suppress(OSError, UnicodeDecodeError):
+            settings = (self.prefix / "releases" / release / "venv/pyvenv.cfg").read_text(encoding="utf-8")
+            for line in settings.splitlines():
+                if line.startswith("executable = "):
+                    return line.removeprefix("executable = ")
+        return "python3"
+
+    def run(self, words: Sequence[object], limit_s: float = 1800.0) -> subprocess.CompletedProcess[str]:
+        """Run a program in an isolated environment; a program that cannot be run has the status 127."""
+        command = [str(word) for word in words]
+        try:
+            return subprocess.run(
+                command,
+                cwd="/",
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=limit_s,
+                check=False,
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            return subprocess.CompletedProcess(command, 127, "", f"{type(error).__name__}: {error}")
+
+    def restart(self) -> None:
+        """Restart flight and link with their present units."""
+        self.run(["systemctl", "daemon-reload"], 60.0)
+        self.run(["systemctl", "reset-failed", FLIGHT, LINK], 60.0)
+        self.run(["systemctl", "--no-block", "restart", FLIGHT, LINK], 60.0)
+
+    def active(self, unit: str) -> bool:
+        """Return whether a unit is active."""
+        return self.run(["systemctl", "is-active", "--quiet", unit], 60.0).returncode == 0
+
+    def flown_release(self) -> str:
+        """Return the name of the release whose Python runs the flight, or an empty text."""
+        with suppress(OSError, ValueError):
+            pid = int(self.run(["systemctl", "show", "--property=MainPID", "--value", FLIGHT], 60.0).stdout)
+            first = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0", 1)[0].decode()
+            parts = Path(first).parts
+            if "releases" in parts[:-1]:
+                return parts[parts.index("releases") + 1]
+        return ""
+
+
+class Renewal:
+    """One run of the renewal: requests, trial and command-loss timer."""
+
+    def __init__(self, board: Board, now: float, boot: str) -> None:
+        """Read the state.
+
+        Args:
+            board: files and services of the board.
+            now: time since boot, s.
+            boot: identification of this boot.
+        """
+        self._board = board
+        self._state = self._read()
+        state = self._state
+        self._elapsed = max(0.0, now - state.at if state.boot == boot else now)
+        state.boot, state.at = boot, now
+        self._contact = self._read_contact()
+
+    def _read(self) -> State:
+        """Return the newest undamaged copy of the state, or an empty state."""
+        found = []
+        for copy in ("a", "b"):
+            with (
+                suppress(OSError, *_DAMAGED),
+                open_beneath(self._board.own, [f"state.{copy}"], LARGEST_RECORD) as file,
+            ):
+                found.append(state_of(decoded(file.read())))
+        return max(found, key=lambda state: state.number, default=State())
+
+    def _save(self) -> None:
+        """Store the state and the reports for the link. Raises OSError if no copy can be written."""
+        state = self._state
+        state.number += 1
+        data, problem, written = encoded(dataclasses.asdict(state)), OSError(), 0
+        for copy in ("a", "b"):
+            try:
+                replace_file(self._board.own / f"state.{copy}", data, 0o600)
+                written += 1
+            except OSError as error:
+                problem = error
+        if not written:
+            raise problem
+        trial = state.trial
+        text = f"{trial.kind} {trial.version}: {trial.stage}, {trial.left_s:.0f} s left" if trial else ""
+        shown = {"reports": state.reports, "trial": text, "note": state.note}
+        replace_file(self._board.own / "status", encoded(shown))
+
+    def _report(self, request: str, result: str, name: str, text: str) -> None:
+        """Add a report for the link, and a line in the journal."""
+        number = 1 + (self._state.reports[-1][0] if self._state.reports else 0)
+        self._state.reports = [*self._state.reports, [number, request, result, name, text[:120]]][
+            -KEPT_REPORTS:
+        ]
+        sys.stderr.write(f"renewal: {name} {result}: {text}\n")
+
+    def _read_contact(self) -> dict[str, Any]:
+        """Return what the link has recorded, or nothing if its record is missing or damaged."""
+        with (
+            suppress(OSError, *_DAMAGED),
+            open_beneath(self._board.link, ["renewal", "contact"], LARGEST_RECORD) as file,
+        ):
+            contact = decoded(file.read())
+            return {
+                "session": str(contact["session"]),
+                "frames": str(contact["frames"]),
+                "limit_s": float(contact["limit_s"]),
+                "safe": str(contact["safe"]),
+            }
+        return {}
+
+    def step(self) -> None:
+        """Continue an interrupted step, execute one request and judge the trial. Raises OSError."""
+        if self._state.trial is not None:
+            self._continue()
+        begun = self._state.trial
+        for name, request in self._requests():
+            self._obey(name, request)
+        # A trial that has just begun is not judged, because the units are still restarting.
+        if begun is not None and self._state.trial is begun and begun.stage == "fly":
+            self._judge()
+        self._count_silence()
+        self._age_note()
+        self._save()
+
+    def _requests(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield the oldest request that was not executed yet, and remove the executed ones."""
+        try:
+            names = sorted(
+                name for name in os.listdir(self._board.link / "renewal") if _REQUEST.fullmatch(name)
+            )
+        except OSError:
+            return
+        for name in names:
+            if name not in self._state.handled:
+                request: dict[str, Any] = {}
+                with (
+                    suppress(OSError, *_DAMAGED),
+                    open_beneath(self._board.link, ["renewal", name], LARGEST_RECORD) as file,
+                ):
+                    request = dict(decoded(file.read()))
+                yield name, request
+                return
+            with suppress(OSError):
+                (self._board.link / "renewal" / name).unlink()
+
+    def _obey(self, name: str, request: dict[str, Any]) -> None:
+        """Execute a request."""
+        self._state.handled = [*self._state.handled, name][-KEPT_REQUESTS:]
+        word, kind = str(request.get("do", "")), str(request.get("kind", ""))
+        try:
+            if kind not in KINDS:
+                raise Refused("the request is damaged")
+            if word == "activate":
+                self._activate(name, kind, request)
+            elif word == "confirm":
+                self._confirm(name, kind)
+            elif word == "withdraw":
+                self._withdraw(name, kind)
+            else:
+                raise Refused("the request is damaged")
+        except (Refused, OSError, *_DAMAGED) as error:
+            self._report(name, "failed", word or "request", str(error) or type(error).__name__)
+
+    def _activate(self, name: str, kind: str, request: dict[str, Any]) -> None:
+        """Check a bundle and begin its trial. Raises Refused and OSError."""
+        state, board = self._state, self._board
+        if state.trial is not None:
+            raise Refused(
+                f"{state.trial.kind} {state.trial.version} is on trial: confirm or withdraw it first"
+            )
+        hours = float(request["hours"])
+        if not 0.0 < hours <= MOST_HOURS:
+            raise Refused(f"{hours:g} h: choose a trial of more than 0 and at most {MOST_HOURS:g} h")
+        staging = board.own / "staging"
+        shutil.rmtree(staging, ignore_errors=True)
+        staging.mkdir(parents=True, mode=0o700)
+        self._copy_bundle(kind, str(request["name"]), str(request["sum"]), staging / "bundle")
+        facts = self._opened(kind, staging)
+        version = int(facts["version"])
+        if version <= state.versions.get(kind, 0) and not facts["back"]:
+            raise Refused(
+                f"{kind} {version} is not newer than {state.versions[kind]}: sign a newer one, or with --back"
+            )
+        left_s, despite = 3600.0 * hours, bool(request["despite_faults"])
+        before, session = board.release("previous"), str(self._contact.get("session", ""))
+        if kind == "release":
+            old, new, what = board.release("current"), "", "release"
+        else:
+            old, what = board.keep(""), "configuration"
+            if kind == "catalogue":
+                index = board.kept / f"index-{facts['sha256']}"
+                replace_file(index, (staging / "artefact").read_bytes())
+            new = board.keep("", staging / "set")
+            if new == old:
+                raise Refused(f"this {kind} flies already")
+        trial = Trial(what, kind, version, name, old, new, "install", left_s, despite, before, session)
+        state.trial = trial
+        self._report(name, "started", "activate", f"{kind} {version} is installed, trial of {hours:g} h")
+        self._save()
+        self._continue()
+
+    def _copy_bundle(self, kind: str, name: str, expected: str, path: Path) -> None:
+        """Copy the selected bundle from the link's files. Raises Refused if its SHA-256 is not `expected`."""
+        if not _NAME.fullmatch(name):
+            raise Refused(f"{name[:64]!r} is not the name of a bundle")
+        digest = hashlib.sha256()
+        parts = ["files", "chosen", kind, name]
+        with open_beneath(self._board.link, parts, LARGEST_BUNDLE) as file, path.open("wb") as copy:
+            copied = 0
+            while (data := file.read(1 << 20)) and copied <= LARGEST_BUNDLE:
+                digest.update(data)
+                copied += copy.write(data)
+        if digest.hexdigest() != expected:
+            raise Refused(f"{name} is not the file that was activated: its SHA-256 is {digest.hexdigest()}")
+
+    def _opened(self, kind: str, staging: Path) -> dict[str, Any]:
+        """Return what `open_bundle.py` says about a bundle. Raises Refused."""
+        board, problems = self._board, list[str]()
+        program = Path(__file__).resolve().with_name("open_bundle.py")
+        kept = "/" / board.kept.relative_to(board.root)
+        # Either of the two root metadata and of the two releases may be damaged.
+        releases = filter(None, (board.release("current"), board.release("previous")))
+        for release, root in itertools.product(releases, board.roots()):
+            for left in ("unpacked", "set"):
+                shutil.rmtree(staging / left, ignore_errors=True)
+            words = [program, board.own / "trusted", root, staging / "bundle", kind, staging]
+            done = board.run([board.python(release), "-I", *words, board.configuration(), kept], 600.0)
+            if done.returncode == 0:
+                facts: dict[str, Any] = json.loads(done.stdout)
+                return facts
+            problems += done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
+        raise Refused(problems[0] if problems else "no release or no root.json is installed")
+
+    def _confirm(self, name: str, kind: str) -> None:
+        """End the trial in favour of the new version. Raises Refused."""
+        state, trial = self._state, self._state.trial
+        if trial is None or trial.stage != "fly" or trial.kind != kind:
+            raise Refused(f"no {kind} is on trial")
+        state.versions[kind] = trial.version
+        if trial.what == "configuration":
+            state.previous = trial.old
+        state.trial = None
+        text = f"{kind} {trial.version} stays"
+        self._report(trial.request, "completed", "activate", text)
+        self._report(name, "completed", "confirm", text)
+        self._save()
+        self._tidy()
+
+    def _withdraw(self, name: str, kind: str) -> None:
+        """Return to the version before the trial, or without a trial to the previous one. Raises Refused."""
+        trial = self._state.trial
+        if trial is None:
+            what = "release" if kind == "release" else "configuration"
+            if not self._go_back(what):
+                raise Refused(f"there is no previous {what}")
+            self._report(name, "completed", "withdraw", f"the previous {what} flies")
+            self._note(f"the ground returned to the previous {what}")
+            return
+        if trial.kind != kind:
+            raise Refused(f"{trial.kind} {trial.version} is on trial, not a {kind}")
+        self._begin_revert("the ground withdrew it")
+        self._report(name, "completed", "withdraw", f"{kind} {trial.version} is withdrawn")
+
+    def _continue(self) -> None:
+        """Execute the stage of the trial, which an earlier run may have begun."""
+        trial = self._state.trial
+        assert trial is not None
+        try:
+            if trial.stage == "install":
+                self._install(trial)
+            elif trial.stage == "revert":
+                self._revert(trial)
+        except (Refused, OSError) as error:
+            if trial.stage == "install":
+                self._begin_revert(f"it cannot be installed: {error}")
+            else:  # what is installed stays; a later run tries again
+                sys.stderr.write(f"renewal: cannot revert yet: {error}\n")
+
+    def _install(self, trial: Trial) -> None:
+        """Install the new version and restart. Raises Refused and OSError."""
+        board = self._board
+        if trial.what == "configuration":
+            board.install(trial.new)
+        else:
+            if not trial.new:
+                trial.tries += 1
+                if trial.tries > MOST_TRIES:
+                    raise Refused(f"its build did not end {MOST_TRIES} times")
+                self._save()
+                trial.new = self._built()
+                self._save()
+            if trial.new == trial.old:
+                raise Refused("this release flies already")
+            board.point("previous", trial.old)
+            board.point("current", trial.new)
+        trial.stage = "fly"
+        self._save()
+        board.restart()
+
+    def _built(self) -> str:
+        """Build the release of the bundle, and return its name. Raises Refused and OSError."""
+        board, staging = self._board, self._board.own / "staging"
+        source = staging / "source"
+        shutil.rmtree(source, ignore_errors=True)
+        extract(staging / "artefact", source)
+        old = board.release("current")
+        wheels = ["--wheels", source / "wheels"] if (source / "wheels").is_dir() else ["--reuse", old]
+        words = [board.builder(old), "-I", source / "deploy/build_release.py", board.prefix, "build"]
+        done = board.run([*words, "--python", board.builder(old), *wheels])
+        if done.returncode != 0:
+            raise Refused((done.stderr.strip().splitlines() or ["the build failed"])[-1])
+        name = done.stdout.split()[-1]
+        dropin = Path(__file__).resolve().with_name("board_dropin.py")
+        checked = board.run([board.python(name), "-I", dropin, board.configuration()], 120.0)
+        if checked.returncode != 0:
+            raise Refused(f"it does not accept the present configuration: {checked.stderr.strip()[-60:]}")
+        return name
+
+    def _begin_revert(self, problem: str) -> None:
+        """Return to the version before the trial."""
+        trial = self._state.trial
+        assert trial is not None
+        trial.stage, trial.problem = "revert", problem
+        self._save()
+        self._continue()
+
+    def _revert(self, trial: Trial) -> None:
+        """Install the version before the trial, restart and end the trial. Raises Refused and OSError."""
+        state, board = self._state, self._board
+        if trial.what == "configuration":
+            try:
+                board.install(trial.old)
+            except Refused:
+                board.install(GROUND)
+        else:
+            if trial.new and trial.new != trial.old:
+                state.bad = [*(name for name in state.bad if name != trial.new), trial.new][-KEPT_REPORTS:]
+            if trial.old:
+                board.point("current", trial.old)
+            if trial.before:
+                board.point("previous", trial.before)
+        text = f"{trial.kind} {trial.version}: {trial.problem}; the previous one flies"
+        self._note(text)
+        state.trial = None
+        self._report(trial.request, "failed", "activate", text)
+        board.restart()  # before the state is stored: a kill in between only repeats this step
+        self._save()
+
+    def _judge(self) -> None:
+        """End the trial if its version fails, or if the ground has not confirmed it in time."""
+        trial, board, contact = self._state.trial, self._board, self._contact
+        assert trial is not None
+        up = board.active(FLIGHT) and board.active(LINK)
+        trial.down_s = 0.0 if up else trial.down_s + self._elapsed
+        trial.left_s -= self._elapsed
+        flown = board.flown_release() if up and trial.what == "release" else ""
+        if board.active(SAFE):
+            self._begin_revert("the flight ended five times in a minute")
+        elif trial.down_s >= DOWN_S:
+            self._begin_revert(f"flight or link were not up for {DOWN_S:.0f} s")
+        elif flown and flown != trial.new:
+            self._begin_revert(f"release {flown} flies in its place")
+        elif contact.get("safe") and contact["session"] != trial.session and not trial.despite_faults:
+            self._begin_revert(f"the flight went to SAFE: {contact['safe']}")
+        elif trial.left_s <= 0.0:
+            self._begin_revert("the ground did not confirm it")
+
+    def _go_back(self, what: str) -> bool:
+        """Return to the previous release or configuration, or return False if there is none."""
+        state, board = self._state, self._board
+        if what == "release":
+            current, previous = board.release("current"), board.release("previous")
+            if not previous or previous == current or previous in state.bad:
+                return False
+            board.point("current", previous)
+            board.point("previous", current)
+        else:
+            name = GROUND if what == GROUND else state.previous
+            current = board.keep("")
+            if not name or self._same(name):
+                return False
+            board.install(name)
+            state.previous = current
+        board.restart()
+        return True
+
+    def _same(self, name: str) -> bool:
+        """Return whether a kept configuration is the installed one, or is missing."""
+        with suppress(OSError):
+            return (
+                self._board.kept / name / CONFIGURATION
+            ).read_bytes() == self._board.configuration().read_bytes()
+        return True
+
+    def _count_silence(self) -> None:
+        """Count the time without an authentic frame, and take the next step after each limit."""
+        state, contact = self._state, self._contact
+        heard = f"{contact.get('session')} {contact.get('frames')}"
+        if contact:
+            state.limit_s = max(0.0, contact["limit_s"])
+        if contact and contact["frames"] != "0" and heard != state.frames:
+            state.frames, state.silent_s, state.steps = heard, 0.0, 0
+            return
+        state.silent_s += self._elapsed
+        while state.limit_s > 0.0 and state.steps < len(STEPS):
+            if state.silent_s < state.limit_s * (state.steps + 1):
+                return
+            step = STEPS[state.steps]
+            state.steps += 1
+            if state.trial is not None:
+                self._begin_revert("no authentic frame arrived")
+            try:
+                done = self._go_back(step)
+            except (Refused, OSError) as error:
+                self._report("", "failed", "command-loss", f"{step}: {error}")
+                continue
+            if done:
+                what = "configuration accepted on the ground" if step == GROUND else f"previous {step}"
+                text = f"no authentic frame for {state.silent_s:.0f} s: the {what} flies"
+                self._report("", "completed", "command-loss", text)
+                self._note(text)
+                return
+            # Without something to return to, the next step follows at once.
+            state.silent_s = max(state.silent_s, state.limit_s * (state.steps + 1))
+
+    def _note(self, text: str) -> None:
+        self._state.note, self._state.note_s = text, 0.0
+
+    def _age_note(self) -> None:
+        """Delete the note for the flight when a flight has lasted long enough to report it."""
+        state = self._state
+        if state.note:
+            state.note_s = state.note_s + self._elapsed if self._board.active(FLIGHT) else 0.0
+            if state.note_s >= FIRST_CONTACT_S + self._elapsed:
+                state.note = ""
+
+    def _tidy(self) -> None:
+        """Remove releases and configurations that are no longer needed."""
+        state, board = self._state, self._board
+        with suppress(OSError):
+            current, previous = board.release("current"), board.release("previous")
+            for path in (board.prefix / "releases").iterdir():
+                if path.name not in {current, previous}:
+                    (path / "manifest").unlink(missing_ok=True)
+                    shutil.rmtree(path)
+            texts = [(board.kept / name / CONFIGURATION) for name in (state.previous, GROUND)]
+            named = b"".join(path.read_bytes() for path in (*texts, board.configuration()) if path.is_file())
+            for path in board.kept.iterdir():
+                if path.name.startswith("index-"):
+                    if path.name.encode() not in named:
+                        path.unlink()
+                elif path.name not in {state.previous, GROUND}:
+                    shutil.rmtree(path)
+
+
+def extract(archive: Path, folder: Path) -> None:
+    """Unpack the regular files and folders of a release. Raises Refused and OSError."""
+    folder.mkdir()
+    try:
+        with tarfile.open(archive, "r:*") as files:
+            for member in files:
+                path = folder / member.name
+                if member.name.startswith("/") or ".." in Path(member.name).parts:
+                    raise Refused(f"the release contains {member.name!r}")
+                if member.isdir():
+                    path.mkdir(parents=True, exist_ok=True)
+                elif member.isreg():
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    content = files.extractfile(member)
+                    assert content is not None
+                    with path.open("wb") as file:
+                        shutil.copyfileobj(content, file)
+                    path.chmod(0o755 if member.mode & 0o100 else 0o644)
+    except (tarfile.TarError, EOFError, ValueError) as error:
+        raise Refused(f"the release is damaged: {error}") from error
+
+
+def boot_id() -> str:
+    """Return the kernel's identification of this boot, or an empty text."""
+    with suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    return ""
+
+
+def main(words: Sequence[str]) -> int:
+    """Execute one run, and return the exit status."""
+    parser = argparse.ArgumentParser(description="Execute one step of the renewal (docs/fly/renewal.md).")
+    parser.add_argument("--root", type=Path, default=Path("/"), help="folder of the board's files")
+    parser.add_argument("--now", type=float, help="time since boot, s, for rehearsals")
+    parser.add_argument(
+        "--accepted", action="store_true", help="keep the configuration that install.sh accepted"
+    )
+    options = parser.parse_args(words)
+    board = Board(options.root)
+    board.own.mkdir(parents=True, exist_ok=True)
+    with open(board.own / "lock", "w", encoding="ascii") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | (0 if options.accepted else fcntl.LOCK_NB))
+        except OSError:
+            return 0  # the run before this one builds a release
+        now = time.clock_gettime(time.CLOCK_BOOTTIME) if options.now is None else options.now
+        try:
+            if options.accepted:
+                board.keep(GROUND)
+            else:
+                Renewal(board, now, boot_id()).step()
+        except OSError as error:
+            sys.stderr.write(f"renewal: {error}\n")
+            return 1
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

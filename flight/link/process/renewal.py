@@ -1,0 +1,130 @@
+"""Part of the link in the renewal in orbit (docs/fly/renewal.md): requests, and reports of their execution.
+
+The privileged program `deploy/renewal.py` reads the requests and the record `contact` in the folder of this
+module, and writes the status file that this module reads. All files have the same form: a line of JSON,
+followed by the SHA-256 of this line.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from flight.link.modes import Mode
+from flight.link.process.commanding import Report, Request, Stage
+from flight.link.process.directives import KINDS, Activate, Confirm, Withdraw
+from flight.link.regular_files import overwrite, read_regular
+from flight.link.telemetry.definitions import MODE
+from flight.link.telemetry.packets import LAYOUTS, to_text
+from hal.interfaces.wires import SECOND_NS
+
+STATUS = Path("/var/lib/knightcube-renewal/status")
+CONTACT_NS = 10 * SECOND_NS
+"""Minimum time (ns) between two records of the contact with the ground."""
+_LARGEST = 1 << 16
+_REACTION = "reaction safe"  # trigger in the mode packet after an event (flight.loop.modes)
+_STAGES = {"started": Stage.STARTED, "completed": Stage.COMPLETED, "failed": Stage.FAILED}
+_DAMAGED = (ValueError, TypeError, AttributeError, LookupError, RecursionError)
+
+
+def encoded(values: object) -> bytes:
+    """Return values as a line of JSON and the SHA-256 of this line."""
+    line = json.dumps(values, sort_keys=True).encode() + b"\n"
+    return line + hashlib.sha256(line).hexdigest().encode() + b"\n"
+
+
+def decoded(data: bytes) -> Any:
+    """Return the values of a record. Raises ValueError for a damaged record."""
+    line, end, digest = data.partition(b"\n")
+    if hashlib.sha256(line + end).hexdigest().encode() + b"\n" != digest:
+        raise ValueError("its checksum is wrong")
+    return json.loads(line)
+
+
+class Renewal:
+    """Exchange of files with the privileged part of the renewal."""
+
+    def __init__(self, folder: Path, status: Path, command_loss: float) -> None:
+        """Use `folder` for requests and records, and read the reports in the file `status`.
+
+        The time `command_loss` (s) without an authentic frame is passed on to the privileged part.
+        """
+        self._folder = folder
+        self._status = status
+        self._limit = command_loss
+        self._session = os.urandom(8).hex()
+        self._safe = ""
+        self._recorded = ("", "")
+        self._due_ns = 0
+        self._modified_ns = 0
+        self._reported = self._stored_number()
+
+    def request(self, directive: Activate | Confirm | Withdraw, done: Report) -> str:
+        """Store a request for the privileged part. Return the problem, or an empty text."""
+        if not self._status.exists():
+            return "this board has no renewal: deploy/install.sh installs it"
+        name = f"{done.spi}-{done.counter}-{done.request.packet}-{done.request.sequence}"
+        values: dict[str, Any] = {"do": type(directive).__name__.lower()}
+        if isinstance(directive, Activate):
+            kind, _, own = directive.name.removeprefix("received/").partition("/")
+            values |= {"kind": kind, "name": own, "sum": directive.sum.hex(), "hours": directive.hours}
+            values["despite_faults"] = bool(directive.despite_faults)
+        else:
+            values["kind"] = KINDS[directive.kind]
+        return "" if self._write(name, encoded(values)) else "the request could not be stored"
+
+    def followed(self, packet: bytes) -> None:
+        """Note a reaction to SAFE in a packet of live telemetry."""
+        layout = LAYOUTS[MODE.name]
+        if packet[:2] == layout.identifier.to_bytes(2, "big"):
+            (row,) = layout.array(packet)
+            if row["mode"] == Mode.SAFE and to_text(row["trigger"]) == _REACTION:
+                self._safe = to_text(row["reason"])[:64] or _REACTION
+
+    def turn(self, admitted: int, now_ns: int) -> list[Report]:
+        """Record the contact with the ground, and return new reports of the privileged part.
+
+        Args:
+            admitted: number of authentic frames since the start of the link.
+            now_ns: current time of the monotonic clock, ns.
+        """
+        contact = (str(admitted), self._safe)
+        if contact != self._recorded and now_ns >= self._due_ns and self._status.parent.exists():
+            self._due_ns = now_ns + CONTACT_NS
+            values = {"session": self._session, "frames": contact[0], "safe": contact[1]}
+            if self._write("contact", encoded(values | {"limit_s": self._limit})):
+                self._recorded = contact
+        with suppress(OSError, *_DAMAGED):
+            modified_ns = self._status.stat().st_mtime_ns
+            if modified_ns != self._modified_ns:
+                self._modified_ns = modified_ns
+                return self._reports(decoded(read_regular(self._status, _LARGEST) or b"")["reports"])
+        return []
+
+    def _reports(self, entries: list[list[Any]]) -> list[Report]:
+        """Return the reports that were not sent before, and store the number of the newest one."""
+        found = []
+        for number, request, result, name, text in entries:
+            if number > self._reported:
+                spi, counter, packet, sequence = map(int, request.split("-")) if request else (0, 0, 0, 0)
+                stage = _STAGES[result]
+                found.append(Report(spi, counter, stage, name, text, Request(packet, sequence)))
+        newest = max((int(entry[0]) for entry in entries), default=0)
+        if newest != self._reported:
+            self._reported = newest
+            self._write("reported", encoded(newest))
+        return found
+
+    def _stored_number(self) -> int:
+        with suppress(OSError, *_DAMAGED):
+            return int(decoded(read_regular(self._folder / "reported", _LARGEST) or b""))
+        return 0
+
+    def _write(self, name: str, data: bytes) -> bool:
+        with suppress(OSError):
+            self._folder.mkdir(mode=0o700, exist_ok=True)
+        return overwrite(self._folder / name, data)

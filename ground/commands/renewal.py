@@ -1,0 +1,329 @@
+"""Command `flight renewal`: keys, signatures and commands of a renewal in orbit (docs/fly/renewal.md)."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import sys
+import tarfile
+from collections.abc import Iterable
+from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
+
+from cryptography.hazmat.primitives import serialization
+from securesystemslib.signer import CryptoSigner
+from tuf.api.exceptions import RepositoryError
+from tuf.api.metadata import Metadata, MetaFile, Root, Snapshot, T, TargetFile, Targets, Timestamp
+
+from flight.app.run import utc_ns
+from flight.link.process import directives
+from flight.link.process.commanding import Report, Stage
+from flight.link.process.directives import KINDS, Activate, Confirm, Directive, Withdraw
+from flight.link.security import COMMAND_SPIS
+from flight.loop.state import LinuxFiles, replace_file
+from flight.schema.document import read_text
+from flight.schema.reader import parse
+from ground.link.commanding import add_link_options, explained, sha256_of, terminal_of
+from ground.link.commanding import command as send
+from knightcube.errors import UsageError
+
+ENDLESS = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)
+"""Expiry of metadata without an end, which no wrong clock can reach."""
+PARTS = (
+    "knightcube",
+    "flight",
+    "hal",
+    "sim_hal",
+    "deploy",
+    "config",
+    "pyproject.toml",
+    "README.md",
+    "LICENSE",
+    "wheels",
+)
+"""Files and folders of the sources that make a release."""
+_SIGNED_BY_ONE = ("targets", "snapshot", "timestamp")
+_TIMEOUT_S = 60.0
+"""Default time (s) to wait for the privileged part, which runs every 10 s."""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight renewal` to the parser."""
+    parser.description = (
+        "Renew a satellite in orbit: make signing keys, sign a configuration, elements, a sky index or a "
+        "release, and activate, confirm or withdraw it over the link."
+    )
+    words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
+    keys = words.add_parser("keys", help="make root keys, a signing key and the first metadata")
+    keys.add_argument("folder", type=Path, metavar="FOLDER", help="a folder that does not exist")
+    renewed = words.add_parser("new-key", help="replace the signing key")
+    renewed.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the keys and the metadata")
+    renewed.add_argument("--root", action="store_true", help="replace both root keys too")
+    signed = words.add_parser("sign", help="sign an artefact and write its bundle")
+    signed.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the keys and the metadata")
+    signed.add_argument("kind", choices=KINDS, help="kind of the artefact")
+    signed.add_argument(
+        "path", type=Path, metavar="FILE", help="the artefact; for a release its folder of sources"
+    )
+    signed.add_argument(
+        "--version", type=int, required=True, metavar="N", help="its version, above the last one"
+    )
+    signed.add_argument("--back", action="store_true", help="permit a version that is not newer")
+    signed.add_argument(
+        "--expires", metavar="DATE", help="end of the signature, such as 2030-01-01 (default none)"
+    )
+    signed.add_argument("--least", type=int, default=1, metavar="N", help="lowest version of the metadata")
+    signed.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder of the bundle")
+    for word, purpose in (
+        ("activate", "try a bundle that was put on the satellite"),
+        ("confirm", "end the trial, the artefact stays"),
+        ("withdraw", "end the trial, or return to the previous configuration or release"),
+    ):
+        placed = words.add_parser(word, help=purpose)
+        add_link_options(placed, placed.add_mutually_exclusive_group(required=True))
+        placed.add_argument("kind", choices=KINDS, help="kind of the artefact")
+        text = "key of the commands on the link (default %(default)s)"
+        placed.add_argument("--spi", type=int, choices=COMMAND_SPIS, default=COMMAND_SPIS[0], help=text)
+        text = f"time to wait for the satellite (default {_TIMEOUT_S:g} s)"
+        placed.add_argument("--timeout", type=float, default=_TIMEOUT_S, metavar="S", help=text)
+        if word == "activate":
+            placed.add_argument("path", type=Path, metavar="BUNDLE", help="local copy of the bundle")
+            text = "time with power within which the ground must confirm (default %(default)g h)"
+            placed.add_argument("--hours", type=float, default=24.0, metavar="H", help=text)
+            text = "a reaction to SAFE does not end the trial"
+            placed.add_argument("--despite-faults", action="store_true", help=text)
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Execute the command."""
+    match options.what:
+        case "keys":
+            root = make_signing_keys(options.folder)
+            sys.stdout.write(
+                f"keys in {options.folder}; for the board: {root} as /etc/knightcube/root.json\n"
+            )
+        case "new-key":
+            version = replace_signing_key(options.folder, options.root)
+            sys.stdout.write(f"root metadata {version}; the next bundle carries them\n")
+        case "sign":
+            bundle = sign(options)
+            sys.stdout.write(f"{bundle}: {bundle.stat().st_size} bytes\n")
+        case _:
+            return _command(options)
+    return 0
+
+
+def make_signing_keys(folder: Path) -> Path:
+    """Make two root keys, a signing key and the first root metadata; return the file of these metadata."""
+    try:
+        folder.mkdir(mode=0o700, parents=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}: name a folder that does not exist") from error
+    (folder / "metadata").mkdir()
+    roots = [_new_key(folder / f"root-{number}.pem") for number in (1, 2)]
+    signing = _new_key(folder / "signing.pem")
+    root = Root(expires=ENDLESS, consistent_snapshot=False)
+    for signer in roots:
+        root.add_key(signer.public_key, "root")
+    for role in _SIGNED_BY_ONE:
+        root.add_key(signing.public_key, role)
+    return _write_signed(folder / "metadata/1.root.json", root, roots)
+
+
+def replace_signing_key(folder: Path, also_root: bool) -> int:
+    """Let a root key name another signing key, and other root keys; return the version of the metadata."""
+    root = _newest_root(folder)
+    old = [_read_key(path) for path in sorted(folder.glob("root-*.pem"))]
+    old = [signer for signer in old if signer.public_key.keyid in root.roles["root"].keyids]
+    if not old:
+        raise UsageError(f"{folder}: no root-*.pem is a root key: bring one of them there")
+    new = _new_key(folder / "signing.pem", replaced=True)
+    for role in _SIGNED_BY_ONE:
+        for keyid in list(root.roles[role].keyids):
+            root.revoke_key(keyid, role)
+        root.add_key(new.public_key, role)
+    roots = old
+    if also_root:
+        roots = [_new_key(folder / f"root-{number}.pem", replaced=True) for number in (1, 2)]
+        for keyid in list(root.roles["root"].keyids):
+            root.revoke_key(keyid, "root")
+        for signer in roots:
+            root.add_key(signer.public_key, "root")
+    root.version += 1
+    signers = {signer.public_key.keyid: signer for signer in (*old, *roots)}
+    _write_signed(folder / f"metadata/{root.version}.root.json", root, signers.values())
+    return root.version
+
+
+def sign(options: argparse.Namespace) -> Path:
+    """Sign an artefact, and return the path of its bundle. Raises UsageError."""
+    folder, kind = options.folder, options.kind
+    signer, data = _read_key(folder / "signing.pem"), _artefact(kind, options.path)
+    if signer.public_key.keyid not in _newest_root(folder).roles["targets"].keyids:
+        raise UsageError(f"{folder}/signing.pem is not the signing key that the root metadata name")
+    expires = ENDLESS if options.expires is None else _date(options.expires)
+    targets = _read(folder, Targets) or Targets()
+    before = targets.targets.get(kind)
+    last = before.unrecognized_fields["custom"]["version"] if before is not None else 0
+    if options.version <= last and not options.back:
+        raise UsageError(
+            f"--version {options.version}: {kind} {last} is signed already; raise it, or add --back"
+        )
+    target = TargetFile.from_data(kind, data)
+    target.unrecognized_fields["custom"] = {"version": options.version, "back": bool(options.back)}
+    targets.targets[kind] = target
+    snapshot = _read(folder, Snapshot) or Snapshot()
+    timestamp = _read(folder, Timestamp) or Timestamp()
+    for one in (targets, snapshot, timestamp):
+        one.version, one.expires = max(one.version + 1, options.least), expires
+    snapshot.meta["targets.json"] = MetaFile(version=targets.version)
+    timestamp.snapshot_meta = MetaFile(version=snapshot.version)
+    _write_signed(folder / "metadata/targets.json", targets, [signer])
+    _write_signed(folder / "metadata/snapshot.json", snapshot, [signer])
+    _write_signed(folder / "metadata/timestamp.json", timestamp, [signer])
+    bundle: Path = options.out / f"{kind}-{options.version}.renewal"
+    _write_bundle(bundle, folder / "metadata", kind, data)
+    return bundle
+
+
+def _command(options: argparse.Namespace) -> int:
+    """Send a directive about a renewal, and print each stage of its execution."""
+    kind = KINDS.index(options.kind)
+    directive: Directive
+    if options.what == "activate":
+        if not 0.0 < options.hours < float("inf"):
+            raise UsageError(f"--hours {options.hours}: must be a positive number")
+        name = f"received/{options.kind}/{options.path.name}"
+        directive = Activate(name, sha256_of(options.path), options.hours, int(options.despite_faults))
+    else:
+        directive = Confirm(kind) if options.what == "confirm" else Withdraw(kind)
+
+    def show(report: Report) -> None:
+        sys.stdout.write(f"{report.stage.name.lower()}: {explained(report)}\n")
+        sys.stdout.flush()
+
+    with closing(terminal_of(options)) as terminal:
+        packet = directives.pack(directive, utc_ns())
+        reports = send(terminal, packet, options.spi, options.timeout, show)
+    return int(reports[-1].stage in {Stage.REFUSED, Stage.FAILED})
+
+
+def _artefact(kind: str, path: Path) -> bytes:
+    """Return the bytes to sign. Raises UsageError for an artefact that the board would refuse."""
+    if kind == "release":
+        return _packed(path)
+    if kind == "configuration":
+        text = read_text(path)
+        if parse(text, str(path)).link is None:
+            raise UsageError(f"{path}: has no `link`, so its flight could not be reached")
+        return text.encode()
+    data = LinuxFiles().read(path)
+    if data is None:
+        raise UsageError(f"{path}: there is no such file")
+    if kind == "elements" and [len(line.rstrip()) for line in data.splitlines() if line.strip()] != [69, 69]:
+        raise UsageError(f"{path}: elements are two lines of 69 characters")
+    return data
+
+
+def _packed(source: Path) -> bytes:
+    """Return the sources of a release as a compressed tar archive. Raises UsageError."""
+    if not (source / "deploy/build_release.py").is_file():
+        raise UsageError(f"{source}: is not the folder of this software's sources")
+
+    def plain(member: tarfile.TarInfo) -> tarfile.TarInfo | None:
+        if "__pycache__" in member.name:
+            return None
+        member.uid = member.gid = member.mtime = 0
+        member.uname = member.gname = ""
+        return member
+
+    data = io.BytesIO()
+    with tarfile.open(fileobj=data, mode="w", dereference=True) as archive:
+        for part in PARTS:
+            if (source / part).exists():
+                archive.add(source / part, part, filter=plain)
+    return data.getvalue()
+
+
+def _write_bundle(path: Path, metadata: Path, kind: str, data: bytes) -> None:
+    """Write a compressed tar archive of all root metadata, the newest other metadata and the artefact."""
+    content = io.BytesIO()
+    with tarfile.open(fileobj=content, mode="w:xz") as archive:
+        for file in sorted(metadata.glob("*.json")):
+            _add(archive, f"metadata/{file.name}", file.read_bytes())
+        _add(archive, f"targets/{kind}", data)
+    path.write_bytes(content.getvalue())
+
+
+def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
+    member = tarfile.TarInfo(name)
+    member.size = len(data)
+    archive.addfile(member, io.BytesIO(data))
+
+
+def _new_key(path: Path, *, replaced: bool = False) -> CryptoSigner:
+    """Make a key and store it in a file that only its owner can read. An old key gets the suffix .old."""
+    signer = CryptoSigner.generate_ed25519()
+    if replaced and path.exists():
+        path.replace(path.with_suffix(".pem.old"))
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(signer.private_bytes)
+        file.flush()
+        os.fsync(file.fileno())
+    return signer
+
+
+def _read_key(path: Path) -> CryptoSigner:
+    """Return the key in a file. Raises UsageError."""
+    try:
+        key = serialization.load_pem_private_key(path.read_bytes(), None)
+        return CryptoSigner(key)
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(f"{path}: is not a readable key: {error}") from error
+
+
+def _newest_root(folder: Path) -> Root:
+    """Return the newest root metadata. Raises UsageError."""
+    files = sorted(
+        (folder / "metadata").glob("*.root.json"), key=lambda path: int(path.name.partition(".")[0])
+    )
+    if not files:
+        raise UsageError(f"{folder}: there are no metadata: make keys by `renewal keys`")
+    return _signed(files[-1], Root)
+
+
+def _read(folder: Path, kind: type[T]) -> T | None:
+    """Return the signed part of metadata, or None if the file does not exist. Raises UsageError."""
+    path = folder / "metadata" / f"{kind.type}.json"
+    return _signed(path, kind) if path.exists() else None
+
+
+def _signed(path: Path, kind: type[T]) -> T:
+    """Return the signed part of a metadata file. Raises UsageError."""
+    try:
+        signed = Metadata[T].from_file(str(path)).signed
+    except RepositoryError as error:
+        raise UsageError(f"{path}: is damaged: {error}") from error
+    if not isinstance(signed, kind):
+        raise UsageError(f"{path}: are not metadata of the role {kind.type}")
+    return signed
+
+
+def _write_signed(path: Path, signed: T, signers: Iterable[CryptoSigner]) -> Path:
+    """Sign metadata and write them by one rename."""
+    metadata = Metadata(signed)
+    for signer in signers:
+        metadata.sign(signer, append=True)
+    replace_file(LinuxFiles(), path, metadata.to_bytes())
+    return path
+
+
+def _date(text: str) -> datetime:
+    """Return a date as the end of a signature. Raises UsageError."""
+    try:
+        return datetime.fromisoformat(text).replace(tzinfo=UTC)
+    except ValueError as error:
+        raise UsageError(f"--expires {text}: is not a date such as 2030-01-01") from error
