@@ -49,7 +49,7 @@ class Refused(Exception):
 
 
 class FolderFetcher(FetcherInterface):  # type: ignore[misc]  # the package may be missing where types are checked
-    """Reads the files of an unpacked bundle in place of downloads."""
+    """Reads the files of an unpacked bundle instead of downloads."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -120,10 +120,16 @@ def replaced(text: str, path: Sequence[str], value: str) -> str:
         node = next((child for key, child in pairs if key.value == name), None)
     if node is None:
         raise Refused(f"the present configuration has no `{'.'.join(path)}` that could be replaced")
-    begin, end = node.start_mark.index, node.end_mark.index
-    # The end mark of a block value is the beginning of the next line with content.
-    tail = text[begin:end]
-    return text[:begin] + value + tail[len(tail.rstrip()) :] + text[end:]
+    # A block sequence may begin in the column of its key, in which a value in brackets may not begin.
+    return f"{text[: node.start_mark.index]} {value}{text[_end(node) :]}"
+
+
+def _end(node: yaml.Node) -> int:
+    """Return the index after a node. The end mark of a block collection lies behind later comments."""
+    if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
+        last = node.value[-1]
+        return _end(last[1] if isinstance(last, tuple) else last)
+    return int(node.end_mark.index)
 
 
 def renewed_text(kind: str, artefact: Path, present: str, kept: str, digest: str) -> str:

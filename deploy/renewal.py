@@ -359,7 +359,7 @@ class Renewal:
         self._board = board
         self._state = self._read()
         state = self._state
-        self._elapsed = max(0.0, now - state.at if state.boot == boot else now)
+        self._elapsed = now - state.at if state.boot == boot and now >= state.at else now
         state.boot, state.at = boot, now
         self._contact = self._read_contact()
 

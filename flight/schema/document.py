@@ -87,7 +87,7 @@ def imported(key: str, named: str, known: Mapping[str, str], environment: Mappin
     if not (module and colon and name):
         raise ConfigError(key, f"is {named!r}: name one of {', '.join(known)}, or `module:object`")
     file = environment.get(MODULES)
-    if file is not None and place not in known.values() and place not in _permitted(Path(file)):
+    if file is not None and place not in known.values() and place not in _permitted_objects(Path(file)):
         raise ConfigError(key, f"is {named!r}: add it as a line to {file}, which belongs to root")
     try:
         return getattr(importlib.import_module(module), name)
@@ -95,9 +95,9 @@ def imported(key: str, named: str, known: Mapping[str, str], environment: Mappin
         raise ConfigError(key, f"is {named!r}, which cannot be imported: {error}") from error
 
 
-def _permitted(path: Path) -> list[str]:
+def _permitted_objects(path: Path) -> list[str]:
     """Return the lines of a file, or nothing if anybody but root could have written it."""
-    with suppress(OSError, UnicodeDecodeError), path.open(encoding="utf-8", opener=_without_waiting) as file:
+    with suppress(OSError, UnicodeDecodeError), open(path, encoding="utf-8", opener=_without_waiting) as file:
         found = os.fstat(file.fileno())
         if stat.S_ISREG(found.st_mode) and found.st_uid == 0 and not found.st_mode & 0o022:
             return file.read(_LONGEST).split()

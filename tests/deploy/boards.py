@@ -30,7 +30,9 @@ case "$*" in
     *"-m flight run /"*"step_demo.yaml"*) grep -q . "$packages/flight/label" ;;
     *"-m flight --version"* | *"import flight"*) ;;
     *"-m flight run "*) echo "flies $(cat "$packages/flight/label")" ;;
-    *) PYTHONPATH={ROOT} exec {sys.executable} "$@" ;;
+    *)  # an isolated Python would not find the modules of this folder
+        [ "$1" != -I ] || shift
+        PYTHONPATH={ROOT} exec {sys.executable} "$@" ;;
 esac
 """
 
@@ -40,6 +42,7 @@ class FakeBoard:
     """A board's files below `root`, and Pythons that build releases of several labels."""
 
     root: Path
+    config: Path = TESTBED
 
     @property
     def prefix(self) -> Path:
@@ -59,7 +62,7 @@ class FakeBoard:
 
     def words(self, label: str) -> list[str]:
         """Return the command that installs a release."""
-        options = ["--python", str(self.python(label)), "--config", str(TESTBED)]
+        options = ["--python", str(self.python(label)), "--config", str(self.config)]
         return ["sh", str(DEPLOY / "install.sh"), *options]
 
     def environment(self) -> dict[str, str]:

@@ -268,7 +268,7 @@ def _start(board: FakeBoard) -> subprocess.Popen[str]:
 def test_the_flight_is_the_process_that_systemd_started(board: FakeBoard, chooser: str, note: str) -> None:
     """Type=notify, the watchdog and SIGTERM go by the main process."""
     python = _python(board, "current")
-    flight = 'echo "$$ $6 $KNIGHTCUBE_RELEASE $KNIGHTCUBE_RELEASE_NOTE"; exec sleep 600'
+    flight = 'echo "$$ $9 $KNIGHTCUBE_RELEASE $KNIGHTCUBE_RELEASE_NOTE"; exec sleep 600'
     ordinary = 'echo "flies $(cat "$packages/flight/label")"'
     _replace(python, python.read_text(encoding="utf-8").replace(ordinary, flight))
     release = (board.prefix / "current").resolve()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import textwrap
 from pathlib import Path
 from typing import Any
@@ -13,9 +15,11 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from flight.schema.document import (
+    MODULES,
     ConfigError,
     Document,
     config_path,
+    imported,
     join,
     merged_text,
     read_document,
@@ -285,3 +289,44 @@ def test_errors_of_sections_name_the_file_of_the_value(tmp_path: Path) -> None:
         ConfigError, match=rf"base\.yaml:{line}: `simulation\.free_body\.release\.speed` is -1"
     ):
         simulation_section(read_text(top), str(top), Simulation)
+
+
+@pytest.mark.parametrize(
+    ("content", "mode", "permitted"),
+    [
+        ("math:tau\n", 0o644, True),
+        ("math:pi\nmath:tau", 0o600, True),
+        ("math:e\n", 0o644, False),
+        ("math:tau\n", 0o664, False),
+        ("math:tau\n", 0o646, False),
+        (None, 0o644, False),
+    ],
+)
+def test_a_board_imports_only_what_a_file_of_root_permits(
+    tmp_path: Path, content: str | None, mode: int, permitted: bool
+) -> None:
+    path = tmp_path / "modules"
+    if content is not None:
+        path.write_text(content, encoding="utf-8")
+        path.chmod(mode)
+    board = {MODULES: str(path)}
+    assert imported("body", "known", {"known": "math:e"}, board) == math.e
+    if permitted and os.getuid() == 0:
+        assert imported("body", "math:tau", {}, board) == math.tau
+    else:
+        with pytest.raises(ConfigError, match=r"add it as a line to .*, which belongs to root"):
+            imported("body", "math:tau", {}, board)
+    assert imported("body", "math:tau", {}, {}) == math.tau, "not a board"
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file away")
+def test_a_list_that_another_user_owns_or_a_fifo_permits_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "modules"
+    path.write_text("math:tau\n", encoding="utf-8")
+    os.chown(path, 1000, 0)
+    fifo, link = tmp_path / "fifo", tmp_path / "link"
+    os.mkfifo(fifo)
+    link.symlink_to("/dev/zero")
+    for file in (path, fifo, link):
+        with pytest.raises(ConfigError, match="add it as a line"):
+            imported("simulation.world", "math:tau", {}, {MODULES: str(file)})

@@ -1,0 +1,169 @@
+"""A board whose root part of the renewal runs, with signing keys, bundles and services that are files."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from flight.link.process.renewal import decoded, encoded
+from ground.commands.renewal import make_signing_keys, sign
+from tests.deploy.boards import FakeBoard
+from tests.deploy.scripts import ROOT, changed_testbed
+
+LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000'}"
+_SYSTEMCTL = """#!/bin/sh
+echo "$*" >>"$BOARD/calls"
+case "$*" in
+    "is-active "*) for unit; do :; done; [ -e "$BOARD/active/$unit" ] ;;
+    *MainPID*) cat "$BOARD/pid" ;;
+esac
+"""
+
+
+class RenewedBoard:
+    """A board with the release `old`, and the ground that signs for it."""
+
+    def __init__(self, place: Path) -> None:
+        """Use a folder that `make` has filled."""
+        self.place, self.root, self.now = place, place / "root", 1000.0
+        self.files = FakeBoard(self.root, place / "flight.yaml")
+        self.own, self.link = self.root / "var/lib/knightcube-renewal", self.root / "var/lib/knightcube-link"
+        self.config = self.root / "etc/knightcube/flight.yaml"
+        self.count = 0
+
+    @classmethod
+    def make(cls, place: Path) -> RenewedBoard:
+        """Install a board, and make the signing keys."""
+        place.mkdir(exist_ok=True)
+        changed_testbed(place, commands="{socket: /run/knightcube/commands}", link=LINK)
+        root_metadata = make_signing_keys(place / "signing")
+        board = cls(place)
+        board.config.parent.mkdir(parents=True)
+        shutil.copyfile(root_metadata, board.config.parent / "root.json")
+        board.files.install("old")
+        systemctl = place / "bin/systemctl"
+        systemctl.parent.mkdir()
+        systemctl.write_text(_SYSTEMCTL, encoding="ascii")
+        systemctl.chmod(0o755)
+        (place / "active").mkdir()
+        for unit in ("knightcube.service", "knightcube-link.service"):
+            board.set_active(unit, True)
+        (place / "pid").write_text("0\n", encoding="ascii")
+        (board.link / "renewal").mkdir(parents=True)
+        return board
+
+    @classmethod
+    def copy(cls, made: RenewedBoard, place: Path) -> RenewedBoard:
+        """Return a copy of a board."""
+        shutil.copytree(made.place, place, symlinks=True, dirs_exist_ok=True)
+        return cls(place)
+
+    def set_active(self, unit: str, active: bool) -> None:
+        """Let a unit be active or not."""
+        path = self.place / "active" / unit
+        path.touch() if active else path.unlink(missing_ok=True)
+
+    def environment(self) -> dict[str, str]:
+        """Return the environment of the root part."""
+        path = f"{self.place / 'bin'}:{os.environ['PATH']}"
+        return {**os.environ, "PATH": path, "BOARD": str(self.place)}
+
+    def words(self) -> list[str]:
+        """Return the command of one step of the root part."""
+        program = self.files.prefix / "bin/renewal.py"
+        return [sys.executable, "-I", "-S", str(program), "--root", str(self.root), "--now", str(self.now)]
+
+    def step(self, seconds: float = 10.0) -> str:
+        """Let time pass and run one step; return its complaints."""
+        self.now += seconds
+        done = subprocess.run(
+            self.words(), env=self.environment(), capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stderr
+
+    def bundle(self, kind: str, path: Path, version: int, **changes: Any) -> Path:
+        """Sign an artefact."""
+        options = {"back": False, "expires": None, "least": 1, "out": self.place}
+        return sign(
+            Namespace(
+                folder=self.place / "signing", kind=kind, path=path, version=version, **options | changes
+            )
+        )
+
+    def put(self, bundle: Path, kind: str = "configuration") -> str:
+        """Put a bundle where the link puts a selected one; return its SHA-256."""
+        place = self.link / "files/chosen" / kind / bundle.name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(bundle, place)
+        return hashlib.sha256(bundle.read_bytes()).hexdigest()
+
+    def request(self, word: str, kind: str = "configuration", **values: Any) -> str:
+        """Leave a request of the link; return its name."""
+        self.count += 1
+        name = f"1-{self.count}-0-0"
+        (self.link / "renewal" / name).write_bytes(encoded({"do": word, "kind": kind, **values}))
+        return name
+
+    def activate(self, bundle: Path, kind: str = "configuration", hours: float = 1.0, **changes: Any) -> str:
+        """Put a bundle and request its activation; return the name of the request."""
+        values = {"name": bundle.name, "sum": self.put(bundle, kind), "hours": hours, "despite_faults": False}
+        return self.request("activate", kind, **values | changes)
+
+    def contact(self, frames: int, session: str = "a", limit_s: float = 0.0, safe: str = "") -> None:
+        """Leave the link's record of its contact."""
+        values = {"session": session, "frames": str(frames), "limit_s": limit_s, "safe": safe}
+        (self.link / "renewal/contact").write_bytes(encoded(values))
+
+    def changed(self, name: str) -> Path:
+        """Return the present configuration with another name."""
+        path = self.place / f"{name}.yaml"
+        lines = self.config.read_text(encoding="utf-8").splitlines(keepends=True)
+        text = "".join(f"name: {name}\n" if line.startswith("name:") else line for line in lines)
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    def flown(self) -> str:
+        """Return the name in the installed configuration, whose checksum must be right."""
+        data = self.config.read_bytes()
+        accepted = self.config.with_name("flight.yaml.sha256").read_text(encoding="ascii").split()[0]
+        assert accepted == hashlib.sha256(data).hexdigest()
+        return next(line[6:] for line in data.decode().splitlines() if line.startswith("name: "))
+
+    def calls(self) -> str:
+        """Return the calls of systemctl."""
+        return (self.place / "calls").read_text(encoding="utf-8")
+
+    def release(self) -> str:
+        """Return the label of the release that would fly now."""
+        return self.files.fly()[0]
+
+    def reports(self, request: str) -> list[tuple[str, str]]:
+        """Return results and texts of the reports about a request."""
+        status = decoded((self.own / "status").read_bytes())
+        return [(result, text) for _, name, result, _, text in status["reports"] if name == request]
+
+    def source(self, label: str) -> Path:
+        """Return the folder of a release's sources, whose flight is called `label`."""
+        builder = self.place / "bin/python3"
+        builder.write_text(f'#!/bin/sh\nexec {self.files.python(label)} "$@"\n', encoding="utf-8")
+        builder.chmod(0o755)
+        folder = self.place / f"source-{label}"
+        for part in ("deploy", "config", "knightcube/README.md", "pyproject.toml"):
+            target = folder / part
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if (ROOT / part).is_dir():
+                shutil.copytree(
+                    ROOT / part, target, symlinks=False, ignore=shutil.ignore_patterns("__pycache__")
+                )
+            else:
+                shutil.copyfile(ROOT / part, target)
+        (folder / "flight").mkdir()
+        (folder / "flight/label").write_text(label, encoding="ascii")
+        return folder

@@ -1,0 +1,329 @@
+"""Renewal in orbit: what is tried and confirmed stays, everything else gives way to the version before."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from ground.commands.renewal import replace_signing_key
+from tests.deploy.renewed_board import RenewedBoard
+from tests.deploy.scripts import script
+
+renewal = script("renewal")
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("systemctl") is None, reason="systemctl is missing: install systemd"
+)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> RenewedBoard:
+    return RenewedBoard.make(tmp_path_factory.mktemp("made") / "board")
+
+
+@pytest.fixture
+def board(made: RenewedBoard, tmp_path: Path) -> RenewedBoard:
+    return RenewedBoard.copy(made, tmp_path / "board")
+
+
+def activated(board: RenewedBoard, name: str = "second", version: int = 1, hours: float = 1.0) -> str:
+    """Activate a configuration; return the name of the request."""
+    request = board.activate(board.bundle("configuration", board.changed(name), version), hours=hours)
+    board.step()
+    assert board.flown() == name, board.reports(request)
+    return request
+
+
+def test_a_confirmed_configuration_stays(board: RenewedBoard) -> None:
+    before = board.flown()
+    request = activated(board)
+    assert [result for result, _ in board.reports(request)] == ["started"]
+    assert "--no-block restart knightcube.service knightcube-link.service" in board.calls()
+    board.request("confirm")
+    board.step()
+    assert board.reports(request)[-1] == ("completed", "configuration 1 stays")
+    board.step(1e6)
+    assert board.flown() == "second"
+    board.request("withdraw")
+    board.step()
+    assert board.flown() == before, "the version before is kept for the ground"
+
+
+def test_without_confirmation_the_time_with_power_decides(board: RenewedBoard) -> None:
+    before, request = board.flown(), activated(board, hours=1.0)
+    board.step(3500.0)
+    assert board.flown() == "second"
+    board.now = 0.0  # another boot: its time counts from the beginning
+    board.step(60.0)
+    assert board.flown() == "second"
+    board.step(200.0)
+    assert board.flown() == before
+    assert board.reports(request)[-1][0] == "failed"
+    assert "did not confirm" in board.reports(request)[-1][1]
+    board.request("confirm")
+    board.step()
+    assert board.flown() == before, "too late"
+
+
+@pytest.mark.parametrize("unit", ["knightcube.service", "knightcube-link.service"])
+def test_a_unit_that_does_not_come_up_ends_the_trial(board: RenewedBoard, unit: str) -> None:
+    before, request = board.flown(), activated(board)
+    board.set_active(unit, False)
+    board.step(100.0)
+    assert board.flown() == "second", "it may still come"
+    board.step(100.0)
+    assert board.flown() == before
+    assert "not up" in board.reports(request)[-1][1]
+
+
+def test_the_safe_state_ends_the_trial_at_once(board: RenewedBoard) -> None:
+    before = board.flown()
+    activated(board)
+    board.set_active("knightcube-safe.service", True)
+    board.step()
+    assert board.flown() == before
+
+
+def test_a_board_in_its_safe_state_can_be_renewed(board: RenewedBoard) -> None:
+    board.set_active("knightcube-safe.service", True)
+    activated(board)
+    board.set_active("knightcube-safe.service", False)
+    board.step()
+    assert board.flown() == "second"
+
+
+def test_a_reaction_to_safe_ends_the_trial_unless_it_was_permitted(board: RenewedBoard) -> None:
+    before = board.flown()
+    board.contact(1, "a", safe="an old one")
+    activated(board)
+    board.step()
+    assert board.flown() == "second", "the link of before reported it"
+    board.contact(0, "b", safe="coil 2 is open")
+    board.step()
+    assert board.flown() == before
+    bundle = board.bundle("configuration", board.changed("third"), 2)
+    board.activate(bundle, despite_faults=True)
+    board.step()
+    board.contact(0, "c", safe="coil 2 is open")
+    board.step()
+    assert board.flown() == "third"
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        ("byte", "is not the file that was activated"),
+        ("cut", "damaged"),
+        ("foreign key", "UnsignedMetadataError"),
+        ("invalid", "`coils.bus`"),
+        ("no link", "would end the contact"),
+        ("extends", "`extends` cannot be used on a board"),
+    ],
+)
+def test_what_is_not_whole_signed_and_flyable_is_refused(
+    board: RenewedBoard, damage: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, path = board.flown(), board.changed("second")
+    if damage == "invalid":
+        path.write_text(path.read_text().replace("  bus: 1", "  bus: -1"))
+    if damage == "no link":
+        path.write_text("".join(line for line in path.read_text().splitlines(True) if "link:" not in line))
+    if damage == "extends":
+        path.write_text("extends: testbed\n")
+    if damage == "foreign key":
+        shutil.rmtree(board.place / "signing")
+        from ground.commands.renewal import make_signing_keys  # noqa: PLC0415
+
+        make_signing_keys(board.place / "signing")
+    monkeypatch.setattr("ground.commands.renewal._artefact", lambda _, path: path.read_bytes())
+    bundle = board.bundle("configuration", path, 1)
+    if damage == "cut":
+        bundle.write_bytes(bundle.read_bytes()[:-200])
+    request = board.activate(bundle)
+    if damage == "byte":
+        placed = board.link / "files/chosen/configuration" / bundle.name
+        data = bytearray(placed.read_bytes())
+        data[100] ^= 1
+        placed.write_bytes(data)
+    board.step()
+    result, text = board.reports(request)[-1]
+    assert (result, words in text) == ("failed", True), text
+    assert board.flown() == before
+
+
+def test_versions_go_back_only_with_a_signature_that_says_so(board: RenewedBoard) -> None:
+    first = board.bundle("configuration", board.changed("first"), 1)
+    board.activate(first)
+    board.step()
+    board.request("confirm")
+    board.step()
+    second = board.bundle("configuration", board.changed("second"), 2)
+    board.activate(second)
+    board.step()
+    board.request("confirm")
+    board.step()
+    replayed = board.activate(first)
+    board.step()
+    assert "BadVersionNumberError" in board.reports(replayed)[-1][1]
+    assert board.flown() == "second"
+    again = board.activate(board.bundle("configuration", board.changed("first"), 1, back=True))
+    board.step()
+    assert board.flown() == "first", board.reports(again)
+
+
+def test_an_old_key_is_refused_once_a_root_key_has_named_another(board: RenewedBoard) -> None:
+    stolen = board.place / "stolen"
+    shutil.copytree(board.place / "signing", stolen)
+    assert replace_signing_key(board.place / "signing", also_root=False) == 2
+    activated(board)
+    board.request("confirm")
+    board.step()
+    shutil.rmtree(board.place / "signing")
+    stolen.rename(board.place / "signing")
+    request = board.activate(board.bundle("configuration", board.changed("third"), 9, least=99))
+    board.step()
+    assert board.reports(request)[-1][0] == "failed"
+    assert board.flown() == "second"
+
+
+def test_the_expiry_of_a_signature_is_the_signers_choice(board: RenewedBoard) -> None:
+    bundle = board.bundle("configuration", board.changed("second"), 1, expires="2020-01-01")
+    request = board.activate(bundle)
+    board.step()
+    assert "ExpiredMetadataError" in board.reports(request)[-1][1]
+    activated(board, version=2)  # without an end, no clock can bar it
+
+
+ELEMENTS = (
+    "1 25544U 98067A   08264.51782528 -.00002182  00000-0 -11606-4 0  2927",
+    "2 25544  51.6416 247.4627 0006703 130.5360 325.0288 15.72125391563537",
+)
+
+
+def test_elements_replace_one_value_of_the_present_configuration(board: RenewedBoard) -> None:
+    text = board.config.read_text() + f"elements:\n  - '{ELEMENTS[1]}'\n  - 'x'\n\n# after\nlast: 1\n"
+    open_bundle = script("open_bundle")
+    changed = open_bundle.replaced(text, ("elements",), json.dumps(ELEMENTS))
+    assert changed.endswith(f"elements:\n   {json.dumps(ELEMENTS)}\n\n# after\nlast: 1\n")
+    path = board.place / "elements.txt"
+    path.write_text("\n".join(ELEMENTS) + "\n")
+    request = board.activate(board.bundle("elements", path, 1), "elements")
+    board.step()
+    assert "has no `elements`" in board.reports(request)[-1][1], "a testbed has none"
+
+
+def test_a_release_is_built_from_the_packages_of_the_present_one_and_tried(board: RenewedBoard) -> None:
+    assert board.release() == "old"
+    request = board.activate(board.bundle("release", board.source("new"), 1), "release")
+    board.step()
+    assert board.release() == "new", board.reports(request)
+    board.request("confirm", "release")
+    board.step()
+    assert board.reports(request)[-1][0] == "completed"
+    board.request("withdraw", "release")
+    board.step()
+    assert board.release() == "old"
+
+
+def test_a_release_that_fails_its_trial_is_never_returned_to(board: RenewedBoard) -> None:
+    board.activate(board.bundle("release", board.source("new"), 1), "release")
+    board.step()
+    board.set_active("knightcube.service", False)
+    board.step(200.0)
+    assert board.release() == "old"
+    refused = board.request("withdraw", "release")
+    board.step()
+    assert board.reports(refused)[-1] == ("failed", "there is no previous release")
+    assert board.release() == "old"
+
+
+def test_silence_leads_back_to_release_configuration_and_ground(board: RenewedBoard) -> None:
+    ground = board.flown()
+    for number, name in enumerate(("first", "second"), start=1):
+        activated(board, name, number)
+        board.request("confirm")
+        board.step()
+    board.activate(board.bundle("release", board.source("new"), 1), "release")
+    board.step()
+    board.request("confirm", "release")
+    board.contact(7, limit_s=86_400.0)
+    board.step()
+    board.step(80_000.0)
+    board.now = 0.0  # a restart of the board keeps the time
+    board.step(7_000.0)
+    assert (board.release(), board.flown()) == ("old", "second")
+    board.step(86_500.0)
+    assert (board.release(), board.flown()) == ("old", "first")
+    board.step(86_500.0)
+    assert (board.release(), board.flown()) == ("old", ground)
+    texts = [text for _, text in board.reports("")]
+    assert [text.partition(" the ")[2] for text in texts] == [
+        "previous release flies",
+        "previous configuration flies",
+        "configuration accepted on the ground flies",
+    ]
+    board.step(1e6)
+    assert len(board.reports("")) == 3
+    board.contact(8, limit_s=86_400.0)
+    board.step()
+    board.step(80_000.0)
+    assert len(board.reports("")) == 3
+
+
+def test_without_a_limit_and_with_authentic_frames_nothing_happens(board: RenewedBoard) -> None:
+    activated(board)
+    board.request("confirm")
+    board.contact(1)
+    board.step()
+    board.step(1e8)
+    board.contact(1, limit_s=1000.0)
+    for frames in range(2, 8):
+        board.contact(frames, limit_s=1000.0)
+        board.step(900.0)
+    assert board.reports("") == []
+    board.contact(0, "another session", limit_s=1000.0)
+    board.step(1100.0)
+    assert board.flown() != "second", "a new link without a frame is silence"
+
+
+@pytest.mark.parametrize("kind", ["fifo", "link", "folder", "large", "text"])
+def test_requests_that_are_no_small_regular_files_are_refused(board: RenewedBoard, kind: str) -> None:
+    path = board.link / "renewal/1-5-0-0"
+    if kind == "fifo":
+        import os  # noqa: PLC0415
+
+        os.mkfifo(path)
+    elif kind == "link":
+        path.symlink_to("/etc/passwd")
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.write_bytes(b"{" * (1 << 20 if kind == "large" else 9))
+    board.step()
+    assert board.reports("1-5-0-0") == [("failed", "the request is damaged")]
+
+
+@pytest.mark.parametrize("copies", ["a", "b", "ab"])
+def test_a_damaged_copy_of_the_state_costs_nothing(board: RenewedBoard, copies: str) -> None:
+    before = board.flown()
+    activated(board)
+    for copy in copies:
+        path = board.own / f"state.{copy}"
+        data = bytearray(path.read_bytes())
+        data[len(data) // 3] ^= 4
+        path.write_bytes(data)
+    board.step(4000.0)
+    assert board.flown() == (before if len(copies) == 1 else "second"), "without any record the trial is lost"
+
+
+def test_records_have_the_same_form_at_both_ends() -> None:
+    from flight.link.process.renewal import decoded, encoded  # noqa: PLC0415
+
+    values = {"a": [1, "b", None]}
+    assert renewal.encoded(values) == encoded(values)
+    assert renewal.decoded(encoded(values)) == decoded(encoded(values)) == values
+    with pytest.raises(ValueError, match="checksum"):
+        decoded(encoded(values).replace(b"1", b"2", 1))

@@ -1,0 +1,93 @@
+"""`flight renewal` makes keys and bundles that a board accepts."""
+
+from __future__ import annotations
+
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from tests.deploy.scripts import changed_testbed, script
+from tests.ground.commands.in_process import command
+
+LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000'}"
+
+
+@pytest.fixture
+def signing(tmp_path: Path) -> Path:
+    done = command("renewal", "keys", tmp_path / "signing")
+    assert (done.returncode, done.stderr) == (0, "")
+    return tmp_path / "signing"
+
+
+def test_a_bundle_is_opened_by_the_root_metadata_of_the_board(signing: Path, tmp_path: Path) -> None:
+    config = changed_testbed(tmp_path, commands="{socket: /run/x}", link=LINK)
+    done = command("renewal", "sign", signing, "configuration", config, "--version", "2", "--out", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    bundle = tmp_path / "configuration-2.renewal"
+    assert bundle.stat().st_size < 8192, "few frames of a slow radio"
+    root, folder = signing / "metadata/1.root.json", tmp_path / "opened"
+    folder.mkdir()
+    words = [tmp_path / "trusted", root, bundle, "configuration", folder, config, "/kept"]
+    assert script("open_bundle").main([str(word) for word in words]) == 0
+    assert (folder / "set/flight.yaml").read_bytes() == config.read_bytes()
+
+
+def test_keys_are_readable_by_their_owner_only_and_never_overwritten(signing: Path) -> None:
+    keys = sorted(signing.glob("*.pem"))
+    assert [key.name for key in keys] == ["root-1.pem", "root-2.pem", "signing.pem"]
+    assert {key.stat().st_mode & 0o777 for key in keys} == {0o600}
+    before = [key.read_bytes() for key in keys]
+    done = command("renewal", "keys", signing)
+    assert done.returncode == 2
+    assert "name a folder that does not exist" in done.stderr
+    assert [key.read_bytes() for key in keys] == before
+
+
+def test_one_root_key_is_enough_to_replace_all_keys(signing: Path, tmp_path: Path) -> None:
+    (signing / "root-1.pem").unlink()
+    assert command("renewal", "new-key", signing, "--root").returncode == 0
+    assert command("renewal", "new-key", signing).returncode == 0
+    index = tmp_path / "index"
+    index.write_bytes(b"stars")
+    done = command("renewal", "sign", signing, "catalogue", index, "--version", "1", "--out", tmp_path)
+    assert done.returncode == 0
+    with tarfile.open(tmp_path / "catalogue-1.renewal") as archive:
+        assert {"metadata/1.root.json", "metadata/2.root.json", "metadata/3.root.json"} < set(
+            archive.getnames()
+        )
+    for key in signing.glob("root-*.pem"):
+        key.unlink()
+    assert "no root-*.pem is a root key" in command("renewal", "new-key", signing).stderr
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "options", "words"),
+    [
+        ("configuration", "name: [", [], "is not YAML"),
+        ("elements", "1 25544U\n2 25544\n", [], "two lines of 69 characters"),
+        ("release", "", [], "is not the folder of this software's sources"),
+        ("catalogue", "x", ["--expires", "soon"], "--expires soon: is not a date"),
+        ("catalogue", None, [], "there is no such file"),
+    ],
+)
+def test_what_the_board_would_refuse_is_not_signed(
+    signing: Path, tmp_path: Path, kind: str, text: str | None, options: list[str], words: str
+) -> None:
+    path = tmp_path / "artefact"
+    if text is not None:
+        path.write_text(text)
+    done = command("renewal", "sign", signing, kind, path, "--version", "1", "--out", tmp_path, *options)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert not list(tmp_path.glob("*.renewal"))
+
+
+def test_versions_rise_unless_going_back_is_signed(signing: Path, tmp_path: Path) -> None:
+    index = tmp_path / "index"
+    index.write_bytes(b"stars")
+    words = ["renewal", "sign", str(signing), "catalogue", str(index), "--out", str(tmp_path), "--version"]
+    assert command(*words, "3").returncode == 0
+    assert "catalogue 3 is signed already" in command(*words, "3").stderr
+    assert command(*words, "2", "--back").returncode == 0
+    assert command(*words, "3").returncode == 0
