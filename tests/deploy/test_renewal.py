@@ -290,7 +290,7 @@ def test_without_a_limit_and_with_authentic_frames_nothing_happens(board: Renewe
 
 
 @pytest.mark.parametrize("kind", ["fifo", "link", "folder", "large", "text"])
-def test_requests_that_are_no_small_regular_files_are_refused(board: RenewedBoard, kind: str) -> None:
+def test_a_request_that_is_not_a_small_regular_file_is_refused(board: RenewedBoard, kind: str) -> None:
     path = board.link / "renewal/1-5-0-0"
     if kind == "fifo":
         import os  # noqa: PLC0415
