@@ -18,6 +18,7 @@ from flight.app.run import RunRequest
 from flight.loop.state import state_folder
 from flight.schema.devices import AravisDevice, Camera, V4l2Device, WideCamera
 from flight.schema.document import ConfigError
+from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus
@@ -28,7 +29,7 @@ from hal.drivers.camera import CameraDevice, ServedCamera
 from hal.drivers.coils import CoilSettings, PwmTorqueCoils, wirings
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685, switch_off
-from hal.drivers.ublox import UbloxReceiver
+from hal.drivers.ublox import EARLIEST_NS, UbloxReceiver
 from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
 from hal.interfaces.devices import (
@@ -43,10 +44,16 @@ from hal.interfaces.errors import DeviceError, OutOfRange
 from hal.interfaces.guardian import CoilReach
 from hal.interfaces.wires import SECOND_NS, Clock, Rig, Wires
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from knightcube.astro.quaternion import NED_TO_TESTBED, attitude_map, attitude_matrix
+from knightcube.errors import UsageError
 
 if TYPE_CHECKING:
     from sim_hal.rig import PosedCamera, SimulationRequest
+
+_BEFORE_ELEMENTS = 365.0
+"""Time (days) before the epoch of the elements from which the dates of the GPS receiver are possible."""
 
 
 def fault_catalogue() -> tuple[str, str]:
@@ -153,7 +160,12 @@ def open_gps(config: Config, rig: Rig, stack: ExitStack) -> UbloxReceiver | None
     """
     if config.gps is None or rig.wires.gps is None:
         return None
-    gps = UbloxReceiver(rig.wires.gps, rig.clock, round(config.gps.period * SECOND_NS))
+    earliest_ns = EARLIEST_NS
+    if isinstance(config, OrbitConfig) and config.elements is not None:
+        with suppress(UsageError):  # composing the body refuses wrong elements
+            days = TwoLineElements(*config.elements).epoch - UNIX_EPOCH
+            earliest_ns = round((days - _BEFORE_ELEMENTS) * DAY) * SECOND_NS
+    gps = UbloxReceiver(rig.wires.gps, rig.clock, round(config.gps.period * SECOND_NS), earliest_ns)
     stack.callback(gps.close)
     return gps
 

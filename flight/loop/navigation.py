@@ -14,13 +14,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from flight.link import events
-from flight.link.telemetry.definitions import FIX, IMU
+from flight.link.telemetry.definitions import FIX, GPS_LINK, IMU
 from flight.loop import facts
 from flight.loop.body import BodyEstimation
 from flight.loop.coil_response import CoilCorrection
 from flight.loop.facts import Services
 from hal.interfaces.devices import (
     CoilState,
+    GpsLink,
     GpsReading,
     GpsReceiver,
     ImuLink,
@@ -283,7 +284,8 @@ class Navigation:
 CLOCK_OFF_NS = SECOND_NS
 """Largest accepted difference (ns) between the wall clock and the GPS receiver's time."""
 FIX_PERIOD_NS = 10 * SECOND_NS
-"""Shortest time (ns) between two recorded fixes."""
+"""Shortest time (ns) between two recorded fixes, and between two records of the line's counters."""
+_COUNTERS = tuple(field.name for field in GPS_LINK.fields)
 
 
 class Positioning:
@@ -310,6 +312,8 @@ class Positioning:
         self._recorder = services.recorder
         self._fixed_ns = 0
         self._recorded_ns: int | None = None
+        self._link = receiver.link()
+        self._link_recorded_ns: int | None = None
 
     def begin(self, time_ns: int) -> None:
         """Measure the age of the newest fix from `time_ns` on."""
@@ -336,10 +340,33 @@ class Positioning:
                 self._facts.update(facts.CLOCK_OFF, abs(off_ns) > CLOCK_OFF_NS, now_ns, text)
             else:
                 self._events.report(events.GPS_REFUSED, now_ns, f"{reading.satellites} satellites")
+        link = self._watch_line(now_ns)
         age_ns = now_ns - self._fixed_ns
-        text = error or f"no usable fix for {age_ns * 1e-9:.0f} s"
+        cause = f": {link.condition}" if link.condition else ""
+        text = error or f"no usable fix for {age_ns * 1e-9:.0f} s{cause}"
         lost_now = bool(error) or age_ns > self._max_age_ns
         self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes come again")
+
+    def _watch_line(self, now_ns: int) -> GpsLink:
+        """Record the counters of the serial line, report what they show, and return them."""
+        link, before = self._receiver.link(), self._link
+        self._link = link
+        if link.refused > before.refused:
+            self._events.report(events.GPS_SET_UP, now_ns, link.refusal)
+        odd = {
+            "frames with a wrong checksum": link.bad_checksum - before.bad_checksum,
+            "solutions out of range": link.out_of_range - before.out_of_range,
+            "dates moved by 1024 weeks": int(link.rolled_over > 0 and before.rolled_over == 0),
+        }
+        if any(odd.values()):
+            text = ", ".join(f"{count} {name}" for name, count in odd.items() if count)
+            cause = f": {link.condition}" if link.condition else ""
+            self._events.report(events.GPS_LINK, now_ns, text + cause)
+        if self._link_recorded_ns is None or now_ns - self._link_recorded_ns >= FIX_PERIOD_NS:
+            self._link_recorded_ns = now_ns
+            counters = {name: getattr(link, name) for name in _COUNTERS}
+            self._recorder.record(GPS_LINK, now_ns, **counters)
+        return link
 
     def _record(self, reading: GpsReading, used: bool, now_ns: int) -> None:
         """Record a fix, unless the last recorded fix is too recent."""

@@ -7,16 +7,22 @@ time, position, velocity and accuracies of one epoch. The NMEA protocol is not u
 these values over several sentences, usually rounds the position to 2 m, and lacks the vertical velocity.
 
 The receiver loses its configuration at a power loss. The driver therefore requests NAV-PVT messages at the
-start, and again whenever none has arrived for three seconds. No call blocks. Consumer receivers stop working
+start, and again whenever none has arrived for three seconds. Receivers with protocol version 27 or later (M9,
+M10, F9) are configured by CFG-VALSET (u-blox F9 interface description, UBX-22008968). Older receivers (u-blox
+7 and 8) are configured by CFG-PRT, CFG-RATE and CFG-MSG. The receiver reports its version in MON-VER. After a
+refused command (ACK-NAK), the driver tries the other kind. No call blocks. Consumer receivers stop working
 above 18 km or 515 m/s, so that a satellite needs a firmware without this limit.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import struct
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
 
 import numpy as np
 
@@ -27,16 +33,26 @@ from hal.interfaces.wires import SECOND_NS, Clock, SerialPort
 SYNC = b"\xb5\x62"
 NAV_PVT = 0x01, 0x07
 ACK_NAK, ACK_ACK = (0x05, 0x00), (0x05, 0x01)
-CFG_PRT, CFG_MSG, CFG_RATE = (0x06, 0x00), (0x06, 0x01), (0x06, 0x08)
+CFG_PRT, CFG_MSG, CFG_RATE, CFG_VALSET = (0x06, 0x00), (0x06, 0x01), (0x06, 0x08), (0x06, 0x8A)
+MON_VER = 0x0A, 0x04
+VALSET_PROTOCOL = 27.0
+"""First protocol version with CFG-VALSET."""
+NAMES = {CFG_PRT: "CFG-PRT", CFG_MSG: "CFG-MSG", CFG_RATE: "CFG-RATE", CFG_VALSET: "CFG-VALSET"}
+UART1_BAUDRATE, UART1_IN_UBX, UART1_OUT_UBX, UART1_OUT_NMEA = 0x40520001, 0x10730001, 0x10740001, 0x10740002
+RATE_MEASUREMENT, RATE_SOLUTION, RATE_TIME, PVT_ON_UART1 = 0x30210001, 0x30210002, 0x20210003, 0x20910007
+"""Keys of CFG-VALSET; the second hexadecimal digit of a key determines the size of its value."""
 OVERHEAD = 8
-PVT_LENGTH = 92
+PVT_LENGTH, OLD_PVT_LENGTH = 92, 84
+"""Lengths (bytes) of the payload of NAV-PVT, from protocol version 15 on and in u-blox 7."""
 _PVT = struct.Struct("<IHBBBBBBIiBBBBiiiiIIiiiiiIIHHIihH")
 THREE_DIMENSIONS = 3
 """Value of the NAV-PVT field `fixType` for a three-dimensional fix."""
-DATE_AND_TIME = 0b011
-"""Bits of the NAV-PVT field `valid` for a valid date and time."""
-FIX_OK = 0b1
-"""Bit of the NAV-PVT field `flags` for a valid fix."""
+DATE_AND_TIME = 0b111
+"""Bits of the NAV-PVT field `valid` for a valid date and time with known leap seconds (fullyResolved)."""
+FIX_OK, INVALID_POSITION = 0b1, 0b1
+"""Bit of the NAV-PVT field `flags` for a valid fix, and bit of `flags3` for an invalid position."""
+UNKNOWN_ACCURACY = 0xFFFF_FFFF
+"""Value of an accuracy that the receiver does not know; the value 0 also means unknown."""
 
 Kind = tuple[int, int]
 
@@ -57,6 +73,7 @@ class Pvt:
         horizontal, vertical: horizontal and vertical accuracy of the position, mm.
         velocity: velocity to the north, to the east and downwards, mm/s.
         speed_accuracy: accuracy of the speed, mm/s.
+        flags3: further status bits, of which the lowest one marks an invalid position.
     """
 
     date: tuple[int, int, int, int, int, int]
@@ -72,6 +89,7 @@ class Pvt:
     vertical: int
     velocity: tuple[int, int, int]
     speed_accuracy: int
+    flags3: int = 0
 
     def packed(self, time_of_week_ms: int = 0) -> bytes:
         """Return the payload of the NAV-PVT message."""
@@ -99,7 +117,7 @@ class Pvt:
             self.speed_accuracy,
             0,
             150,  # position dilution of precision, units of 0.01
-            0,
+            self.flags3,
             0,
             0,
             0,
@@ -108,8 +126,9 @@ class Pvt:
 
 
 def unpack_pvt(payload: bytes) -> Pvt:
-    """Return the content of a NAV-PVT payload of 92 bytes."""
-    values = _PVT.unpack(payload)
+    """Return the content of a NAV-PVT payload of 92 bytes, or of 84 bytes, which is that of u-blox 7."""
+    old = len(payload) == OLD_PVT_LENGTH
+    values = _PVT.unpack(payload.ljust(PVT_LENGTH, b"\0"))
     (_, year, month, day, hour, minute, second, valid, _, nano, fix, flags, _, satellites) = values[:14]
     longitude, latitude, height, _, horizontal, vertical, north, east, down, _, _, accuracy = values[14:26]
     return Pvt(
@@ -126,6 +145,7 @@ def unpack_pvt(payload: bytes) -> Pvt:
         vertical=vertical,
         velocity=(north, east, down),
         speed_accuracy=accuracy,
+        flags3=0 if old else values[28],
     )
 
 
@@ -144,26 +164,38 @@ def frame(kind: Kind, payload: bytes = b"") -> bytes:
     return SYNC + body + checksum(body)
 
 
-class UbxParser:
-    """Decoder that extracts UBX frames from received bytes.
+LONGEST_FRAME = 8192
+"""Largest length (bytes) of a payload; NAV-SAT, RXM-RAWX and MON-VER, for example, have up to 4 kB."""
+_NMEA = re.compile(rb"\$([\x20-\x23\x25-\x29\x2b-\x7e]{5,90})\*([0-9A-Fa-f]{2})\r?\n")
+_NMEA_TAIL = 100
 
-    If a candidate frame is invalid, the search continues two bytes after the candidate's start.
+
+class UbxParser:
+    """Decoder that extracts UBX frames from received bytes, and counts NMEA sentences between them.
+
+    If a candidate frame is invalid, the search continues two bytes after the candidate's start. A long
+    candidate whose end has not arrived is discarded if it contains a valid frame.
 
     Attributes:
         bytes_received: number of received bytes.
         frames: number of frames with a valid checksum.
+        long_frames: number of frames with more than `longest` bytes of payload and a valid checksum.
         bad_checksum: number of frames with a wrong checksum.
         discarded_bytes: number of bytes outside valid frames.
+        sentences: number of NMEA sentences with a valid checksum among the discarded bytes.
     """
 
     def __init__(self, longest: int = 256) -> None:
-        """Accept frames with at most `longest` bytes of payload."""
+        """Wait without a further search for frames with at most `longest` bytes of payload."""
         self.bytes_received = 0
         self.frames = 0
+        self.long_frames = 0
         self.bad_checksum = 0
         self.discarded_bytes = 0
+        self.sentences = 0
         self._longest = longest
         self._buffer = b""
+        self._text = b""
 
     def feed(self, data: bytes) -> list[tuple[Kind, bytes, int]]:
         """Return the frames that `data` completes.
@@ -176,25 +208,53 @@ class UbxParser:
             start = buffer.find(SYNC, position)
             if start < 0:
                 start = len(buffer) - buffer.endswith(SYNC[:1])
-            self.discarded_bytes += start - position
+            self._discard(buffer[position:start])
             position = start
             if len(buffer) - start < OVERHEAD:
                 break
             length = int.from_bytes(buffer[start + 4 : start + 6], "little")
             end = start + OVERHEAD + length
-            if length <= self._longest and end > len(buffer):
-                break
+            if length <= LONGEST_FRAME and end > len(buffer):
+                inner = self._inner_frame(buffer, start) if length > self._longest else -1
+                if inner < 0:
+                    break
+                self._discard(buffer[start:inner])
+                position = inner
+                continue
             body = buffer[start + 2 : end - 2]
-            if length > self._longest or checksum(body) != buffer[end - 2 : end]:
-                self.bad_checksum += 1
-                self.discarded_bytes += len(SYNC)
+            if length > LONGEST_FRAME or checksum(body) != buffer[end - 2 : end]:
+                self.bad_checksum += length <= LONGEST_FRAME
+                self._discard(buffer[start : start + len(SYNC)])
                 position = start + len(SYNC)
                 continue
             self.frames += 1
+            self.long_frames += length > self._longest
             found.append(((body[0], body[1]), body[4:], len(buffer) - end))
             position = end
         self._buffer = buffer[position:]
         return found
+
+    def _inner_frame(self, buffer: bytes, start: int) -> int:
+        """Return the offset of the first valid frame after `start`, or -1."""
+        inner = buffer.find(SYNC, start + len(SYNC))
+        while inner >= 0:
+            end = inner + OVERHEAD + int.from_bytes(buffer[inner + 4 : inner + 6], "little")
+            complete = len(buffer) - inner >= OVERHEAD and end <= len(buffer)
+            if complete and checksum(buffer[inner + 2 : end - 2]) == buffer[end - 2 : end]:
+                return inner
+            inner = buffer.find(SYNC, inner + len(SYNC))
+        return -1
+
+    def _discard(self, data: bytes) -> None:
+        """Count bytes outside valid frames, and the NMEA sentences that they complete."""
+        if not data:
+            return
+        self.discarded_bytes += len(data)
+        text, end = self._text + data, 0
+        for sentence in _NMEA.finditer(text):
+            end = sentence.end()
+            self.sentences += reduce(xor, sentence[1], 0) == int(sentence[2], 16)
+        self._text = text[end:][-_NMEA_TAIL:]
 
 
 DEVICE = "gps"
@@ -203,34 +263,67 @@ _BITS = 10
 _SEMI_MAJOR_AXIS, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84, NGA.STND.0036
 _FASTEST = 12_000.0
 _HIGHEST = 3e6
+EARLIEST_NS = 1_767_225_600 * SECOND_NS
+"""UTC (ns since 1970) of the start of 2026, before which no released software of this project flew."""
+ROLLOVER_NS = 1024 * 7 * 86_400 * SECOND_NS
+"""Period (ns) after which the ten-bit week number of GPS repeats."""
+_PROTOCOL = re.compile(rb"PROTVER[ =](\d+\.\d+)")
 
 
 class UbloxReceiver:
     """Driver of a u-blox receiver, which implements `hal.interfaces.devices.GpsReceiver`."""
 
-    def __init__(self, port: SerialPort, clock: Clock, period_ns: int = SECOND_NS) -> None:
-        """Request a fix every `period_ns`. Raises OutOfRange for a period outside 0.1 to 60 s."""
+    def __init__(
+        self,
+        port: SerialPort,
+        clock: Clock,
+        period_ns: int = SECOND_NS,
+        earliest_ns: int = EARLIEST_NS,
+    ) -> None:
+        """Prepare the driver. Raises OutOfRange for a period outside 0.1 to 60 s.
+
+        Args:
+            port: open serial port.
+            clock: clock of the flight.
+            period_ns: period of the fixes that are requested, ns.
+            earliest_ns: earliest possible UTC, ns since 1970; an earlier date of the receiver is moved by
+                1024 weeks.
+        """
         if not 0.1 <= period_ns / SECOND_NS <= 60.0:
             raise OutOfRange(DEVICE, "period", period_ns / SECOND_NS, 0.1, 60.0, "s")
         self._port = port
         self._clock = clock
         self._period_ns = period_ns
+        self._earliest_ns = earliest_ns
+        self._silence_ns = max(SILENCE_NS, 2 * period_ns)
         self._parser = UbxParser()
-        self._requested_ns = -SILENCE_NS
-        self._fix_arrival_ns = clock.now_ns()
+        self._requested_ns: int | None = None
+        self._is_due = False
+        self._uses_valset = False
+        self._protocol = 0.0
+        self._refusal = ""
+        self._cause = ""
+        now_ns = clock.now_ns()
+        self._fix_arrival_ns = now_ns
+        self._arrivals_ns = {"frame": -1, "sentence": -1}
         self._last_byte_ns = -1
-        self._refused = self._out_of_range = 0
+        self._refused = self._out_of_range = self._unresolved = self._no_fix = self._rolled_over = 0
 
     def poll(self) -> list[GpsReading]:
         """Return the readings since the last call, oldest first. Raises NotResponding if the port is lost."""
         readings = []
+        parser = self._parser
         for arrival_ns, data in self._port.receive():
             self._last_byte_ns = arrival_ns
-            for kind, payload, behind in self._parser.feed(data):
+            sentences = parser.sentences
+            for kind, payload, behind in parser.feed(data):
+                self._arrivals_ns["frame"] = arrival_ns
                 sent_ns = arrival_ns - behind * _BITS * SECOND_NS // self._port.baud_rate
                 reading = self._reading(kind, payload, sent_ns)
                 if reading is not None:
                     readings.append(reading)
+            if parser.sentences > sentences:
+                self._arrivals_ns["sentence"] = arrival_ns
         self._set_up()
         return readings
 
@@ -240,10 +333,18 @@ class UbloxReceiver:
         return GpsLink(
             bytes_received=parser.bytes_received,
             frames=parser.frames,
+            long_frames=parser.long_frames,
             bad_checksum=parser.bad_checksum,
             discarded_bytes=parser.discarded_bytes,
+            sentences=parser.sentences,
             out_of_range=self._out_of_range,
+            unresolved=self._unresolved,
+            no_fix=self._no_fix,
+            rolled_over=self._rolled_over,
             refused=self._refused,
+            refusal=self._refusal,
+            protocol=self._protocol,
+            condition=self._condition(),
             last_byte_ns=self._last_byte_ns,
         )
 
@@ -251,45 +352,135 @@ class UbloxReceiver:
         """Close the serial port."""
         self._port.close()
 
+    def _condition(self) -> str:
+        """Return why no usable fix arrives and what to do, or an empty text."""
+        since_ns = self._clock.now_ns() - self._silence_ns
+        if self._fix_arrival_ns >= since_ns:
+            return self._cause
+        if self._arrivals_ns["frame"] >= since_ns:
+            return f"UBX frames but no NAV-PVT: {self._refusal or 'the request was not answered'}"
+        if self._arrivals_ns["sentence"] >= since_ns:
+            return (
+                "NMEA sentences but no UBX frame: check the wire from the host's TX to the receiver's RX, "
+                "and that the receiver is a u-blox 7 or newer"
+            )
+        if self._last_byte_ns >= since_ns:
+            return (
+                f"bytes but neither UBX frames nor NMEA sentences at {self._port.baud_rate} baud: check "
+                "`gps.baud_rate` (factory settings: 9600 for u-blox 7 and 8, 38400 for M9, M10 and F9)"
+            )
+        return "no byte received: check power, the cable, and the port's name"
+
     def _reading(self, kind: Kind, payload: bytes, arrival_ns: int) -> GpsReading | None:
-        if kind == ACK_NAK:
-            self._refused += 1
-        if kind == NAV_PVT and len(payload) == PVT_LENGTH:
-            self._fix_arrival_ns = self._clock.now_ns()
-            try:
-                return reading_of(unpack_pvt(payload), arrival_ns, self._port.baud_rate)
-            except OutOfRange:
-                self._out_of_range += 1
-        return None
+        if kind == ACK_NAK and len(payload) >= 2:
+            self._take_refusal((payload[0], payload[1]))
+        if kind == MON_VER and (version := _PROTOCOL.search(payload)):
+            self._protocol = float(version[1])
+            self._use_valset(self._protocol >= VALSET_PROTOCOL)
+        if kind != NAV_PVT or len(payload) not in {PVT_LENGTH, OLD_PVT_LENGTH}:
+            return None
+        self._fix_arrival_ns = self._clock.now_ns()
+        pvt = unpack_pvt(payload)
+        try:
+            reading = reading_of(pvt, arrival_ns, self._port.baud_rate, self._earliest_ns, len(payload))
+        except OutOfRange as error:
+            self._out_of_range += 1
+            self._cause = error.message
+            return None
+        self._rolled_over += reading.rolled_over
+        if pvt.valid & DATE_AND_TIME != DATE_AND_TIME:
+            self._unresolved += 1
+            self._cause = (
+                f"the receiver does not know date, time and leap seconds yet (valid {pvt.valid:#05b})"
+            )
+        elif not reading.valid:
+            self._no_fix += 1
+            self._cause = (
+                f"the receiver has no valid fix (fixType {pvt.fix}, flags {pvt.flags:#04x}, flags3 "
+                f"{pvt.flags3:#06x}, {pvt.satellites} satellites): check the antenna"
+            )
+        else:
+            self._cause = ""
+        return reading
+
+    def _take_refusal(self, command: Kind) -> None:
+        """Count a refused command, and try the other kind of configuration."""
+        self._refused += 1
+        name = NAMES.get(command, f"command {command[0]:02X} {command[1]:02X}")
+        if not self._protocol and command in NAMES:
+            self._use_valset(command != CFG_VALSET)
+        version = f"{self._protocol:g}" if self._protocol else "unknown"
+        cure = "CFG-VALSET is needed from version 27 on, and CFG-PRT and CFG-MSG before"
+        self._refusal = f"the receiver refused {name} (ACK-NAK, protocol version {version}): {cure}"
+
+    def _use_valset(self, wanted: bool) -> None:
+        """Configure by CFG-VALSET or not, and at once if this is a change."""
+        self._is_due = self._is_due or wanted > self._uses_valset
+        self._uses_valset = wanted
 
     def _set_up(self) -> None:
         """Configure the receiver to send only NAV-PVT.
 
-        The request is repeated every three seconds.
+        The request is repeated while no NAV-PVT arrives.
         """
         now_ns = self._clock.now_ns()
-        never = self._parser.frames == 0 and self._requested_ns < 0
-        if (
-            not never and now_ns - self._fix_arrival_ns < SILENCE_NS
-        ) or now_ns - self._requested_ns < SILENCE_NS:
+        requested_ns = self._requested_ns
+        silent = now_ns - self._fix_arrival_ns >= self._silence_ns
+        if requested_ns is None:
+            due = silent or self._parser.frames == 0
+        else:
+            due = self._is_due or (silent and now_ns - requested_ns >= self._silence_ns)
+        if not due:
             return
-        self._requested_ns = now_ns
-        rate = (self._period_ns // 1_000_000).to_bytes(2, "little") + b"\x01\x00\x01\x00"  # time system GPS
-        # Port 1 is UART 1, configured as 8N1 with UBX in both directions and without NMEA.
-        port = (
-            b"\x01\x00\x00\x00\xd0\x08\x00\x00" + self._port.baud_rate.to_bytes(4, "little") + b"\x01\x00" * 2
-        )
-        request = frame(CFG_PRT, port + b"\x00" * 4) + frame(CFG_RATE, rate)
-        self._port.send(request + frame(CFG_MSG, bytes((*NAV_PVT, 1))))
+        self._requested_ns, self._is_due = now_ns, False
+        request = b"" if self._protocol else frame(MON_VER)
+        made = valset if self._uses_valset else legacy_set_up
+        self._port.send(made(self._port.baud_rate, self._period_ns) + request)
 
 
-def reading_of(pvt: Pvt, arrival_ns: int, baud_rate: int) -> GpsReading:
+def legacy_set_up(baud_rate: int, period_ns: int) -> bytes:
+    """Return the frames that make u-blox 7 and 8 send UBX only on UART 1, one NAV-PVT per period (ns)."""
+    rate = (period_ns // 1_000_000).to_bytes(2, "little") + b"\x01\x00\x01\x00"  # time system GPS
+    # Port 1 is UART 1, configured as 8N1 with UBX in both directions and without NMEA.
+    port = b"\x01\x00\x00\x00\xd0\x08\x00\x00" + baud_rate.to_bytes(4, "little") + b"\x01\x00" * 2
+    return frame(CFG_PRT, port + b"\x00" * 4) + frame(CFG_RATE, rate) + frame(CFG_MSG, bytes((*NAV_PVT, 1)))
+
+
+def valset(baud_rate: int, period_ns: int) -> bytes:
+    """Return the frame that configures M9, M10 and F9 in their volatile memory."""
+    values = {
+        UART1_BAUDRATE: baud_rate,
+        UART1_IN_UBX: 1,
+        UART1_OUT_UBX: 1,
+        UART1_OUT_NMEA: 0,
+        RATE_MEASUREMENT: period_ns // 1_000_000,
+        RATE_SOLUTION: 1,
+        RATE_TIME: 1,  # time system GPS
+        PVT_ON_UART1: 1,
+    }
+    packed = (
+        key.to_bytes(4, "little") + value.to_bytes(VALUE_SIZES[key >> 28], "little")
+        for key, value in values.items()
+    )
+    return frame(CFG_VALSET, b"\x00\x01\x00\x00" + b"".join(packed))
+
+
+VALUE_SIZES = {1: 1, 2: 1, 3: 2, 4: 4}
+"""Sizes (bytes) of the values of CFG-VALSET, by the first hexadecimal digit of the key."""
+
+
+def reading_of(
+    pvt: Pvt, arrival_ns: int, baud_rate: int, earliest_ns: int = EARLIEST_NS, length: int = PVT_LENGTH
+) -> GpsReading:
     """Return the reading of a NAV-PVT message. Raises OutOfRange for physically impossible values.
 
     Args:
         pvt: content of the message.
         arrival_ns: host time at which the last byte of the message was received, ns.
         baud_rate: baud rate of the serial line.
+        earliest_ns: earliest possible UTC, ns since 1970; a date of at most 1024 weeks earlier is moved by
+            1024 weeks, and any other date outside the following 1024 weeks is impossible.
+        length: length of the payload, bytes.
     """
     limits: tuple[tuple[str, float, float, float, str], ...] = (
         ("latitude", pvt.latitude * 1e-7, -90.0, 90.0, "deg"),
@@ -302,16 +493,33 @@ def reading_of(pvt: Pvt, arrival_ns: int, baud_rate: int) -> GpsReading:
             raise OutOfRange(DEVICE, name, value, low, high, unit)
     position, axes = _position(pvt)
     timed = pvt.valid & DATE_AND_TIME == DATE_AND_TIME
+    told_ns = _utc_ns(pvt) if timed else 0
+    utc_ns = (
+        told_ns + ROLLOVER_NS if timed and earliest_ns - ROLLOVER_NS <= told_ns < earliest_ns else told_ns
+    )
+    if timed and not earliest_ns <= utc_ns < earliest_ns + ROLLOVER_NS:
+        first, last = (
+            datetime.fromtimestamp(limit_ns // SECOND_NS, UTC).year
+            for limit_ns in (earliest_ns, earliest_ns + ROLLOVER_NS)
+        )
+        raise OutOfRange(DEVICE, "year", pvt.date[0], first, last, "")
+    accuracies = pvt.horizontal, pvt.vertical
+    known = not {0, UNKNOWN_ACCURACY}.intersection(accuracies)
+    speed_known = pvt.speed_accuracy not in {0, UNKNOWN_ACCURACY}
     return GpsReading(
-        time_ns=arrival_ns - (PVT_LENGTH + OVERHEAD) * _BITS * SECOND_NS // baud_rate,
+        time_ns=arrival_ns - (length + OVERHEAD) * _BITS * SECOND_NS // baud_rate,
         arrival_ns=arrival_ns,
-        utc_ns=_utc_ns(pvt) if timed else 0,
+        utc_ns=utc_ns,
         position=position,
         velocity=1e-3 * np.array(pvt.velocity, dtype=float) @ axes,
-        sigma=1e-3 * math.hypot(pvt.horizontal, pvt.vertical) / math.sqrt(3.0),
-        velocity_sigma=1e-3 * pvt.speed_accuracy / math.sqrt(3.0),
+        sigma=1e-3 * math.hypot(*accuracies) / math.sqrt(3.0) if known else math.nan,
+        velocity_sigma=1e-3 * pvt.speed_accuracy / math.sqrt(3.0) if speed_known else math.nan,
         satellites=pvt.satellites,
-        valid=timed and pvt.fix == THREE_DIMENSIONS and bool(pvt.flags & FIX_OK),
+        valid=timed
+        and pvt.fix == THREE_DIMENSIONS
+        and bool(pvt.flags & FIX_OK)
+        and not pvt.flags3 & INVALID_POSITION,
+        rolled_over=utc_ns != told_ns,
     )
 
 

@@ -77,10 +77,11 @@ class GpsReading:
         utc_ns: UTC of the epoch, ns since 1970; 0 if the receiver does not know the time.
         position: (3,) position in the ITRS, m.
         velocity: (3,) velocity with respect to the ground, in ITRS axes, m/s.
-        sigma: reported standard deviation of the position per axis, m.
-        velocity_sigma: reported standard deviation of the velocity per axis, m/s.
+        sigma: reported standard deviation of the position per axis, m; NaN if the receiver does not know it.
+        velocity_sigma: reported standard deviation of the velocity per axis, m/s; NaN if unknown.
         satellites: number of GPS satellites used in the solution.
-        valid: whether the receiver reports time and position as valid.
+        valid: whether the receiver reports time, leap seconds and position as valid.
+        rolled_over: whether the date was moved by 1024 weeks, after which the receiver's week number repeats.
     """
 
     time_ns: int
@@ -92,6 +93,7 @@ class GpsReading:
     velocity_sigma: float
     satellites: int
     valid: bool
+    rolled_over: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,19 +103,35 @@ class GpsLink:
     Attributes:
         bytes_received: number of received bytes.
         frames: number of valid frames.
+        long_frames: number of valid frames with more than 256 bytes of payload.
         bad_checksum: number of frames with a wrong checksum.
         discarded_bytes: number of bytes outside valid frames.
+        sentences: number of valid NMEA sentences.
         out_of_range: number of navigation solutions rejected because a value is physically impossible.
+        unresolved: number of navigation solutions without a valid date, time or leap seconds.
+        no_fix: number of navigation solutions without a valid fix.
+        rolled_over: number of navigation solutions whose date was moved by 1024 weeks.
         refused: number of commands that the receiver rejected.
+        refusal: text about the last rejected command, or an empty text.
+        protocol: protocol version that the receiver reports, 0 if unknown.
+        condition: reason why no usable fix arrives, with its remedy, or an empty text.
         last_byte_ns: host time of the last received byte, ns; -1 before the first byte.
     """
 
     bytes_received: int
     frames: int
+    long_frames: int
     bad_checksum: int
     discarded_bytes: int
+    sentences: int
     out_of_range: int
+    unresolved: int
+    no_fix: int
+    rolled_over: int
     refused: int
+    refusal: str
+    protocol: float
+    condition: str
     last_byte_ns: int
 
 

@@ -20,10 +20,17 @@ from hal.drivers.ublox import (
     CFG_MSG,
     CFG_PRT,
     CFG_RATE,
+    CFG_VALSET,
     DATE_AND_TIME,
     FIX_OK,
+    MON_VER,
     NAV_PVT,
+    PVT_ON_UART1,
+    RATE_MEASUREMENT,
     THREE_DIMENSIONS,
+    UNKNOWN_ACCURACY,
+    VALSET_PROTOCOL,
+    VALUE_SIZES,
     Kind,
     Pvt,
     UbxParser,
@@ -42,7 +49,6 @@ from sim_hal.clock import NEVER, SerialEnd
 from sim_hal.worlds.world import OrbitingWorld
 
 NMEA = b"$GNTXT,01,01,02,u-blox*12\r\n"
-_UNKNOWN = 0xFFFF_FFFF
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,6 +80,8 @@ class EmulatedGps:
         clock_ns: error of the reported time that a fault adds, ns.
         blind: whether a fault blocks the signals of all satellites.
         frozen: whether a fault makes the receiver repeat its last fix.
+        protocol: protocol version, from 27 on of a receiver that accepts CFG-VALSET only.
+        obeys: whether the receiver executes commands.
     """
 
     def __init__(
@@ -89,6 +97,8 @@ class EmulatedGps:
         self.clock_ns = 0
         self.blind = False
         self.frozen = False
+        self.protocol = 18.0
+        self.obeys = True
         self._world, self._line, self._generator, self._errors = world, line, generator, errors
         self._period_ns = SECOND_NS
         self._utc_offset_ns = world.utc_ns() - now_ns
@@ -134,12 +144,32 @@ class EmulatedGps:
         self._epoch_ns = now_ns + (-utc_ns) % self._period_ns
 
     def _execute(self, kind: Kind, payload: bytes, now_ns: int) -> None:
-        known = kind in {CFG_PRT, CFG_RATE, CFG_MSG}
-        if kind == CFG_MSG and payload[:2] == bytes(NAV_PVT):
+        if not self.obeys:
+            return
+        if kind == MON_VER:
+            version = f"PROTVER={self.protocol:.2f}".encode("ascii").ljust(30, b"\0")
+            self._line.write(frame(MON_VER, bytes(40) + version), now_ns)
+            return
+        known = kind in ({CFG_VALSET} if self.protocol >= VALSET_PROTOCOL else {CFG_PRT, CFG_RATE, CFG_MSG})
+        if known and kind == CFG_VALSET:
+            self._set_values(payload[4:])
+        if known and kind == CFG_MSG and payload[:2] == bytes(NAV_PVT):
             self._enabled = payload[-1] > 0
-        if kind == CFG_RATE:
+        if known and kind == CFG_RATE:
             self._period_ns = max(100, int.from_bytes(payload[:2], "little")) * 1_000_000
         self._line.write(frame(ACK_ACK if known else ACK_NAK, bytes(kind)), now_ns)
+
+    def _set_values(self, pairs: bytes) -> None:
+        """Execute the keys and values of a CFG-VALSET message."""
+        while len(pairs) > 4:
+            key = int.from_bytes(pairs[:4], "little")
+            size = VALUE_SIZES[key >> 28]
+            value = int.from_bytes(pairs[4 : 4 + size], "little")
+            pairs = pairs[4 + size :]
+            if key == PVT_ON_UART1:
+                self._enabled = value > 0
+            if key == RATE_MEASUREMENT:
+                self._period_ns = max(100, value) * 1_000_000
 
     def _measure(self, epoch_ns: int) -> Pvt:
         if self.frozen and self._last is not None:
@@ -167,19 +197,19 @@ class EmulatedGps:
         if not found:
             longitude = latitude = height = north = east = down = 0.0
         when = datetime.fromtimestamp(utc_ns // SECOND_NS, UTC)
-        accuracy = round(1e3 * math.sqrt(2.0) * math.hypot(errors.walk, errors.noise))
+        accuracy = max(1, round(1e3 * math.sqrt(2.0) * math.hypot(errors.walk, errors.noise)))
         return Pvt(
             date=(when.year, when.month, when.day, when.hour, when.minute, when.second),
             nano=utc_ns % SECOND_NS,
-            valid=DATE_AND_TIME | 0b100,
+            valid=DATE_AND_TIME,
             fix=THREE_DIMENSIONS if found else 0,
             flags=FIX_OK if found else 0,
             satellites=11 if found else 0,
             longitude=round(math.degrees(longitude) * 1e7),
             latitude=round(math.degrees(latitude) * 1e7),
             height=round(1e3 * height),
-            horizontal=accuracy if found else _UNKNOWN,
-            vertical=accuracy if found else _UNKNOWN,
+            horizontal=accuracy if found else UNKNOWN_ACCURACY,
+            vertical=accuracy if found else UNKNOWN_ACCURACY,
             velocity=(round(north), round(east), round(down)),
-            speed_accuracy=round(1e3 * math.sqrt(3.0) * errors.velocity_noise) if found else 20_000,
+            speed_accuracy=max(1, round(1e3 * math.sqrt(3.0) * errors.velocity_noise)) if found else 20_000,
         )

@@ -86,6 +86,7 @@ def test_every_integer_of_the_testbed_may_pass_its_end(
         "spin",
         "navigation",
         "fix",
+        "gps_link",
         "directions",
         "truth",
         "orbit_truth",

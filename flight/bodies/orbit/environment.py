@@ -35,6 +35,8 @@ CONTRADICTED = 30
 """Number of rejected GPS fixes in a row after which the last accepted fix is considered wrong."""
 TIME_GATE_NS = SECOND_NS // 2
 """Largest accepted step (ns) of the receiver's time relative to the host's clock."""
+UNKNOWN_SIGMA, UNKNOWN_VELOCITY_SIGMA = 100.0, 1.0
+"""Standard deviations of position (m) and velocity (m/s) per axis if the receiver does not know them."""
 _SHORTEST = 1.0
 
 
@@ -74,7 +76,10 @@ class EstimatedEnvironment:
         date = UNIX_EPOCH + reading.utc_ns / (DAY * SECOND_NS)
         offset_ns = reading.utc_ns + GPS_DELAY_NS - reading.time_ns
         try:
-            fix = GpsFix(date, reading.position, reading.velocity, reading.sigma, reading.velocity_sigma)
+            sigma = UNKNOWN_SIGMA if math.isnan(reading.sigma) else reading.sigma
+            speed_sigma = reading.velocity_sigma
+            speed_sigma = UNKNOWN_VELOCITY_SIGMA if math.isnan(speed_sigma) else speed_sigma
+            fix = GpsFix(date, reading.position, reading.velocity, sigma, speed_sigma)
             contradicts = self._is_out_of_time(offset_ns) or self._contradicts(fix)
         except OrbitError:
             contradicts = True

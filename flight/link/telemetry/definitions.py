@@ -555,10 +555,31 @@ FIX = Packet(
         Field("utc_ns", "i8", "ns", "UTC of the fix since 1970"),
         Field("position", "f8", "m", "geocentric position, ITRS", 3),
         Field("velocity", "f8", "m/s", "velocity with respect to the ground, ITRS", 3),
-        Field("sigma", "f4", "m", "standard deviation of the position per axis"),
-        Field("velocity_sigma", "f4", "m/s", "standard deviation of the velocity per axis"),
+        Field("sigma", "f4", "m", "standard deviation of the position per axis; NaN if unknown"),
+        Field("velocity_sigma", "f4", "m/s", "standard deviation of the velocity per axis; NaN if unknown"),
         Field("satellites", "u1", "-", "number of GPS satellites"),
         flag("used", "whether the orbit was updated; no means that the fix contradicts the known orbit"),
+    ),
+)
+
+GPS_LINK = Packet(
+    "gps_link",
+    0x11A,
+    "0.1 Hz",
+    "Counters of the serial line of the GPS receiver since the start of the flight software",
+    (
+        counter("bytes_received", "received bytes"),
+        counter("frames", "UBX frames with a valid checksum"),
+        counter("long_frames", "UBX frames with more than 256 bytes of payload, which are skipped"),
+        counter("bad_checksum", "UBX frames with a wrong checksum"),
+        counter("discarded_bytes", "bytes outside UBX frames"),
+        counter("sentences", "NMEA sentences, which are not used"),
+        counter("out_of_range", "navigation solutions with an impossible value"),
+        counter("unresolved", "navigation solutions without a valid date, time or leap seconds"),
+        counter("no_fix", "navigation solutions without a valid fix"),
+        counter("rolled_over", "navigation solutions whose date was moved by 1024 weeks"),
+        counter("refused", "commands that the receiver refused"),
+        Field("protocol", "f4", "-", "protocol version that the receiver reports; 0 if unknown"),
     ),
 )
 
@@ -874,6 +895,7 @@ PACKETS: tuple[Packet, ...] = (
     NAVIGATION,
     DESCRIPTION,
     FIX,
+    GPS_LINK,
     DIRECTIONS,
     TARGET,
     MODE,

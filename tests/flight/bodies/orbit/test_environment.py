@@ -93,6 +93,14 @@ def test_a_fix_that_the_receiver_does_not_vouch_for_is_not_used(elements: TwoLin
     assert known.refused == 0
 
 
+def test_a_fix_of_unknown_accuracy_is_used_with_a_wide_one(elements: TwoLineElements) -> None:
+    known = EstimatedEnvironment(None, SimClock(UTC_NS))
+    assert known.fix(replace(reading(elements, 0), sigma=np.nan, velocity_sigma=np.nan))
+    state = known.state(100 * SECOND_NS)
+    assert state is not None
+    assert 300.0 < state.sigma < 500.0
+
+
 def test_a_long_prediction_from_the_known_state_agrees_with_the_environment(
     elements: TwoLineElements,
 ) -> None:

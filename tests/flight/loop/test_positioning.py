@@ -1,0 +1,113 @@
+"""Positioning records the counters of the receiver's line, and reports what keeps fixes away."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from flight.link.telemetry.definitions import GPS_LINK, Packet
+from flight.link.telemetry.log import Recorder
+from flight.loop.facts import EventLog, Facts, Services, Streams
+from flight.loop.navigation import Positioning
+from hal.interfaces.devices import GpsLink, GpsReading
+from hal.interfaces.wires import SECOND_NS
+from sim_hal.clock import SimClock
+
+LINK = GpsLink(1000, 10, 2, 0, 50, 0, 0, 0, 0, 0, 0, "", 18.0, "", 0)
+
+
+class Sink:
+    def write(self, packet: bytes) -> None:
+        pass
+
+
+class KeepingRecorder(Recorder):
+    """Recorder that keeps the values of each packet that could be packed."""
+
+    def __init__(self) -> None:
+        super().__init__(Sink(), Sink())
+        self.kept: list[dict[str, Any]] = []
+
+    def record(self, packet: Packet, time_ns: int, **values: Any) -> bytes | None:
+        if packet is GPS_LINK:
+            self.kept.append(values)
+        return super().record(packet, time_ns, **values)
+
+
+class Receiver:
+    """Receiver with given counters that delivers no readings, or one each second."""
+
+    def __init__(self) -> None:
+        self.counters = LINK
+        self.readings: list[GpsReading] = []
+
+    def poll(self) -> list[GpsReading]:
+        return self.readings
+
+    def link(self) -> GpsLink:
+        return self.counters
+
+    def close(self) -> None:
+        pass
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.texts: dict[str, list[str]] = {}
+        self.receiver = Receiver()
+        self.recorder = KeepingRecorder()
+        events = EventLog(lambda kind, _1, _2, text: self.texts.setdefault(kind.name, []).append(text), 0)
+        clock = SimClock()
+        services = Services(clock, None, self.recorder, events, Facts(events), Streams(()))  # type: ignore[arg-type]  # no jobs
+        self.positioning = Positioning(self.receiver, lambda _: False, 60 * SECOND_NS, services)
+        self.positioning.begin(0)
+        self._now_ns = 0
+
+    def run(self, seconds: int, **changes: object) -> None:
+        """Run once a second; `changes` are values of the counters from now on."""
+        self.receiver.counters = replace(self.receiver.counters, **changes)  # type: ignore[arg-type]
+        for _ in range(seconds):
+            self._now_ns += SECOND_NS
+            self.positioning.run(self._now_ns)
+
+
+def test_refusals_damage_and_moved_dates_are_events() -> None:
+    bench = Bench()
+    bench.run(2)
+    assert bench.texts == {}
+    bench.run(2, refused=1, refusal="the receiver refused CFG-MSG")
+    assert bench.texts == {"gps-set-up": ["the receiver refused CFG-MSG"]}
+    bench.run(1, bad_checksum=5, out_of_range=1, condition="latitude = 91")
+    bench.run(1, rolled_over=1, condition="")
+    bench.run(1, rolled_over=2)
+    assert bench.texts["gps-link"] == [
+        "5 frames with a wrong checksum, 1 solutions out of range: latitude = 91",
+        "1 dates moved by 1024 weeks",
+    ]
+
+
+def test_the_event_of_a_lost_receiver_names_the_cause() -> None:
+    bench = Bench()
+    bench.run(70, condition="bytes but neither UBX frames nor NMEA sentences at 9600 baud")
+    assert bench.texts["gps-lost"][0].startswith("no usable fix for 61 s: bytes but neither UBX")
+
+
+def test_the_counters_are_recorded_every_ten_seconds() -> None:
+    bench = Bench()
+    bench.run(1, sentences=7, no_fix=3)
+    bench.run(9, sentences=8)
+    [first] = bench.recorder.kept
+    assert (first["sentences"], first["no_fix"], first["frames"], first["protocol"]) == (7, 3, 10, 18.0)
+    bench.run(1)
+    assert bench.recorder.kept[1]["sentences"] == 8
+    assert bench.recorder.lost == 0
+
+
+def test_a_fix_that_is_not_valid_is_not_offered_to_the_body() -> None:
+    bench = Bench()
+    zero = np.zeros(3)
+    bench.receiver.readings = [GpsReading(0, 0, 0, zero, zero, 1.0, 1.0, 9, False)]
+    bench.run(3)
+    assert "gps-refused" not in bench.texts

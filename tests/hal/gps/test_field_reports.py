@@ -1,0 +1,282 @@
+"""What receivers send in the field: unresolved time, rollover, refusals, foreign protocols."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pyubx2 import UBXReader
+
+from hal.drivers.ublox import (
+    ACK_NAK,
+    CFG_MSG,
+    NAV_PVT,
+    ROLLOVER_NS,
+    Kind,
+    Pvt,
+    UbloxReceiver,
+    UbxParser,
+    frame,
+    reading_of,
+    unpack_pvt,
+    valset,
+)
+from hal.interfaces.devices import GpsReading
+from hal.interfaces.errors import OutOfRange
+from hal.interfaces.wires import SECOND_NS
+from sim_hal.clock import SimClock
+from tests.hal.gps.bench_line import bench
+from tests.hal.gps.fixes import PVT
+
+INPUTS = Path(__file__).resolve().parents[4] / "shared/data/inputs"
+needs_inputs = pytest.mark.skipif(
+    not INPUTS.is_dir(), reason="the inputs of ../shared/data/inputs are missing"
+)
+NAV_SAT: Kind = (0x01, 0x35)
+
+
+class OneWayPort:
+    """Serial port that delivers given bytes, one piece each poll, and keeps what is sent."""
+
+    def __init__(self, pieces: Iterable[bytes], clock: SimClock) -> None:
+        self.baud_rate = 115200
+        self.sent = b""
+        self._pieces, self._clock = iter(pieces), clock
+
+    def receive(self) -> list[tuple[int, bytes]]:
+        data = next(self._pieces, b"")
+        return [(self._clock.now_ns(), data)] if data else []
+
+    def send(self, data: bytes) -> None:
+        self.sent += data
+
+    def set_baud_rate(self, baud_rate: int) -> None:
+        self.baud_rate = baud_rate
+
+    def close(self) -> None:
+        pass
+
+
+def received(pieces: list[bytes], step: float = 0.1) -> tuple[list[GpsReading], UbloxReceiver, OneWayPort]:
+    """Return the readings of a driver that polls once for each piece, the driver, and its port."""
+    clock = SimClock()
+    port = OneWayPort(pieces, clock)
+    driver = UbloxReceiver(port, clock)
+    readings = []
+    for _ in pieces:
+        clock.sleep_until_ns(clock.now_ns() + round(step * SECOND_NS))
+        readings += driver.poll()
+    return readings, driver, port
+
+
+def utc(reading: GpsReading) -> datetime:
+    return datetime.fromtimestamp(reading.utc_ns / SECOND_NS, UTC)
+
+
+@needs_inputs
+def test_the_solutions_of_the_reports_are_read_as_they_should() -> None:
+    def only(name: str) -> tuple[GpsReading, UbloxReceiver]:
+        [reading], driver, _ = received([(INPUTS / f"{name}.ubx").read_bytes()])
+        return reading, driver
+
+    reading, driver = only("pvt-unresolved")
+    assert (reading.valid, driver.link().unresolved) == (False, 1)
+    assert "leap seconds" in driver.link().condition
+    reading, driver = only("pvt-invalidllh")
+    assert (reading.valid, driver.link().no_fix) == (False, 1)
+    assert "flags3 0x0001" in driver.link().condition
+    reading, driver = only("pvt-rollover")
+    assert (reading.valid, reading.rolled_over, utc(reading)) == (
+        True,
+        True,
+        datetime(2026, 11, 17, 12, tzinfo=UTC),
+    )
+    assert driver.link().rolled_over == 1
+    reading, driver = only("pvt-84")
+    assert (reading.valid, utc(reading)) == (True, datetime(2026, 11, 17, 12, tzinfo=UTC))
+    assert (driver.link().condition, driver.link().bad_checksum) == ("", 0)
+
+
+@needs_inputs
+def test_a_refused_message_leads_to_the_other_configuration() -> None:
+    _, driver, port = received([b"", (INPUTS / "m10-nak.ubx").read_bytes()])
+    assert frame(CFG_MSG, bytes((*NAV_PVT, 1))) in port.sent
+    assert port.sent.endswith(frame((0x0A, 0x04)))
+    assert valset(115200, SECOND_NS) in port.sent
+    assert driver.link().refused == 1
+    assert (
+        "refused CFG-MSG (ACK-NAK, protocol version unknown): CFG-VALSET is needed" in driver.link().refusal
+    )
+
+
+@needs_inputs
+@pytest.mark.parametrize("piece", [1, 13, 64, 5000])
+def test_long_frames_are_skipped_whole(piece: int) -> None:
+    long, sound = (INPUTS / "ubx-long.ubx").read_bytes(), frame(NAV_PVT, PVT.packed())
+    data = sound + long + sound + long
+    readings, driver, _ = received([data[at : at + piece] for at in range(0, len(data), piece)], 1e-4)
+    link = driver.link()
+    assert len(readings) == 2
+    assert (link.frames, link.long_frames, link.bad_checksum, link.discarded_bytes) == (4, 2, 0, 0)
+
+
+@pytest.mark.parametrize("length", [257, 1500, 4000])
+def test_a_long_frame_may_hold_the_sync_bytes(length: int) -> None:
+    payload = (b"\xb5\x62" * length)[:length]
+    parser, sound = UbxParser(), frame(NAV_PVT, PVT.packed())
+    data = frame(NAV_SAT, payload) + sound
+    kinds = [kind for at in range(0, len(data), 50) for kind, _, _ in parser.feed(data[at : at + 50])]
+    assert kinds == [NAV_SAT, NAV_PVT]
+    assert parser.discarded_bytes == 0
+
+
+def test_a_false_length_delays_no_frame_by_more_than_a_frame() -> None:
+    parser, sound = UbxParser(), frame(NAV_PVT, PVT.packed())
+    broken = sound[:4] + (6000).to_bytes(2, "little") + sound[6:]
+    assert parser.feed(broken) == []
+    assert [kind for kind, _, _ in parser.feed(sound)] == [NAV_PVT]
+    assert parser.discarded_bytes == len(broken)
+
+
+@pytest.mark.parametrize(
+    ("change", "valid"),
+    [
+        ({}, True),
+        ({"valid": 0b110}, False),
+        ({"valid": 0b101}, False),
+        ({"valid": 0b011}, False),
+        ({"valid": 0b1111}, True),
+        ({"flags": 0b1000_0010}, False),
+        ({"flags": 0b1100_0001}, True),
+        ({"flags3": 0x0001}, False),
+        ({"flags3": 0x4000}, True),
+        *(({"fix": kind}, False) for kind in (0, 1, 2, 4, 5)),
+    ],
+)
+def test_every_validity_flag_counts(change: dict[str, Any], valid: bool) -> None:
+    assert reading_of(unpack_pvt(replace(PVT, **change).packed()), 0, 115200).valid is valid
+
+
+@pytest.mark.parametrize("accuracy", [0, 0xFFFF_FFFF])
+def test_an_unknown_accuracy_is_not_a_perfect_one(accuracy: int) -> None:
+    assert math.isnan(reading_of(replace(PVT, horizontal=accuracy), 0, 115200).sigma)
+    assert math.isnan(reading_of(replace(PVT, vertical=accuracy), 0, 115200).sigma)
+    assert math.isnan(reading_of(replace(PVT, speed_accuracy=accuracy), 0, 115200).velocity_sigma)
+    assert reading_of(PVT, 0, 115200).sigma == pytest.approx(math.hypot(2.5, 4.0) / 3**0.5)
+
+
+@pytest.mark.parametrize("when", [datetime(2026, 11, 26, 10), datetime(2038, 11, 25), datetime(2045, 1, 1)])
+def test_a_date_of_the_former_epoch_is_moved(when: datetime) -> None:
+    old = when - timedelta(weeks=1024)
+    date = (old.year, old.month, old.day, old.hour, old.minute, old.second)
+    reading = reading_of(replace(PVT, date=date, nano=0), 0, 115200)
+    assert utc(reading) == when.replace(tzinfo=UTC)
+    now = (when.year, when.month, when.day, when.hour, when.minute, when.second)
+    assert reading_of(replace(PVT, date=now, nano=0), 0, 115200).utc_ns == reading.utc_ns
+    earliest_ns = reading.utc_ns - SECOND_NS
+    assert reading_of(replace(PVT, date=now, nano=0), 0, 115200, earliest_ns).rolled_over is False
+
+
+@pytest.mark.parametrize("year", [1980, 1999, 2046, 2099])
+def test_a_date_that_no_rollover_explains_is_refused(year: int) -> None:
+    with pytest.raises(OutOfRange, match=rf"year = {year}.*2026.*2045"):
+        reading_of(replace(PVT, date=(year, 3, 1, 0, 0, 0)), 0, 115200)
+    assert ROLLOVER_NS == 1024 * 7 * 86_400 * SECOND_NS
+
+
+@pytest.mark.parametrize("protocol", [14.0, 18.0, 27.12, 32.0, 34.1])
+def test_each_generation_is_set_up_at_once(protocol: float) -> None:
+    gps = bench()
+    gps.gps.protocol = protocol
+    assert sum(reading.valid for reading in gps.fly(4.0)) >= 2
+    link = gps.driver.link()
+    assert link.protocol == pytest.approx(protocol)
+    assert (link.refused > 0) is (protocol >= 27.0)
+    gps.gps.switch_off()
+    gps.gps.switch_on(gps.clock.now_ns())
+    refused = link.refused
+    gps.fly(60.0)
+    assert gps.fly(2.0)[-1].valid
+    assert gps.driver.link().refused == refused, "the version is known by now"
+
+
+def test_the_configuration_by_values_is_what_another_author_reads() -> None:
+    read = UBXReader.parse(valset(38400, 2 * SECOND_NS), msgmode=1)
+    assert (read.identity, read.version, read.ram, read.bbr, read.flash) == ("CFG-VALSET", 0, 1, 0, 0)
+    values = (read.CFG_UART1_BAUDRATE, read.CFG_UART1INPROT_UBX, read.CFG_UART1OUTPROT_UBX)
+    assert values == (38400, 1, 1)
+    assert (read.CFG_UART1OUTPROT_NMEA, read.CFG_MSGOUT_UBX_NAV_PVT_UART1) == (0, 1)
+    assert (read.CFG_RATE_MEAS, read.CFG_RATE_NAV, read.CFG_RATE_TIMEREF) == (2000, 1, 1)
+
+
+def sentence(text: str) -> bytes:
+    total = 0
+    for byte in text.encode("ascii"):
+        total ^= byte
+    return f"${text}*{total:02X}\r\n".encode("ascii")
+
+
+@pytest.mark.parametrize(
+    ("piece", "named"),
+    [
+        (b"", "no byte received: check power"),
+        (sentence("GNRMC,120000.00,A,5122.7,S,07409.4,W,0.0,,171126,,,A"), "NMEA sentences but no UBX frame"),
+        (bytes(range(0x80, 0xF0)), "bytes but neither UBX frames nor NMEA sentences at 115200 baud"),
+        (frame(NAV_SAT, bytes(20)), "UBX frames but no NAV-PVT: the request was not answered"),
+        (frame(ACK_NAK, bytes(CFG_MSG)), "UBX frames but no NAV-PVT: the receiver refused CFG-MSG"),
+        (
+            frame(NAV_PVT, replace(PVT, fix=2).packed()),
+            "no valid fix (fixType 2, flags 0x01, flags3 0x0000, 9",
+        ),
+        (frame(NAV_PVT, replace(PVT, latitude=910_000_000).packed()), "latitude = 91"),
+        (frame(NAV_PVT, PVT.packed()), ""),
+    ],
+)
+def test_what_keeps_fixes_away_is_named(piece: bytes, named: str) -> None:
+    _, driver, _ = received([piece] * 50)
+    condition = driver.link().condition
+    assert named in condition
+    assert (condition == "") is (named == "")
+    assert driver.link().sentences == (50 if piece.startswith(b"$") else 0)
+
+
+def test_a_receiver_that_does_not_obey_is_named_on_the_wire() -> None:
+    gps = bench()
+    gps.gps.obeys = False
+    assert gps.fly(10.0) == []
+    assert "NMEA sentences but no UBX frame" in gps.driver.link().condition
+
+
+@given(st.binary(min_size=84, max_size=92).filter(lambda data: len(data) in {84, 92}))
+def test_any_solution_is_read_or_refused_by_name(payload: bytes) -> None:
+    readings, driver, _ = received([frame(NAV_PVT, payload)])
+    link = driver.link()
+    assert len(readings) + link.out_of_range == 1
+    if readings:
+        assert np.all(np.isfinite(readings[0].position))
+        assert np.all(np.isfinite(readings[0].velocity))
+    else:
+        assert "range" in link.condition or "=" in link.condition
+
+
+@given(st.integers(0, 27), st.integers(0, 2**32 - 1))
+def test_one_changed_field_of_a_solution_never_gives_an_impossible_reading(which: int, value: int) -> None:
+    payload = bytearray(PVT.packed())
+    at = min(4 * which, 88)
+    payload[at : at + 4] = value.to_bytes(4, "little")
+    pvt: Pvt = unpack_pvt(bytes(payload))
+    try:
+        reading = reading_of(pvt, 0, 115200)
+    except OutOfRange:
+        return
+    assert 6.3e6 < np.linalg.norm(reading.position) < 9.4e6
+    assert np.linalg.norm(reading.velocity) <= 12_000.0
+    assert not reading.valid or 2026 <= utc(reading).year <= 2045
