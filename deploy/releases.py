@@ -17,6 +17,7 @@ import os
 import re
 import stat
 import sys
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -89,6 +90,19 @@ def _text(path: Path, largest: int) -> str:
         return file.read()
 
 
+def record(line: str) -> str:
+    """Return a line and its CRC-32, as flight/link/regular_files.py, which is not imported here, does."""
+    crc = zlib.crc32(f"{line}\n".encode())
+    return f"{line}\n{crc:08x}\n"
+
+
+def _line_of(text: str) -> str:
+    line = text.partition("\n")[0]
+    if record(line) != text:
+        raise ValueError("its CRC-32 is wrong")
+    return line
+
+
 def linked(prefix: Path, link: str) -> Path | None:
     """Return the release to which a link points, or None unless this release is complete."""
     try:
@@ -107,7 +121,7 @@ class Trials:
         self.proven: list[str] = []
         # A damaged file is ignored, so that the flight starts in any case.
         with suppress(OSError, *DAMAGED):
-            kept = json.loads(_text(self._path, LARGEST_RECORD))
+            kept = json.loads(_line_of(_text(self._path, LARGEST_RECORD)))
             starts = {str(name): int(count) for name, count in kept["starts"].items()}
             self.proven = [str(name) for name in kept["proven"]]
             self.starts = starts
@@ -125,7 +139,7 @@ class Trials:
             beside = self._path.with_suffix(".part")
             beside.unlink(missing_ok=True)  # a FIFO of this name would block the next line
             with beside.open("w", encoding="utf-8") as file:
-                json.dump({"starts": self.starts, "proven": self.proven}, file)
+                file.write(record(json.dumps({"starts": self.starts, "proven": self.proven})))
                 file.flush()
                 os.fsync(file.fileno())
             beside.replace(self._path)

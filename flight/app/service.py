@@ -44,7 +44,6 @@ import re
 import signal
 import sys
 import threading
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -58,7 +57,7 @@ from flight.app.devices import corrupted_text
 from flight.app.run import RunRequest
 from flight.link import events
 from flight.link.events import EventKind
-from flight.link.regular_files import read_regular
+from flight.link.regular_files import line_of, read_regular, to_record
 from flight.link.telemetry.log import Recorder
 from flight.loop.facts import EventLog
 from flight.loop.flight_loop import FlightLoop
@@ -201,22 +200,15 @@ class SeparationInhibit:
         if stored < seconds:
             with suppress(OSError):  # a disk that cannot be written only prolongs the inhibit at a restart
                 folder.mkdir(parents=True, exist_ok=True)
-                replace_file(LinuxFiles(), path, _powered_record(self._elapsed))
+                replace_file(LinuxFiles(), path, to_record(b"%.1f" % self._elapsed))
         if (left := seconds - self._elapsed) > 0.0:
             raise InhibitedError(f"separation inhibit of {seconds:g} s: {left:.0f} s with power are left")
-
-
-def _powered_record(elapsed: float) -> bytes:
-    text = f"{elapsed:.1f}".encode()
-    return text + b" %08x\n" % zlib.crc32(text)
 
 
 def _powered(path: Path) -> float:
     """Return the stored time with power, s, or 0 if the file is missing or damaged."""
     with suppress(OSError, ValueError):
-        text, _, crc = (read_regular(path, _LARGEST_POWERED) or b"").partition(b" ")
-        if crc == b"%08x\n" % zlib.crc32(text):
-            return float(text)
+        return float(line_of(read_regular(path, _LARGEST_POWERED) or b"") or b"0")
     return 0.0
 
 
@@ -312,13 +304,13 @@ class FlownRelease:
     def _write(self, proven: list[str]) -> None:
         assert self._path is not None
         text = json.dumps({"starts": {}, "proven": proven})
-        replace_file(LinuxFiles(), self._path, text.encode())
+        replace_file(LinuxFiles(), self._path, to_record(text.encode()))
 
 
 def _proven(path: Path) -> list[str]:
     """Return the proven releases, or an empty list if the file is missing or damaged."""
     with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
-        kept: dict[str, Any] = json.loads(LinuxFiles().read(path) or b"")
+        kept: dict[str, Any] = json.loads(line_of(LinuxFiles().read(path) or b"") or b"")
         return [str(name) for name in kept["proven"]]
     return []
 

@@ -1,4 +1,4 @@
-"""Reading regular files with a size limit, durable writing and file locks.
+"""Reading regular files with a size limit, records with checksums, durable writing and file locks.
 
 A FIFO at the path of an expected file would block the reader, and a huge sparse file would exhaust the
 memory.
@@ -10,6 +10,7 @@ import errno
 import fcntl
 import os
 import stat
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,6 +42,17 @@ def read_regular(path: Path, most: int) -> bytes | None:
         return data
     finally:
         os.close(file)
+
+
+def to_record(line: bytes) -> bytes:
+    """Return a record: a line of text without line breaks, and a line with the CRC-32 of the first line."""
+    return line + b"\n%08x\n" % zlib.crc32(line + b"\n")
+
+
+def line_of(data: bytes) -> bytes | None:
+    """Return the line of a record, or None if its CRC-32 is wrong or missing."""
+    line, end, crc = data.partition(b"\n")
+    return line if crc == b"%08x\n" % zlib.crc32(line + end) else None
 
 
 def make_lasting(folder: Path) -> None:

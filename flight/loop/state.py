@@ -47,7 +47,7 @@ from msgspec import Meta
 
 from flight.link import events
 from flight.link.events import EventKind
-from flight.link.regular_files import make_lasting, read_regular
+from flight.link.regular_files import line_of, make_lasting, read_regular, to_record
 from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import Clock
@@ -388,7 +388,7 @@ def note_boot(folders: Iterable[Path], number: int) -> None:
     """Write the number of a boot to a file in each folder. Never raises."""
     for folder in folders:
         with suppress(OSError):
-            replace_file(LinuxFiles(), folder / NOTE, b"%d\n" % number)
+            replace_file(LinuxFiles(), folder / NOTE, to_record(b"%d" % number))
 
 
 def newest_boot(folders: Iterable[Path]) -> int:
@@ -396,7 +396,7 @@ def newest_boot(folders: Iterable[Path]) -> int:
     numbers = [0]
     for folder in folders:
         with suppress(OSError):
-            text = (LinuxFiles().read(folder / NOTE) or b"").strip()
+            text = line_of(LinuxFiles().read(folder / NOTE) or b"") or b""
             if text.isdigit() and len(text) < 16:  # 2^53, the largest boot count, has 16 digits
                 numbers.append(int(text))
     return max(numbers)
@@ -493,8 +493,7 @@ class StateStore:
 def encode(generation: int, state: StoredState) -> bytes:
     """Return the bytes of one copy of the state. Raises ValueError for a state that `decode` would reject."""
     check(state)
-    line = msgspec.json.encode(_StateCopy(generation, state)) + b"\n"
-    data = line + b"%08x\n" % zlib.crc32(line)
+    data = to_record(msgspec.json.encode(_StateCopy(generation, state)))
     decode(data)
     return data
 
@@ -506,8 +505,8 @@ def decode(data: bytes) -> _StateCopy:
     """
     if len(data) > LARGEST_FILE:
         raise ValueError(f"{len(data)} bytes are too many")
-    line, end, crc = data.partition(b"\n")
-    if crc != b"%08x\n" % zlib.crc32(line + end):
+    line = line_of(data)
+    if line is None:
         raise ValueError(f"torn or corrupt, {len(data)} bytes")
     try:
         copy = msgspec.json.decode(line, type=_StateCopy)

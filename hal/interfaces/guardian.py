@@ -49,12 +49,15 @@ class CoilReach:
     def note(self, folder: Path) -> None:
         """Write the bus and address durably to a file in `folder`, for the script `deploy/coils-off`.
 
-        Never raises.
+        The SHA-256 of bus and address follows them. Never raises.
         """
+        import hashlib  # noqa: PLC0415 - the guardian, which imports this module, needs no checksum
+
+        text = f"{self.where} 0x{self.address:02x}".encode()
         beside = folder / f"{NOTE}.part"
         with contextlib.suppress(OSError):
             with beside.open("wb") as note:
-                note.write(f"{self.where} 0x{self.address:02x}\n".encode())
+                note.write(text + f" {hashlib.sha256(text).hexdigest()}\n".encode())
                 note.flush()
                 os.fsync(note.fileno())
             beside.replace(folder / NOTE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import stat
@@ -205,6 +206,19 @@ def test_half_a_note_counts_for_nothing(tools: Tools, half: str) -> None:
     assert tools.run(KNIGHTCUBE_I2C="/dev/i2c-3")[1] == ["i2cset -y 3 0x40 0xfd 0x10 b"]
 
 
+def test_a_note_with_a_flipped_bit_writes_to_no_other_chip(tools: Tools) -> None:
+    tools.put("i2cset", 0)
+    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", 0x42).note(tools.folder)
+    whole = (tools.folder / "coils").read_bytes()
+    for place in (3, 9, 14, 16, 40, 79):
+        (tools.folder / "coils").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        status, _, said = tools.run(KNIGHTCUBE_I2C="/dev/i2c-3")
+        assert (status, "coils is damaged and not used" in said) == (0, True)
+    assert set((tools.folder / "calls").read_text(encoding="utf-8").splitlines()) == {
+        "i2cset -y 3 0x40 0xfd 0x10 b"
+    }
+
+
 def test_the_note_is_on_the_disk_before_it_has_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -223,7 +237,9 @@ def test_the_note_is_on_the_disk_before_it_has_its_name(
     monkeypatch.setattr(Path, "replace", replace)
     CoilReach("hal.buses.smbus_byte:open_bus", "/dev/knightcube-i2c", 0x42).note(tmp_path)
     assert done == ["note", "name", "folder"]
-    assert (tmp_path / "coils").read_text(encoding="ascii") == "/dev/knightcube-i2c 0x42\n"
+    text = "/dev/knightcube-i2c 0x42"
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    assert (tmp_path / "coils").read_text(encoding="ascii") == f"{text} {digest}\n"
 
 
 def test_a_stable_name_of_the_bus_is_followed_to_its_number(tools: Tools, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from flight.app.service import TRIALS
+from flight.link.regular_files import to_record
 from tests.deploy.boards import FakeBoard
 from tests.deploy.scripts import DEPLOY, ROOT, script
 
@@ -190,7 +191,7 @@ def test_a_release_that_cannot_start_gives_way_to_the_other(
 
 def test_a_proven_release_that_no_longer_starts_gives_way_too(board: FakeBoard) -> None:
     """Starts of a proven release are not counted."""
-    (board.root / "state" / TRIALS).write_text('{"starts": {}, "proven": ["0.1.0+2"]}', encoding="ascii")
+    (board.root / "state" / TRIALS).write_bytes(to_record(b'{"starts": {}, "proven": ["0.1.0+2"]}'))
     PYTHONS["cannot import the flight"](_python(board, "current"))
     assert [board.fly()[0] for _ in range(4)] == ["old"] * 4
 
@@ -317,7 +318,7 @@ def test_a_whole_release_flies_after_any_flipped_bit_of_releases_py(board: FakeB
 
 
 def test_a_whole_release_flies_after_any_flipped_bit_of_the_record(board: FakeBoard) -> None:
-    whole = b'{"starts": {"0.1.0+2": 2}, "proven": ["0.1.0+1"]}'
+    whole = to_record(b'{"starts": {"0.1.0+2": 2}, "proven": ["0.1.0+1"]}')
     flown = []
     for damaged in _flips(whole, FLIPS):
         (board.root / "state" / TRIALS).write_bytes(damaged)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from flight.app.service import NAME, NOTE, TRIALS, FlownRelease
+from flight.link.regular_files import line_of, to_record
 from tests.deploy.boards import FakeBoard
 from tests.deploy.scripts import script
 
@@ -70,7 +71,19 @@ def test_a_damaged_record_of_the_starts_keeps_nothing_from_flying(board: FakeBoa
     (board.root / "state").mkdir()
     (board.root / "state" / TRIALS).write_text(content, encoding="ascii")
     assert _flown(board, 1) == ["new"]
-    assert json.loads((board.root / "state" / TRIALS).read_text())["starts"] == {"0.1.0+2": 1}
+    line = line_of((board.root / "state" / TRIALS).read_bytes())
+    assert line is not None
+    assert json.loads(line)["starts"] == {"0.1.0+2": 1}
+
+
+@pytest.mark.parametrize("content", DAMAGED[1:-1])
+def test_a_wrong_record_with_a_right_checksum_keeps_nothing_from_flying(
+    board: FakeBoard, content: str
+) -> None:
+    assert releases.record(content).encode() == to_record(content.encode())
+    (board.root / "state").mkdir()
+    (board.root / "state" / TRIALS).write_text(releases.record(content), encoding="ascii")
+    assert _flown(board, 1) == ["new"]
 
 
 def _ours(board: FakeBoard, link: str) -> Path:

@@ -1,7 +1,7 @@
 """State of file transfers on disk: open transfers, transaction numbers, ended transfers and received files.
 
 Each record is written to a temporary file, synced and renamed, so that a crash leaves the old or the new
-record. A record is a line of JSON, followed by its CRC-32 in hexadecimal digits.
+record. A record is a line of JSON, followed by a line with its CRC-32 in hexadecimal digits.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,7 +18,7 @@ import msgspec
 from msgspec import Meta
 
 from flight.link.files.units import HIGHEST_NUMBER
-from flight.link.regular_files import locked, make_lasting, read_regular
+from flight.link.regular_files import line_of, locked, make_lasting, read_regular, to_record
 from knightcube.errors import FlightError, UsageError
 
 LONGEST_NAME = 96
@@ -214,16 +213,15 @@ def write_whole(path: Path, data: bytes) -> None:
         raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def _write(path: Path, record: msgspec.Struct) -> None:
-    """Store a record with its CRC-32. Raises FileError if the disk cannot be written."""
-    line = msgspec.json.encode(record)
-    write_whole(path, line + b"\n%08x" % zlib.crc32(line))
+def _write(path: Path, values: msgspec.Struct) -> None:
+    """Store values as a record. Raises FileError if the disk cannot be written."""
+    write_whole(path, to_record(msgspec.json.encode(values)))
 
 
 def _read(path: Path, shape: type[T]) -> T | None:
     """Return the record stored in a file, None if the file is missing or damaged."""
     try:
-        line, _, crc = (read_regular(path, _LONGEST_RECORD) or b"").partition(b"\n")
-        return msgspec.json.decode(line, type=shape) if crc == b"%08x" % zlib.crc32(line) else None
+        line = line_of(read_regular(path, _LONGEST_RECORD) or b"")
+        return None if line is None else msgspec.json.decode(line, type=shape)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None

@@ -18,7 +18,6 @@ the current mode.
 from __future__ import annotations
 
 import socket
-import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
@@ -33,7 +32,7 @@ from msgspec import Meta
 from flight.link.commands import ChangeMode, Command, CommandError, Point, Slew, command_of_words
 from flight.link.modes import Mode
 from flight.link.process.directives import LONGEST_COMMAND, SCHEDULE, Deletion, Listing, Scheduled
-from flight.link.regular_files import overwrite, read_regular
+from flight.link.regular_files import line_of, overwrite, read_regular, to_record
 from flight.link.security import COPIES
 from flight.link.telemetry.definitions import COMMAND, HEALTH, MODE
 from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text, walk
@@ -338,7 +337,7 @@ class Timetable:
 
     def _store(self, entries: tuple[Entry, ...], last: int) -> None:
         copy = _Copy(self._now.version + 1, last, entries)
-        data = _encode(copy)
+        data = to_record(msgspec.json.encode(copy))
         if not sum([overwrite(self._path(name), data) for name in COPIES]):
             raise TimetableError("the schedule could not be stored")
         self._now = copy
@@ -354,18 +353,11 @@ class Timetable:
         return self._folder / f"schedule.{name}"
 
 
-def _encode(copy: _Copy) -> bytes:
-    line = msgspec.json.encode(copy) + b"\n"
-    return line + b"%08x\n" % zlib.crc32(line)
-
-
 def _decode(data: bytes) -> _Copy | None:
     """Return the schedule in the bytes of a stored copy, None if the copy is damaged."""
-    line, end, crc = data.partition(b"\n")
-    if crc != b"%08x\n" % zlib.crc32(line + end):
-        return None
+    line = line_of(data)
     try:
-        return msgspec.json.decode(line, type=_Copy)
+        return None if line is None else msgspec.json.decode(line, type=_Copy)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
 

@@ -16,6 +16,7 @@ import pytest
 from flight.app import service
 from flight.app.service import Collector, EndingSignals, FlownRelease, Supervision
 from flight.link import events
+from flight.link.regular_files import line_of, to_record
 from hal.interfaces.guardian import GuardianNews
 
 MS = 1_000_000
@@ -84,13 +85,18 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def kept(folder: Path) -> Any:
     """Return the record of releases."""
-    return json.loads((folder / "releases.json").read_text())
+    line = line_of((folder / "releases.json").read_bytes())
+    assert line is not None
+    return json.loads(line)
+
+
+def keep(folder: Path, facts: Any) -> None:
+    """Write a record of releases."""
+    (folder / "releases.json").write_bytes(to_record(json.dumps(facts).encode()))
 
 
 def test_a_release_is_proven_once_and_the_newest_four_are_kept(folder: Path) -> None:
-    (folder / "releases.json").write_text(
-        json.dumps({"starts": {"e": 2}, "proven": ["a", "b", "e", "c", "d"]})
-    )
+    keep(folder, {"starts": {"e": 2}, "proven": ["a", "b", "e", "c", "d"]})
     release = FlownRelease({"KNIGHTCUBE_RELEASE": "e", "KNIGHTCUBE_RELEASE_NOTE": "note"})
     assert release.note == "note"
     release.prove()
@@ -103,7 +109,7 @@ def test_a_release_is_proven_once_and_the_newest_four_are_kept(folder: Path) -> 
 
 
 def test_the_end_of_a_release_resets_the_count_of_its_starts(folder: Path) -> None:
-    (folder / "releases.json").write_text(json.dumps({"starts": {"e": 2}, "proven": ["a"]}))
+    keep(folder, {"starts": {"e": 2}, "proven": ["a"]})
     FlownRelease({"KNIGHTCUBE_RELEASE": "e"}).end()
     assert kept(folder) == {"starts": {}, "proven": ["a"]}
     (folder / "releases.json").write_text("{damaged")
