@@ -20,10 +20,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from flight.link.files.transfer import FOREIGN, SATELLITE
-from flight.link.files.units import DOWN, PACKET_VERSION, SEGMENT_BYTES, UP
+from flight.link.files.units import DOWN, PACKET_VERSION, SEGMENT_BYTES, UNIT_OVERHEAD_BYTES, UP
 from flight.link.process.station import host_port
 from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES
 from ground.link.gateway import ADDRESS, token_path
+from ground.link.terminal import DEFAULTS, FRAME_OVERHEAD_BYTES
 from ground.xtce import EPOCH, SPACE, document
 from knightcube.errors import UsageError
 
@@ -179,8 +180,18 @@ ArchiveRetrieval: *replay
 """
 
 
-def files(folder: Path, gateway: str, http_port: int, epoch: str, keys: Path = KEYS) -> Mapping[str, str]:
-    """Return the content of each file by its name below `folder`; `keys` is the gateway's folder of keys."""
+def files(
+    folder: Path,
+    gateway: str,
+    http_port: int,
+    epoch: str,
+    keys: Path = KEYS,
+    command_frame_bytes: int = DEFAULTS.command_frame_bytes,
+) -> Mapping[str, str]:
+    """Return the content of each file by its name below `folder`.
+
+    The folder `keys` is that of the gateway, and no PDU needs a frame longer than `command_frame_bytes`.
+    """
     host, port = host_port(gateway)
     buckets = {"down": DOWN_BUCKET, "up": UP_BUCKET}
     server = _SERVER.format(
@@ -200,7 +211,7 @@ def files(folder: Path, gateway: str, http_port: int, epoch: str, keys: Path = K
         instance=INSTANCE,
         epoch=epoch,
         cfdp=CFDP,
-        pdu_bytes=SEGMENT_BYTES,
+        pdu_bytes=min(SEGMENT_BYTES, command_frame_bytes - FRAME_OVERHEAD_BYTES - UNIT_OVERHEAD_BYTES),
         own=FOREIGN,
         satellite=SATELLITE,
         down=DOWN_BUCKET,
@@ -225,11 +236,12 @@ def write(
     http_port: int = HTTP_PORT,
     epoch: str = EPOCH,
     keys: Path = KEYS,
+    command_frame_bytes: int = DEFAULTS.command_frame_bytes,
 ) -> None:
     """Write the configuration into a folder. Raises UsageError."""
     folder = folder.absolute()
     try:
-        contents = files(folder, gateway, http_port, epoch, keys)
+        contents = files(folder, gateway, http_port, epoch, keys, command_frame_bytes)
     except ValueError as error:
         raise UsageError(f"{gateway}: give HOST:PORT of the gateway") from error
     try:
@@ -259,8 +271,18 @@ def main() -> None:
     )
     parser.add_argument("--http", type=int, default=HTTP_PORT, metavar="PORT", help=f"default {HTTP_PORT}")
     parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=f"mission time zero (default {EPOCH})")
+    text = "`link.command_frame_bytes` of the satellite (default %(default)s)"
+    size = DEFAULTS.command_frame_bytes
+    parser.add_argument("--command-frame-bytes", type=int, default=size, metavar="N", help=text)
     options = parser.parse_args()
-    write(options.folder, options.gateway, options.http, options.epoch, options.keys)
+    write(
+        options.folder,
+        options.gateway,
+        options.http,
+        options.epoch,
+        options.keys,
+        options.command_frame_bytes,
+    )
     sys.stdout.write(f"Yamcs asks for user and password: {USER}, and the one in {options.folder / USERS}\n")
 
 

@@ -9,7 +9,7 @@ filled up with an idle packet. Telecommand and telemetry frames carry the securi
 355.0-B (`flight.link.security`).
 
 In a byte stream (serial line, TCP) each frame follows the attached sync marker 1ACFFC1D (CCSDS 131.0-B), in
-both directions. CLTUs are not created by this software. A radio that transmits CLTUs must create the CLTUs.
+both directions, unless another form of the stream is configured (`flight.link.coding`).
 """
 
 from __future__ import annotations
@@ -82,6 +82,10 @@ NO_HEADER = 0x7FF
 IDLE = 0x7FF
 """APID of idle packets."""
 
+IDLE_CHANNEL = 7
+"""Virtual channel of frames that contain only idle data."""
+_ONLY_IDLE_DATA = 0x7FE  # first header pointer of such a frame
+
 _COUNTS = 256  # number of values of a frame count
 
 _STATUS = 0b11 << 11  # frame status field: segment length identifier 11, all flags zero
@@ -139,6 +143,36 @@ class TelemetryFramer:
         self._master.value = (self._master.value + 1) % 256
         self._count = (self._count + 1) % 256
         return frame
+
+
+class IdleFramer:
+    """Framer of telemetry frames with only idle data, which keep the carrier of a radio modulated.
+
+    The frames are not protected, because they carry no information.
+    """
+
+    def __init__(self, spacecraft: int, frame_bytes: int, master: MasterCount, fill: bytes) -> None:
+        """Make frames of `frame_bytes` bytes with the first bytes of `fill`."""
+        self._first = spacecraft << 4 | IDLE_CHANNEL << 1
+        self._fill = fill[: frame_bytes - TELEMETRY_HEADER.size - CRC_BYTES]
+        self._master = master
+        self._count = 0
+
+    def frame(self) -> bytes:
+        """Return the next frame."""
+        status = _STATUS | _ONLY_IDLE_DATA
+        header = TELEMETRY_HEADER.pack(self._first, self._master.value, self._count, status)
+        self._master.value = (self._master.value + 1) % _COUNTS
+        self._count = (self._count + 1) % _COUNTS
+        return close_frame(header + self._fill)
+
+
+def is_idle(frame: bytes) -> bool:
+    """Return whether a telemetry frame has a correct CRC and contains only idle data."""
+    if len(frame) < TELEMETRY_HEADER.size or crc16(frame) != 0:
+        return False
+    first, status = int.from_bytes(frame[:2], "big"), int.from_bytes(frame[4:6], "big")
+    return first >> 1 & 7 == IDLE_CHANNEL and status & NO_HEADER == _ONLY_IDLE_DATA
 
 
 def idle_packet(length: int) -> bytes:
@@ -226,15 +260,22 @@ SYNC = bytes.fromhex("1ACFFC1D")
 class FrameStream:
     """Decoder that extracts frames from a byte stream by their sync markers. Not thread-safe."""
 
-    def __init__(self, length_of: Callable[[bytes], int], header_bytes: int) -> None:
+    def __init__(
+        self,
+        length_of: Callable[[bytes], int],
+        header_bytes: int,
+        decode: Callable[[bytes], bytes] = bytes,
+    ) -> None:
         """Find frames in a byte stream.
 
         Args:
             length_of: function that returns the length (bytes) of a frame from its header.
             header_bytes: length (bytes) of the header that `length_of` needs.
+            decode: function that returns the frame in the bytes after a sync marker.
         """
         self._length_of = length_of
         self._header_bytes = header_bytes
+        self._decode = decode
         self._data = b""
 
     def add(self, data: bytes) -> list[bytes]:
@@ -252,7 +293,7 @@ class FrameStream:
             if not whole or end > len(self._data):
                 self._data = self._data[mark:]
                 return found
-            frame = self._data[begin:end]
+            frame = self._decode(self._data[begin:end])
             found.append(frame)
             self._data = self._data[end if crc16(frame) == 0 else begin :]
         self._data = self._data[1 - len(SYNC) :]

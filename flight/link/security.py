@@ -1,11 +1,11 @@
 """Link security (CCSDS 355.0-B-2): stored keys and counters, encryption, authentication, replay protection.
 
 Frames in both directions are protected by AES-256-GCM. A protected frame contains the SPI (2 bytes), the IV
-(12 bytes), the ciphertext and the MAC (16 bytes). The IV is the nonce, which must never repeat under the same
-key. It consists of a salt of 32 random bits, which each sender draws at its start, and of a counter of 64
-bits. The counter increases from frame to frame, and the receiver ignores the salt. If a folder of keys is
-restored from a backup, counters are used again, but with another salt. The MAC covers the virtual channel,
-the SPI and the data, as in Yamcs.
+(12 bytes), the ciphertext and the MAC (16 bytes). Telemetry may also be authenticated without encryption. The
+IV is the nonce, which must never repeat under the same key. It consists of a salt of 32 random bits, which
+each sender draws at its start, and of a counter of 64 bits. The counter increases from frame to frame, and
+the receiver ignores the salt. If a folder of keys is restored from a backup, counters are used again, but
+with another salt. The MAC covers the virtual channel, the SPI and the data, as in Yamcs.
 
 The key and counter of each SPI are stored in two files. Each file is a record of fixed size that ends with a
 CRC-32. Both files are overwritten in place, one after the other, so that a full disk does not prevent the
@@ -57,10 +57,18 @@ def _authenticated(header: bytes, mask: bytes, spi: bytes) -> bytes:
     return masked.to_bytes(len(header), "big") + spi + _NO_IV
 
 
-def protect(cipher: AESGCM, spi: int, iv: int, header: bytes, mask: bytes, data: bytes) -> bytes:
-    """Return header, security header, ciphertext and MAC. The MAC covers the header bits in `mask`."""
+def protect(
+    cipher: AESGCM, spi: int, iv: int, header: bytes, mask: bytes, data: bytes, encrypted: bool = True
+) -> bytes:
+    """Return header, security header, data and MAC. The MAC covers the header bits in `mask`.
+
+    If `encrypted` is false, the data are authenticated by AES-GMAC and can be read without a key.
+    """
     index, nonce = spi.to_bytes(SPI_BYTES, "big"), iv.to_bytes(IV_BYTES, "big")
-    return header + index + nonce + cipher.encrypt(nonce, data, _authenticated(header, mask, index))
+    authenticated = _authenticated(header, mask, index)
+    if encrypted:
+        return header + index + nonce + cipher.encrypt(nonce, data, authenticated)
+    return header + index + nonce + data + cipher.encrypt(nonce, b"", authenticated + data)
 
 
 def spi_of(protected: bytes) -> int:
@@ -73,11 +81,18 @@ def counter_of(protected: bytes) -> int:
     return int.from_bytes(protected[SPI_BYTES:SECURITY_HEADER_BYTES], "big") % (1 << _COUNTER_BITS)
 
 
-def unprotect(cipher: AESGCM, header: bytes, mask: bytes, protected: bytes) -> bytes | None:
-    """Return the decrypted data of a protected frame, None if the MAC is wrong."""
+def unprotect(
+    cipher: AESGCM, header: bytes, mask: bytes, protected: bytes, encrypted: bool = True
+) -> bytes | None:
+    """Return the data of a protected frame, None if the MAC is wrong."""
     index, iv = protected[:SPI_BYTES], protected[SPI_BYTES:SECURITY_HEADER_BYTES]
+    authenticated = _authenticated(header, mask, index)
     try:
-        return cipher.decrypt(iv, protected[SECURITY_HEADER_BYTES:], _authenticated(header, mask, index))
+        if encrypted:
+            return cipher.decrypt(iv, protected[SECURITY_HEADER_BYTES:], authenticated)
+        data, mac = protected[SECURITY_HEADER_BYTES:-MAC_BYTES], protected[-MAC_BYTES:]
+        cipher.decrypt(iv, mac, authenticated + data)
+        return data
     except InvalidTag:
         return None
 
@@ -285,17 +300,19 @@ class Gate:
         mask: bytes,
         window: int = WINDOW,
         store_every: int = 1,
+        encrypted: bool = True,
     ) -> None:
         """Accept frames of the given SPIs and restore lost copies of their associations.
 
         If `store_every` is above 1, the counter is stored only once per `store_every` counts. The ground uses
-        a value above 1 for telemetry.
+        a value above 1 for telemetry. Telemetry can be authenticated without being `encrypted`.
         """
         self._vault = vault
         self._parse = parse
         self._mask = mask
         self._window = window
         self._store_every = store_every
+        self._encrypted = encrypted
         self._ciphers: dict[tuple[int, int], AESGCM] = {}
         self._open: dict[int, Association | None] = {spi: vault.read(spi) for spi in spis}
         for entry in self._open.values():
@@ -348,7 +365,7 @@ class Gate:
         if spi not in self._open:
             raise RefusedError(Refusal.SPI)
         entry = self._open[spi] or self._read_again(spi)
-        data = unprotect(self._cipher(entry), header, self._mask, protected)
+        data = unprotect(self._cipher(entry), header, self._mask, protected, self._encrypted)
         if data is None:
             entry, data = self._by_next_key(spi, header, protected)
         counter = counter_of(protected)
@@ -385,7 +402,7 @@ class Gate:
         """
         following = self._vault.read(f"{spi}-{NEXT}") if self._store_every > 1 else None
         if following is not None:
-            data = unprotect(following.cipher, header, self._mask, protected)
+            data = unprotect(following.cipher, header, self._mask, protected, self._encrypted)
             if data is not None:
                 self.replace_key(spi, following.generation, following.key)
                 self._vault.remove(f"{spi}-{NEXT}")
@@ -397,7 +414,13 @@ class Sealer:
     """Sender that protects frames of one SPI. A counter is reserved on disk before it is used in a frame."""
 
     def __init__(
-        self, vault: Vault, name: int | str, mask: bytes, block: int = 1, shared: bool = False
+        self,
+        vault: Vault,
+        name: int | str,
+        mask: bytes,
+        block: int = 1,
+        shared: bool = False,
+        encrypted: bool = True,
     ) -> None:
         """Protect frames with the association `name`, and reserve `block` counters at a time.
 
@@ -411,6 +434,7 @@ class Sealer:
         self._mask = mask
         self._block = block
         self._shared = shared
+        self._encrypted = encrypted
         self._salt = secrets.randbits(_SALT_BITS) << _COUNTER_BITS
         self._next = 0
         self._end = 0
@@ -434,7 +458,7 @@ class Sealer:
         counter = self._next
         self._next += 1
         iv = self._salt | counter
-        return protect(self._cipher, self._spi, iv, header, self._mask, data), counter
+        return protect(self._cipher, self._spi, iv, header, self._mask, data, self._encrypted), counter
 
     def _is_overtaken(self) -> bool:
         """Return whether another process has changed the key or reserved counters after this block."""

@@ -47,6 +47,8 @@ _BEYOND = 1.01
 """Largest ratio of the current limit of a coil to the current that its supply voltage drives."""
 _PREFIX = 24
 """Default prefix length of the network whose hosts may send frames to the link."""
+_DATA_SYMBOLS = 223
+"""Number of data symbols in a codeword of the link's Reed-Solomon code."""
 
 
 def check_consistency(config: Config, document: Document) -> None:
@@ -254,14 +256,24 @@ def _check_commands(commands: Commands, on_testbed: bool, refuse: Refuse) -> Non
 def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
     if commands.socket is None:
         refuse("link", "needs `commands.socket`, through which it passes commands to the flight")
-    if link.udp is None and link.tcp is None and link.serial is None:
-        refuse("link", "has no line: give `udp`, `tcp` or `serial`")
+    if link.udp is None and link.tcp is None and link.serial is None and link.kiss is None:
+        refuse("link", "has no line: give `udp`, `tcp`, `serial` or `kiss`")
+    depth = link.coding.reed_solomon
+    if depth is not None and (link.frame_bytes % depth or link.frame_bytes > _DATA_SYMBOLS * depth):
+        most = _DATA_SYMBOLS * depth
+        cure = f"must be a multiple of `link.coding.reed_solomon` ({depth}), at most {most}"
+        refuse("link.frame_bytes", f"is {link.frame_bytes}: {cure}")
+    if link.call_signs is not None and link.kiss is None and not (link.serial and link.serial.kiss):
+        refuse("link.call_signs", "goes with `link.kiss` or `link.serial.kiss`")
+    if link.idle_rate > link.rate:
+        refuse("link.idle_rate", f"is {link.idle_rate:g}: must not be above `link.rate` ({link.rate:g})")
     if link.telemetry_to is not None and link.udp is None:
         refuse("link.telemetry_to", "goes with `link.udp`")
     try:
         peer_networks(link)
     except ValueError as error:
-        refuse("link.peers" if link.peers else "link.udp" if link.udp else "link.tcp", str(error))
+        named = next((name for name in ("peers", "udp", "tcp", "kiss") if getattr(link, name)), "peers")
+        refuse(f"link.{named}", str(error))
 
 
 def _check_camera(camera: Camera, refuse: Refuse) -> None:
@@ -292,15 +304,16 @@ def _check_camera(camera: Camera, refuse: Refuse) -> None:
 
 
 def peer_networks(link: Link) -> tuple[IPv4Network, ...]:
-    """Return the networks from which the link accepts frames; without UDP and TCP there are none.
+    """Return the networks from which the link accepts frames; without UDP, TCP and KISS there are none.
 
     The sandbox of the systemd service (`deploy/board_dropin.py`) blocks packets of all other networks. Raises
     ValueError for an invalid network, and for an address that requires `link.peers`.
     """
-    hosts = [address.rpartition(":")[0] for address in (link.udp, link.tcp) if address is not None]
-    if hosts and link.peers is not None:
-        return tuple(map(IPv4Network, link.peers))
+    lines = (link.udp, link.tcp, link.kiss) if link.peers is None else (link.kiss,)
+    hosts = [address.rpartition(":")[0] for address in lines if address is not None]
     networks = []
+    if link.peers is not None and (link.udp or link.tcp or link.kiss):
+        networks = list(map(IPv4Network, link.peers))
     for host in hosts:
         try:
             own = IPv4Address("127.0.0.1" if host == "localhost" else host)

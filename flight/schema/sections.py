@@ -24,6 +24,7 @@ from flight.schema.devices import (
 from flight.schema.values import (
     Q2,
     Aim,
+    CallSign,
     CommandedMode,
     GoalName,
     HostPort,
@@ -160,10 +161,24 @@ class Commands(Section, frozen=True, kw_only=True):
 
 
 class LinkSerial(Section, frozen=True, kw_only=True):
-    """A serial line to a radio: its device file and bit rate (bit/s)."""
+    """A serial line to a radio: its device file and bit rate (bit/s), with KISS framing if `kiss` is true."""
 
     device: Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$", description="a device file")]
     baud: Annotated[int, Meta(ge=1200, le=4_000_000)] = 115200
+    kiss: bool = False
+
+
+class LinkCoding(Section, frozen=True, kw_only=True):
+    """Channel coding for a radio without a coding modem, equal at both ends (`flight.link.coding`).
+
+    Telemetry is randomised by the `short` or `long` sequence of CCSDS 131.0-B, and protected by the
+    Reed-Solomon code (255,223) with interleaving depth `reed_solomon`. Telecommands are sent in CLTUs of
+    CCSDS 231.0-B, `plain` or `randomised`.
+    """
+
+    randomiser: Literal["short", "long"] | None = None
+    reed_solomon: Annotated[int, Meta(ge=1, le=5)] | None = None
+    cltu: Literal["plain", "randomised"] | None = None
 
 
 class Link(Section, frozen=True, kw_only=True):
@@ -173,8 +188,13 @@ class Link(Section, frozen=True, kw_only=True):
     in each frame. The addresses `udp` and `tcp` (HOST:PORT) accept frames only from the networks `peers`.
     Without `peers`, a loopback address accepts frames from this machine, any other address from its network
     of 256 addresses. The value `serial` describes the line of a radio. Telemetry is sent to authenticated
-    senders, to `telemetry_to` (HOST:PORT, UDP), to all clients of `tcp` and to `serial`. Telemetry frames
-    have `frame_bytes` bytes, and each line carries at most `rate` bytes/s. After `command_loss` s with power
+    senders, to `telemetry_to` (HOST:PORT, UDP), to all clients of `tcp`, to `serial` and to the TNC at `kiss`
+    (HOST:PORT, TCP). With the two `call_signs` (to, from), KISS frames contain AX.25 frames. Telemetry frames
+    have `frame_bytes` bytes, and telecommand frames have at most `command_frame_bytes` bytes. Each line
+    carries at most `rate` bytes/s of telemetry frames. Frames of idle data fill it up to `idle_rate` bytes/s.
+    Telemetry is always authenticated, and readable without a key if `encrypt_telemetry` is false. The section
+    `coding` describes the channel coding.
+    After `command_loss` s with power
     without an authentic frame, a board returns to its previous release, after the same time again to its
     previous configuration, then to the configuration accepted on the ground; 0 switches this off.
     """
@@ -186,9 +206,15 @@ class Link(Section, frozen=True, kw_only=True):
     tcp: HostPort | None = None
     serial: LinkSerial | None = None
     peers: Annotated[tuple[Peer, ...], Meta(min_length=1)] | None = None
+    kiss: HostPort | None = None
+    call_signs: tuple[CallSign, CallSign] | None = None
     frame_bytes: Annotated[int, Meta(ge=128, le=2048)] = 1115
+    command_frame_bytes: Annotated[int, Meta(ge=128, le=1024)] = 1024
     rate: Annotated[float, Meta(ge=100.0, le=1.0e7)] = 50_000.0
     command_loss: Annotated[float, Meta(ge=0.0, le=3.2e7)] = 0.0
+    idle_rate: Annotated[float, Meta(ge=0.0, le=1.0e7)] = 0.0
+    encrypt_telemetry: bool = True
+    coding: LinkCoding = LinkCoding()
 
 
 class Telemetry(Section, frozen=True, kw_only=True):

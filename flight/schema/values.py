@@ -27,6 +27,13 @@ Bus = (
         str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$", description="the number of a bus, or its device file")
     ]
 )
+CallSign = Annotated[
+    str,
+    Meta(
+        pattern=r"^[A-Z0-9]{1,6}(-([0-9]|1[0-5]))?$",
+        description="an amateur call sign of capitals and digits with an SSID from 0 to 15, such as OK0SAT-1",
+    ),
+]
 Peer = Annotated[
     str,
     Meta(

@@ -91,6 +91,7 @@ def run_gateway(options: argparse.Namespace) -> int:
             sys.stdout.write(f"packets on 127.0.0.1:{gateway.port}, token in {path} (Ctrl-C ends)\n")
             sys.stdout.flush()
             gateway.run(lambda: signals.received)
+        sys.stdout.write(f"{terminal.reception()}\n")
     return 0
 
 
@@ -263,9 +264,6 @@ def configure_console(parser: argparse.ArgumentParser) -> None:
         "--fly", metavar="CONFIG", type=Path, help="fly this simulated configuration into RUN in real time"
     )
     add_link_options(parser, way)
-    parser.add_argument(
-        "--config", metavar="CONFIG", type=Path, help="with --link: configuration of the flight, for the map"
-    )
     parser.add_argument(
         "--frames",
         metavar="FOLDER",

@@ -9,22 +9,41 @@ import socket
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
 from flight.link.files.store import Store
 from flight.link.files.transfer import CRC32, GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
-from flight.link.files.units import DOWN, UP, Metadata, PduError, UnitPacker, is_unit, unit_of
-from flight.link.frames import LONGEST_FRAME, TELECOMMAND_HEADER, TELECOMMAND_MASK
+from flight.link.files.units import (
+    DOWN,
+    UNIT_OVERHEAD_BYTES,
+    UP,
+    Metadata,
+    PduError,
+    UnitPacker,
+    is_unit,
+    unit_of,
+)
+from flight.link.frames import LONGEST_FRAME, TELECOMMAND_MASK
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import Directive, NewKey, SendFile
 from flight.link.process.filing import LISTING
-from flight.link.security import COMMAND_SPIS, NEXT, OVERHEAD_BYTES, Association, Sealer, Vault, new_key
+from flight.link.security import COMMAND_SPIS, NEXT, Association, Sealer, Vault, new_key
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
-from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, LONGEST_PACKET, to_text
-from ground.link.terminal import DEFAULTS, Terminal, TerminalSettings, open_terminal, report_of
+from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text
+from flight.schema.reader import load
+from ground.link.terminal import (
+    ADDRESSES,
+    DEFAULTS,
+    FRAME_OVERHEAD_BYTES,
+    Terminal,
+    TerminalSettings,
+    open_terminal,
+    report_of,
+)
 from knightcube.errors import FlightError, UsageError
 
 Show = Callable[[Report], object]
@@ -34,7 +53,6 @@ _REPEAT_NS = 5_000_000_000
 """Time (ns) after which an unanswered command is sent again."""
 _BURST_S = 0.05
 """Time (s) over which unused transmission capacity accumulates."""
-_FRAME_BYTES = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + CRC_BYTES
 _VERIFICATION = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
 _TRANSFER = LAYOUTS[TRANSFER.name]
 
@@ -83,22 +101,26 @@ def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExc
     way.add_argument(
         "--link",
         metavar="ADDRESS",
-        help="link of the flight: HOST:PORT (UDP), tcp:HOST:PORT or /dev/FILE@BAUD",
+        help=f"link of the flight: {ADDRESSES}",
     )
     parser.add_argument("--keys", type=Path, metavar="FOLDER", help="keys of the ground, needed with --link")
     parser.add_argument(
+        "--config",
+        type=Path,
+        metavar="CONFIG",
+        help="configuration of the flight, whose section `link` describes frames and their coding",
+    )
+    parser.add_argument(
         "--spacecraft",
         type=int,
-        default=DEFAULTS.spacecraft,
         metavar="N",
-        help="spacecraft identifier of the link (default %(default)s)",
+        help=f"spacecraft identifier of the link (default that of --config, or {DEFAULTS.spacecraft})",
     )
     parser.add_argument(
         "--frame-bytes",
         type=int,
-        default=DEFAULTS.frame_bytes,
         metavar="N",
-        help="length of the link's telemetry frames (default %(default)s)",
+        help=f"length of the link's telemetry frames (default that of --config, or {DEFAULTS.frame_bytes})",
     )
 
 
@@ -109,7 +131,14 @@ def terminal_of(options: argparse.Namespace) -> Terminal:
     """
     if options.keys is None:
         raise UsageError("--link needs --keys, the ground's folder of `python -m ground keys`")
-    settings = TerminalSettings(options.spacecraft, options.frame_bytes)
+    section = DEFAULTS if options.config is None else load(options.config).link
+    if section is None:
+        raise UsageError(f"{options.config}: has no section `link`")
+    settings = TerminalSettings.of(section)
+    if options.spacecraft is not None:
+        settings = replace(settings, spacecraft=options.spacecraft)
+    if options.frame_bytes is not None:
+        settings = replace(settings, frame_bytes=options.frame_bytes)
     return open_terminal(options.link, options.keys, settings)
 
 
@@ -204,7 +233,9 @@ class FileSession:
         self._units = UnitPacker(UP)
         self._wanted = {LISTING}
         self.received = store.received
-        self.entity = Entity(GROUND, store, self._may_come, LONGEST_FILE, now_ns)
+        self.entity = Entity(
+            GROUND, store, self._may_come, LONGEST_FILE, now_ns, terminal.packet_bytes - UNIT_OVERHEAD_BYTES
+        )
         self.received_ns = now_ns
         self._texts: dict[tuple[int, int], str] = {}
         self._asked: tuple[Directive, int] | None = None
@@ -253,7 +284,7 @@ class FileSession:
         while self._credit > 0.0 and (unit := self.entity.unit(now_ns)) is not None:
             packet = self._units.pack(unit, utc_ns())
             self._terminal.send_by(self._sealer, packet)
-            self._credit -= len(packet) + _FRAME_BYTES
+            self._credit -= len(packet) + FRAME_OVERHEAD_BYTES
         self.entity.keep(now_ns)
 
     def _may_come(self, metadata: Metadata) -> str:

@@ -25,12 +25,11 @@ from pathlib import Path
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
 from flight.link.files.units import PACKET_VERSION, UP
-from flight.link.frames import LONGEST_FRAME, TELECOMMAND_HEADER
+from flight.link.frames import LONGEST_FRAME
 from flight.link.process.station import host_port
-from flight.link.security import OVERHEAD_BYTES
 from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, SECONDARY_BYTES, crc16
-from ground.link.terminal import Terminal, report_of
+from ground.link.terminal import FRAME_OVERHEAD_BYTES, Terminal, report_of
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import FlightError, UsageError
 
@@ -57,7 +56,7 @@ _TOKEN_BYTES = 32
 _CHECKED_BYTES = HEADER_BYTES + 1
 """Number of checked bytes: the primary header and the byte with the version of the packet definition."""
 _UNSEGMENTED = 0b11
-_LONGEST_PACKET = LONGEST_FRAME - TELECOMMAND_HEADER.size - OVERHEAD_BYTES - CRC_BYTES
+_LONGEST_PACKET = LONGEST_FRAME - FRAME_OVERHEAD_BYTES
 _SHORTEST_UNIT = HEADER_BYTES + SECONDARY_BYTES + 1 + CRC_BYTES
 
 
@@ -296,6 +295,8 @@ class Gateway:
             return
         try:
             for packet in self._connections[line].stream.packets(data):
+                if len(packet) > (most := self._terminal.packet_bytes):
+                    raise StreamError(f"{len(packet)} bytes: link.command_frame_bytes allows {most}")
                 self._terminal.send_by(self._sealer, finished(packet, utc_ns()))
                 self.up += 1
         except StreamError as error:

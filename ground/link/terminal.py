@@ -14,17 +14,16 @@ from typing import Protocol
 
 import serial
 
+from flight.link.coding import Framing, LinkCodes
 from flight.link.frames import (
-    SYNC,
     TELECOMMAND_HEADER,
     TELECOMMAND_MASK,
     TELEMETRY_MASK,
-    FrameStream,
     PacketAssembler,
     TelecommandHeader,
     close_frame,
+    is_idle,
     open_telemetry,
-    telemetry_stream,
 )
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.downlink import LIVE
@@ -43,17 +42,22 @@ from flight.link.security import (
 )
 from flight.link.telemetry.definitions import LINK, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
-from flight.schema.sections import Link
+from flight.schema.sections import Link, LinkCoding
 from knightcube.errors import FlightError, UsageError
 
 DEFAULTS = Link(keys="-")
-"""Default spacecraft identifier and frame length."""
+"""Default settings of the link."""
+
+ADDRESSES = "HOST:PORT (UDP), tcp:HOST:PORT, /dev/FILE@BAUD, kiss:HOST:PORT or kiss:/dev/FILE@BAUD"
+"""Forms of the address of a line to the satellite."""
 
 _STORE_EVERY = 256
 """Number of telemetry frames between two writes of the anti-replay counters."""
 _ANY_AHEAD = 2**63
 """Width of the anti-replay window, which accepts any gap after lost telemetry."""
 _READ_BYTES = 1 << 16
+FRAME_OVERHEAD_BYTES = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + CRC_BYTES
+"""Number of bytes in a telecommand frame besides the packet."""
 _LINK, _VERIFICATION = (LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION))
 
 
@@ -81,10 +85,33 @@ def make_keys(folder: Path) -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class TerminalSettings:
-    """Spacecraft identifier and length of telemetry frames, which must be equal at both ends of a link."""
+    """Settings of the section `link` of a configuration that must be equal at both ends of a link."""
 
     spacecraft: int = DEFAULTS.spacecraft
     frame_bytes: int = DEFAULTS.frame_bytes
+    command_frame_bytes: int = DEFAULTS.command_frame_bytes
+    encrypted: bool = DEFAULTS.encrypt_telemetry
+    coding: LinkCoding = DEFAULTS.coding
+    call_signs: tuple[str, str] | None = None
+
+    @classmethod
+    def of(cls, link: Link) -> TerminalSettings:
+        """Return the settings of the section `link`."""
+        return cls(
+            link.spacecraft,
+            link.frame_bytes,
+            link.command_frame_bytes,
+            link.encrypt_telemetry,
+            link.coding,
+            link.call_signs,
+        )
+
+    def codes(self) -> LinkCodes:
+        """Return the codes of the link, without corrected errors."""
+        coding = self.coding
+        return LinkCodes(
+            self.frame_bytes, coding.randomiser, coding.reed_solomon, coding.cltu, self.call_signs
+        )
 
 
 class GroundLine(Protocol):
@@ -110,10 +137,14 @@ class Terminal:
         gate: authentication of the telemetry frames, with the numbers of refused frames.
         lost_frames: number of telemetry frames that are missing according to their authenticated counters.
             Counters that the satellite's link process skips when it starts again are included.
+        idle_frames: number of received frames of idle data.
+        packet_bytes: longest packet that a telecommand frame can carry, bytes.
     """
 
-    def __init__(self, line: GroundLine, vault: Vault, settings: TerminalSettings) -> None:
-        """Create a terminal with an open line and the ground's keys."""
+    def __init__(
+        self, line: GroundLine, vault: Vault, settings: TerminalSettings, codes: LinkCodes | None = None
+    ) -> None:
+        """Create a terminal with an open line, the codes of this line and the ground's keys."""
         self._line = line
         self._vault = vault
         self._settings = settings
@@ -121,8 +152,18 @@ class Terminal:
         self._sealers: dict[int, Sealer] = {}
         self._channels: dict[int, PacketAssembler] = {}
         self._expected: dict[int, int] = {}  # next counter of each SPI
-        self.lost_frames = 0
-        self.gate = Gate(vault, TELEMETRY_SPIS, self._parse, TELEMETRY_MASK, _ANY_AHEAD, _STORE_EVERY)
+        self._codes = codes or settings.codes()
+        self.lost_frames = self.idle_frames = 0
+        self.packet_bytes = settings.command_frame_bytes - FRAME_OVERHEAD_BYTES
+        self.gate = Gate(
+            vault,
+            TELEMETRY_SPIS,
+            self._parse,
+            TELEMETRY_MASK,
+            _ANY_AHEAD,
+            _STORE_EVERY,
+            encrypted=settings.encrypted,
+        )
 
     def fileno(self) -> int:
         """Return the line's file descriptor for `select`."""
@@ -138,9 +179,15 @@ class Terminal:
         return Sealer(self._vault, spi, TELECOMMAND_MASK, block, shared=True)
 
     def send_by(self, sealer: Sealer, packet: bytes) -> int:
-        """Send a command packet with a sealer's key and return the counter of its frame."""
+        """Send a command packet with a sealer's key and return the counter of its frame.
+
+        Raises FlightError if the packet is too long, or if the frame cannot be sent.
+        """
+        length = FRAME_OVERHEAD_BYTES + len(packet)
+        if len(packet) > self.packet_bytes:
+            most = f"link.command_frame_bytes is {self._settings.command_frame_bytes}"
+            raise FlightError(f"the command needs a frame of {length} bytes, but {most}")
         header = TelecommandHeader(self._settings.spacecraft, 0, self._sequence)
-        length = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + len(packet) + CRC_BYTES
         body, counter = sealer.seal(header.pack(length), packet)
         self._sequence += 1
         self._line.send(close_frame(body))
@@ -156,6 +203,9 @@ class Terminal:
     def take(self) -> Iterator[tuple[int, bytes]]:
         """Yield virtual channel and packet of the telemetry received since the last call."""
         for frame in self._line.receive():
+            if is_idle(frame):
+                self.idle_frames += 1
+                continue
             try:
                 admitted = self.gate.admit(frame)
             except RefusedError:  # counted by the gate
@@ -188,6 +238,15 @@ class Terminal:
                 if found.stage.final or repeated:
                     return
                 reported = True
+
+    def reception(self) -> str:
+        """Return the numbers of received and lost frames and of corrected errors as a text."""
+        code = self._codes.telemetry
+        return (
+            f"{self.gate.admitted} frames accepted, {sum(self.gate.refused.values())} refused, "
+            f"{self.lost_frames} lost, {self.idle_frames} idle; {code.corrected} symbols corrected, "
+            f"{code.uncorrectable} codewords not corrigible"
+        )
 
     def close(self) -> None:
         """Store the frame counters and close the line."""
@@ -222,8 +281,9 @@ def report_of(packet: bytes) -> Report:
 class UdpGround:
     """UDP line with one frame per datagram."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, codes: LinkCodes | None = None) -> None:
         """Open a socket that sends to HOST:PORT and receives at any free port. Raises FlightError."""
+        self._codes = codes or LinkCodes()
         self._address = host_port(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
@@ -236,17 +296,17 @@ class UdpGround:
         return self._socket.fileno()
 
     def receive(self) -> list[bytes]:
-        """Return the received datagrams."""
+        """Return the frames in the received datagrams."""
         found: list[bytes] = []
         with contextlib.suppress(OSError):
             while len(found) < 1024:
-                found.append(self._socket.recv(4096))
+                found.append(self._codes.telemetry.decode(self._socket.recv(4096)))
         return found
 
     def send(self, frame: bytes) -> None:
         """Send a datagram."""
         with _reaching(str(self._address)):
-            self._socket.sendto(frame, self._address)
+            self._socket.sendto(self._codes.commands.encode(frame), self._address)
 
     def close(self) -> None:
         """Close the socket."""
@@ -254,13 +314,14 @@ class UdpGround:
 
 
 class StreamGround:
-    """Stream of frames with sync markers, over TCP or a serial line."""
+    """Stream of frames over TCP or a serial line."""
 
-    def __init__(self, name: str, file: int, frame_bytes: int, close: Callable[[], object]) -> None:
+    def __init__(self, name: str, file: int, framing: Framing, close: Callable[[], object]) -> None:
         """Create a stream on an open file descriptor."""
         self._name = name
         self._file = file
-        self._stream: FrameStream = telemetry_stream(frame_bytes)
+        self._framing = framing
+        self._stream = framing.stream()
         self._close = close
 
     def fileno(self) -> int:
@@ -276,8 +337,8 @@ class StreamGround:
         return self._stream.add(data)
 
     def send(self, frame: bytes) -> None:
-        """Send a frame after its sync marker."""
-        data = SYNC + frame
+        """Send a frame."""
+        data = self._framing.wrap(frame)
         with _reaching(self._name):
             while data:
                 data = data[os.write(self._file, data) :]
@@ -288,29 +349,32 @@ class StreamGround:
 
 
 def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = None) -> Terminal:
-    """Open the line to HOST:PORT (UDP), tcp:HOST:PORT, or /dev/FILE@BAUD.
+    """Open the line to HOST:PORT (UDP), tcp:HOST:PORT, or /dev/FILE@BAUD, or to a TNC after `kiss:`.
+
+    The TNC speaks KISS on HOST:PORT (TCP) or /dev/FILE@BAUD.
 
     Raises UsageError for an invalid address or key folder, and FlightError if the line cannot be opened.
     """
     settings = settings or TerminalSettings()
-    vault = Vault(keys)
+    vault, codes = Vault(keys), settings.codes()
+    kiss = address.startswith("kiss:")
+    framing, place = codes.on_ground(kiss), address.removeprefix("kiss:")
     line: GroundLine
     try:
         with _reaching(address):
-            if address.startswith("tcp:"):
-                connection = socket.create_connection(host_port(address.removeprefix("tcp:")), timeout=5.0)
-                connection.setblocking(True)
-                close = connection.close
-                line = StreamGround(address, connection.fileno(), settings.frame_bytes, close)
-            elif address.startswith("/"):
-                device, _, baud = address.partition("@")
+            if place.startswith("/"):
+                device, _, baud = place.partition("@")
                 port = serial.Serial(device, int(baud), exclusive=True)
-                line = StreamGround(address, port.fileno(), settings.frame_bytes, port.close)
+                line = StreamGround(address, port.fileno(), framing, port.close)
+            elif kiss or place.startswith("tcp:"):
+                connection = socket.create_connection(host_port(place.removeprefix("tcp:")), timeout=5.0)
+                connection.setblocking(True)
+                line = StreamGround(address, connection.fileno(), framing, connection.close)
             else:
-                line = UdpGround(address)
+                line = UdpGround(address, codes)
     except ValueError as error:
-        raise UsageError(f"{address}: give HOST:PORT, tcp:HOST:PORT or /dev/FILE@BAUD") from error
-    return Terminal(line, vault, settings)
+        raise UsageError(f"{address}: give {ADDRESSES}") from error
+    return Terminal(line, vault, settings, codes)
 
 
 @contextlib.contextmanager

@@ -37,7 +37,7 @@ def missing() -> str:
     return ""
 
 
-def _jars() -> Path:
+def jars() -> Path:
     """Return what stands for all archives of the bundle on a class path."""
     found = importlib.util.find_spec(_BUNDLE)
     assert found is not None
@@ -47,7 +47,7 @@ def _jars() -> Path:
 
 def compile_link(folder: Path) -> None:
     """Compile the data link of a configuration. Raises RuntimeError with the compiler's words."""
-    compiler = ["java", "-cp", str(_jars()), "-m", "jdk.compiler/com.sun.tools.javac.Main", "-proc:none"]
+    compiler = ["java", "-cp", str(jars()), "-m", "jdk.compiler/com.sun.tools.javac.Main", "-proc:none"]
     command = [*compiler, "-d", str(folder), str(folder / LINK_SOURCE)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
@@ -58,7 +58,7 @@ def words(folder: Path) -> list[str]:
     """Return the command that starts Yamcs on the configuration in a folder."""
     places = ["--etc-dir", str(folder / "etc"), "--data-dir", str(folder / "data")]
     flags = ["-Djava.awt.headless=true", "-Djava.net.preferIPv4Stack=true", "-XX:TieredStopAtLevel=1"]
-    return ["java", *flags, "-cp", f"{_jars()}:{folder}", "org.yamcs.YamcsServer", *places, "--no-color"]
+    return ["java", *flags, "-cp", f"{jars()}:{folder}", "org.yamcs.YamcsServer", *places, "--no-color"]
 
 
 def troubles(log: str) -> list[str]:

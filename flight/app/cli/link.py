@@ -15,9 +15,18 @@ from functools import partial
 from pathlib import Path
 
 from flight.app.service import SeparationInhibit, StartRetry, StoppedError, accepted_config, retried_start
+from flight.link.coding import LinkCodes
 from flight.link.process.commanding import ControlLine, Sent
 from flight.link.process.downlink import LogFollower
-from flight.link.process.station import Line, SerialLine, Station, StationSettings, TcpLine, UdpLine
+from flight.link.process.station import (
+    Line,
+    SerialLine,
+    Station,
+    StationSettings,
+    TcpLine,
+    TncLine,
+    UdpLine,
+)
 from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.schema.document import ConfigError, config_path
 from flight.schema.reader import parse, peer_networks
@@ -133,17 +142,29 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
     if all(vault.read(spi) is None for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)):
         raise UsageError(f"{section.keys}: no key can be read: mount or copy the satellite's keys there")
     stack.enter_context(vault.owned())
-    lines = _open_lines(section, clock, stack)
+    coding = section.coding
+    codes = LinkCodes(
+        section.frame_bytes, coding.randomiser, coding.reed_solomon, coding.cltu, section.call_signs
+    )
+    lines = _open_lines(section, codes, clock, stack)
     folder = os.environ.get("RUNTIME_DIRECTORY") or stack.enter_context(
         tempfile.TemporaryDirectory(prefix="knightcube-")
     )
     control: ControlLine[Sent] = ControlLine(judged.socket, Path(folder))
-    settings = StationSettings(section.spacecraft, section.frame_bytes, section.rate, section.command_loss)
+    settings = StationSettings(
+        section.spacecraft,
+        section.frame_bytes,
+        section.rate,
+        section.command_loss,
+        idle_rate=section.idle_rate,
+        encrypted=section.encrypt_telemetry,
+        codes=codes,
+    )
     station = Station(settings, vault, lines, control, LogFollower(log), clock)
     return _OpenedLink(station, ", ".join(line.name for line in lines))
 
 
-def _open_lines(section: Link, clock: SystemClock, stack: ExitStack) -> list[Line]:
+def _open_lines(section: Link, codes: LinkCodes, clock: SystemClock, stack: ExitStack) -> list[Line]:
     """Open the configured lines, which `stack` closes. Raises UsageError and DeviceError."""
     peers, lines = peer_networks(section), list[Line]()
 
@@ -152,13 +173,15 @@ def _open_lines(section: Link, clock: SystemClock, stack: ExitStack) -> list[Lin
         lines.append(line)
 
     if section.udp is not None:
-        add(UdpLine(section.udp, section.telemetry_to, peers))
+        add(UdpLine(section.udp, section.telemetry_to, peers, codes))
     if section.tcp is not None:
-        add(TcpLine(section.tcp, peers))
+        add(TcpLine(section.tcp, peers, codes.on_board()))
     if section.serial is not None:
         device, baud = section.serial.device, section.serial.baud
         port = PySerialPort(device, baud, clock, patient=True, write_timeout=_WRITE_TIMEOUT_S)
-        add(SerialLine(section.serial.device, port))
+        add(SerialLine(section.serial.device, port, codes.on_board(section.serial.kiss)))
+    if section.kiss is not None:
+        add(TncLine(section.kiss, codes.on_board(kiss=True)))
     return lines
 
 

@@ -28,7 +28,11 @@ from fastcrc import crc32
 
 from flight.link.files.store import Ending, FileError, Incoming, Outgoing, Store, problem_of_name
 from flight.link.files.units import (
+    FILE_DATA_OVERHEAD,
+    LONGEST_UNIT,
     MOST_REQUESTS,
+    NAK_OVERHEAD,
+    REQUEST_BYTES,
     SEGMENT_BYTES,
     Ack,
     Code,
@@ -211,9 +215,20 @@ class Sender:
     """
 
     def __init__(
-        self, source: int, record: Outgoing, save: Callable[[Outgoing], None], now_ns: int, *, fresh: bool
+        self,
+        source: int,
+        record: Outgoing,
+        save: Callable[[Outgoing], None],
+        now_ns: int,
+        *,
+        fresh: bool,
+        segment_bytes: int = SEGMENT_BYTES,
     ) -> None:
-        """Begin a transfer if `fresh` is true; otherwise continue a stored transfer by metadata and EOF."""
+        """Begin a transfer if `fresh` is true; otherwise continue a stored transfer by metadata and EOF.
+
+        Each PDU contains at most `segment_bytes` bytes of the file.
+        """
+        self._segment_bytes = segment_bytes
         self.record = record
         self.transaction = Transaction(source, record.number, record.destination)
         self.condition: int | None = None
@@ -297,7 +312,7 @@ class Sender:
         return None
 
     def _piece(self, now_ns: int) -> Content | None:
-        begin, end = self._wanted.take(SEGMENT_BYTES)
+        begin, end = self._wanted.take(self._segment_bytes)
         try:
             with self._path.open("rb") as file:
                 file.seek(begin)
@@ -362,8 +377,20 @@ class Receiver:
         said: text about the end of the transfer.
     """
 
-    def __init__(self, store: Store, record: Incoming, accept: Accept, most: int, now_ns: int) -> None:
-        """Begin or continue the transfer `record`, rejecting a file of more than `most` bytes."""
+    def __init__(
+        self,
+        store: Store,
+        record: Incoming,
+        accept: Accept,
+        most: int,
+        now_ns: int,
+        most_requests: int = MOST_REQUESTS,
+    ) -> None:
+        """Begin or continue the transfer `record`, rejecting a file of more than `most` bytes.
+
+        Each NAK PDU requests at most `most_requests` ranges.
+        """
+        self._most_requests = most_requests
         self.record = record
         self.closed = False
         self.said = ""
@@ -501,7 +528,7 @@ class Receiver:
     def _next_request(self, begin: int) -> Nak | None:
         """Return the request for the next gaps from offset `begin`, None at the end of the file."""
         size = self.record.end[1] if self.record.end is not None else self.record.size
-        gaps = self._ranges.gaps(begin, size, MOST_REQUESTS - 1)
+        gaps = self._ranges.gaps(begin, size, self._most_requests - 1)
         self._asked_to = gaps[-1][1] if gaps and gaps[-1][1] < size else None
         if self.record.name is None and begin == 0:
             gaps.insert(0, (0, 0))
@@ -609,16 +636,26 @@ class Entity:
         ended: queue of ended transfers, which the caller empties.
     """
 
-    def __init__(self, number: int, store: Store, accept: Accept, most: int, now_ns: int) -> None:
-        """Continue the open transfers of the store, rejecting incoming files of more than `most` bytes."""
+    def __init__(
+        self,
+        number: int,
+        store: Store,
+        accept: Accept,
+        most: int,
+        now_ns: int,
+        unit_bytes: int = LONGEST_UNIT,
+    ) -> None:
+        """Continue the open transfers of the store, rejecting incoming files of more than `most` bytes.
+
+        File data and requests for gaps are sent in PDUs of at most `unit_bytes` bytes.
+        """
         self.number = number
+        self._segment_bytes = min(SEGMENT_BYTES, (unit_bytes - FILE_DATA_OVERHEAD) // 4 * 4)
+        self._most_requests = min(MOST_REQUESTS, (unit_bytes - NAK_OVERHEAD) // REQUEST_BYTES)
         self.ended: deque[Progress] = deque(maxlen=_MOST_REPLIES)
         self._store, self._accept, self._most = store, accept, most
         self._replies: deque[bytes] = deque(maxlen=_MOST_REPLIES)
-        self._out = {
-            record.number: Sender(number, record, store.save, now_ns, fresh=False)
-            for record in store.outgoing()
-        }
+        self._out = {record.number: self._sender(record, now_ns, fresh=False) for record in store.outgoing()}
         self._in = {
             (record.source, record.number): self._receiver(record, now_ns) for record in store.incoming()
         }
@@ -663,7 +700,7 @@ class Entity:
             number, destination, str(path), name, facts.st_size, facts.st_mtime_ns, kind, None, origin
         )
         self._store.save(record)
-        self._out[number] = Sender(self.number, record, self._store.save, now_ns, fresh=True)
+        self._out[number] = self._sender(record, now_ns, fresh=True)
         return _of_sender(self._out[number])
 
     def cancel(self, source: int, number: int) -> None:
@@ -772,8 +809,12 @@ class Entity:
         found = self._in[record.source, record.number] = self._receiver(record, now_ns)
         return found
 
+    def _sender(self, record: Outgoing, now_ns: int, *, fresh: bool) -> Sender:
+        segment = self._segment_bytes
+        return Sender(self.number, record, self._store.save, now_ns, fresh=fresh, segment_bytes=segment)
+
     def _receiver(self, record: Incoming, now_ns: int) -> Receiver:
-        return Receiver(self._store, record, self._accept, self._most, now_ns)
+        return Receiver(self._store, record, self._accept, self._most, now_ns, self._most_requests)
 
     def _open(self, path: str, name: str, destination: int) -> Sender | None:
         wanted = (path, name, destination)

@@ -20,6 +20,9 @@ SEGMENT_BYTES = 900
 """Maximum file data (bytes) in one PDU, chosen so that the PDU fits into a telecommand frame."""
 MOST_REQUESTS = 100
 """Maximum number of gaps in one NAK PDU, chosen so that the PDU fits into a telecommand frame."""
+FILE_DATA_OVERHEAD, NAK_OVERHEAD, REQUEST_BYTES = 16, 21, 8
+"""Number of bytes of a file data PDU besides the data, of a NAK PDU besides its gaps, and of each gap."""
+LONGEST_UNIT = FILE_DATA_OVERHEAD + SEGMENT_BYTES
 HIGHEST_NUMBER = 2**32 - 1
 _ENTITY_BYTES, _NUMBER_BYTES = 2, 4
 _FIXED_BYTES = 4
@@ -252,6 +255,9 @@ DOWN = 0x0973
 UP = 0x1A28
 """First 16 bits of a packet that carries a PDU to the satellite (type telecommand, APID 0x228)."""
 PACKET_VERSION = 1
+
+UNIT_OVERHEAD_BYTES = HEADER_BYTES + SECONDARY_BYTES + CRC_BYTES
+"""Number of bytes in a packet besides the PDU."""
 
 _PACKET_HEADERS = struct.Struct(">HHHBq")
 _MODULUS = 1 << 14

@@ -16,7 +16,8 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from flight.link.frames import TELEMETRY_HEADER, MasterCount, Seal, TelemetryFramer
+from flight.link.coding import pseudo_random
+from flight.link.frames import TELEMETRY_HEADER, IdleFramer, MasterCount, Seal, TelemetryFramer
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import Play
 from flight.link.security import OVERHEAD_BYTES
@@ -240,17 +241,26 @@ class Downlink:
     """
 
     def __init__(
-        self, spacecraft: int, frame_bytes: int, rate: float, seal: Seal, files: Callable[[], bytes | None]
+        self,
+        spacecraft: int,
+        frame_bytes: int,
+        rate: float,
+        seal: Seal,
+        files: Callable[[], bytes | None],
+        idle_rate: float = 0.0,
     ) -> None:
         """Make frames of `frame_bytes` bytes at a data rate of `rate` bytes/s.
 
         The function `files` returns the next packet of the file transfers, or None if no packet is due.
+        Frames of idle data raise the data rate to `idle_rate`, bytes/s.
         """
         room = frame_bytes - TELEMETRY_HEADER.size - OVERHEAD_BYTES - CRC_BYTES
         master = MasterCount()
         self._live = TelemetryFramer(spacecraft, LIVE, room, master, seal)
         self._replay = TelemetryFramer(spacecraft, PLAYBACK, room, master, seal)
         self._filed = TelemetryFramer(spacecraft, FILES, room, master, seal)
+        self._idle = IdleFramer(spacecraft, frame_bytes, master, pseudo_random("long"))
+        self._idle_rate, self._idle_credit = idle_rate, 0.0
         self._files = files
         self._files_first = True
         self._frame_bytes = frame_bytes
@@ -304,7 +314,16 @@ class Downlink:
             due += made
             self._credit -= self._frame_bytes * len(made)
         self.sent += len(due)
-        return due
+        return due + self._idle_frames(1e-9 * (now_ns - before), len(due))
+
+    def _idle_frames(self, seconds: float, sent: int) -> list[bytes]:
+        """Return the frames of idle data that are due after `seconds` s in which `sent` frames were made."""
+        most = self._frame_bytes + self._idle_rate * _BURST_S
+        credit = self._idle_credit + self._idle_rate * seconds - sent * self._frame_bytes
+        credit = min(max(credit, -most), most)
+        made = [self._idle.frame() for _ in range(int(max(credit, 0.0) // self._frame_bytes))]
+        self._idle_credit = credit - len(made) * self._frame_bytes
+        return made
 
     def _next_live(self, now_ns: int) -> list[bytes]:
         while (packet := self._urgent.popleft() if self._urgent else self._queue.take()) is not None:

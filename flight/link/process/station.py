@@ -21,18 +21,15 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flight.link import commands
+from flight.link.coding import LONGEST_CLTU, FrameDecoder, Framing, LinkCodes
 from flight.link.commands import CommandError, CommandPacker
 from flight.link.files.store import files_folder
 from flight.link.files.units import UP, is_unit
 from flight.link.frames import (
-    LONGEST_FRAME,
-    SYNC,
     TELECOMMAND_HEADER,
     TELECOMMAND_MASK,
     TELEMETRY_MASK,
-    FrameStream,
     open_telecommand,
-    telecommand_stream,
 )
 from flight.link.process import directives
 from flight.link.process.commanding import (
@@ -93,6 +90,7 @@ If 200 strangers connect per second, a new connection has 160 ms for its first f
 _UNSENT = 1 << 18
 _SO_ATTACH_FILTER = 26  # Linux, asm-generic/socket.h; not in Python's module socket
 _PIECE = 1 << 14
+_RECONNECT_NS = 5 * SECOND_NS
 
 
 class Line(Protocol):
@@ -120,7 +118,11 @@ class UdpLine:
     """
 
     def __init__(
-        self, address: str, to: str | None = None, peers: Sequence[IPv4Network] | None = None
+        self,
+        address: str,
+        to: str | None = None,
+        peers: Sequence[IPv4Network] | None = None,
+        codes: LinkCodes | None = None,
     ) -> None:
         """Bind a UDP socket.
 
@@ -128,11 +130,13 @@ class UdpLine:
             address: own address, HOST:PORT.
             to: fixed address HOST:PORT that receives telemetry, None for no fixed address.
             peers: networks of the accepted senders, None to accept all senders.
+            codes: codes of the frames in the datagrams, None for plain frames.
 
         Raises UsageError if the address cannot be bound.
         """
         self.name = f"UDP {address}"
         self._peers = peers
+        self._codes = codes or LinkCodes()
         self._fixed = None if to is None else host_port(to)
         self._heard: dict[Any, int] = {}
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -153,17 +157,17 @@ class UdpLine:
         return int(self._socket.getsockname()[1])
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return the received datagrams, each cut to one byte more than the longest frame."""
+        """Return the frames in the received datagrams, each cut to one byte more than the longest unit."""
         found = []
         for _ in range(AT_MOST):
             try:
-                data, sender = self._socket.recvfrom(LONGEST_FRAME + 1)
+                data, sender = self._socket.recvfrom(LONGEST_CLTU + 1)
             except BlockingIOError:
                 break
             except OSError:  # ICMP error from a listener that no longer exists
                 continue
             if self._peers is None or any(IPv4Address(sender[0]) in peers for peers in self._peers):
-                found.append((data, sender))
+                found.append((self._codes.commands.decode(data), sender))
         return found
 
     def trust(self, sender: Any, now_ns: int) -> None:
@@ -174,10 +178,11 @@ class UdpLine:
         """Send each frame as one datagram to each listener."""
         self._heard = {who: at for who, at in self._heard.items() if now_ns - at < _HEARD_NS}
         fixed = () if self._fixed is None or self._fixed in self._heard else (self._fixed,)
+        units = [self._codes.telemetry.encode(frame) for frame in frames]
         for listener in (*fixed, *self._heard):
-            for frame in frames:
+            for unit in units:
                 with contextlib.suppress(OSError):
-                    self._socket.sendto(frame, listener)
+                    self._socket.sendto(unit, listener)
 
     def close(self) -> None:
         """Close the socket."""
@@ -213,29 +218,33 @@ def _accept_only(udp: socket.socket, peers: Sequence[IPv4Network]) -> None:
 class _Connection:
     """TCP connection: its decoder, its unsent bytes, and whether it has sent an authentic frame."""
 
-    stream: FrameStream = field(default_factory=telecommand_stream)
+    stream: FrameDecoder
     unsent: bytearray = field(default_factory=bytearray)
     trusted: bool = False
 
 
 class TcpLine:
-    """TCP server on which each frame follows a sync marker.
+    """TCP server on which each frame follows a sync marker, or has the configured code.
 
     Connections that have sent an authentic frame are limited to four, other connections to 32. A further
     connection replaces the oldest connection of the same kind, so that strangers displace only strangers.
     """
 
-    def __init__(self, address: str, peers: Sequence[IPv4Network] | None = None) -> None:
+    def __init__(
+        self, address: str, peers: Sequence[IPv4Network] | None = None, framing: Framing | None = None
+    ) -> None:
         """Listen for connections.
 
         Args:
             address: own address, HOST:PORT.
             peers: networks from which connections are accepted, None to accept all connections.
+            framing: form of the frames in the stream, None for plain frames.
 
         Raises UsageError if the address cannot be bound.
         """
         self.name = f"TCP {address}"
         self._peers = peers
+        self._framing = framing or LinkCodes().on_board()
         self._connections: dict[socket.socket, _Connection] = {}
         try:
             self._listener = socket.create_server(host_port(address))
@@ -274,7 +283,7 @@ class TcpLine:
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
         """Send frames to all connections, and close connections that do not read the frames."""
-        marked = b"".join(SYNC + frame for frame in frames)
+        marked = b"".join(map(self._framing.wrap, frames))
         for connection, state in list(self._connections.items()):
             unsent = state.unsent
             unsent.extend(marked)
@@ -305,7 +314,7 @@ class TcpLine:
                 continue
             connection.setblocking(False)
             self._make_room(trusted=False, most=_STRANGERS)
-            self._connections[connection] = _Connection()
+            self._connections[connection] = _Connection(self._framing.stream())
 
     def _make_room(self, trusted: bool, most: int) -> None:
         """Drop the oldest connection of one kind if there are `most` of this kind."""
@@ -318,14 +327,79 @@ class TcpLine:
         connection.close()
 
 
-class SerialLine:
-    """Serial line to a radio or modem, on which each frame follows a sync marker."""
+class TncLine:
+    """Client of a terminal node controller (TNC), such as Direwolf, by KISS over TCP.
 
-    def __init__(self, name: str, port: SerialPort) -> None:
-        """Use an open serial port, which reopens automatically if the device is lost."""
+    A lost connection is opened again after five seconds.
+    """
+
+    def __init__(self, address: str, framing: Framing) -> None:
+        """Connect to the address HOST:PORT as soon as frames can be sent."""
+        self.name = f"KISS {address}"
+        self._address = host_port(address)
+        self._framing = framing
+        self._stream = framing.stream()
+        self._socket: socket.socket | None = None
+        self._unsent = bytearray()
+        self._next_ns = 0
+
+    def receive(self) -> list[tuple[bytes, Any]]:
+        """Return the received frames, or an empty list without a connection."""
+        if self._socket is None:
+            return []
+        try:
+            data = self._socket.recv(_PIECE)
+        except BlockingIOError:
+            return []
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+        return [(frame, None) for frame in self._stream.add(data)]
+
+    def trust(self, sender: Any, now_ns: int) -> None:
+        """Do nothing, because a TNC has only one other end."""
+
+    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
+        """Send frames in KISS frames. Frames are discarded without a connection, or if the TNC is slow."""
+        if self._socket is None and now_ns >= self._next_ns:
+            self._next_ns = now_ns + _RECONNECT_NS
+            self._stream = self._framing.stream()
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            self._socket.setblocking(False)
+            with contextlib.suppress(OSError):
+                self._socket.connect(self._address)
+        if self._socket is None:
+            return
+        if len(self._unsent) < _UNSENT:
+            self._unsent.extend(b"".join(map(self._framing.wrap, frames)))
+        try:
+            del self._unsent[: self._socket.send(self._unsent) if self._unsent else 0]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._unsent.clear()
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+class SerialLine:
+    """Serial line to a radio, on which each frame follows a sync marker, or has the configured code."""
+
+    def __init__(self, name: str, port: SerialPort, framing: Framing | None = None) -> None:
+        """Use an open serial port, which reopens automatically if the device is lost.
+
+        Without a `framing`, plain frames follow sync markers.
+        """
         self.name = name
         self._port = port
-        self._stream = telecommand_stream()
+        self._framing = framing or LinkCodes().on_board()
+        self._stream = self._framing.stream()
 
     def receive(self) -> list[tuple[bytes, Any]]:
         """Return the received frames, or an empty list if the port is lost."""
@@ -339,10 +413,10 @@ class SerialLine:
         """Do nothing, because a serial line has only one other end."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send frames with sync markers. Frames are discarded while the port is lost."""
+        """Send frames. Frames are discarded while the port is lost."""
         with contextlib.suppress(DeviceError):
             if frames:
-                self._port.send(b"".join(SYNC + frame for frame in frames))
+                self._port.send(b"".join(map(self._framing.wrap, frames)))
 
     def close(self) -> None:
         """Close the port."""
@@ -392,6 +466,9 @@ class StationSettings:
         rate: data rate of the telemetry, bytes/s.
         command_loss: time without an authentic frame after which the board suspects itself, s; 0 for none.
         renewal: status file of the privileged part of the renewal.
+        idle_rate: data rate (bytes/s) up to which frames of idle data are sent.
+        encrypted: whether telemetry is encrypted. It is always authenticated.
+        codes: codes of the lines, which count the corrected errors.
     """
 
     spacecraft: int
@@ -399,6 +476,9 @@ class StationSettings:
     rate: float
     command_loss: float = 0.0
     renewal: Path = STATUS
+    idle_rate: float = 0.0
+    encrypted: bool = True
+    codes: LinkCodes = field(default_factory=LinkCodes)
 
 
 class Station:
@@ -420,9 +500,18 @@ class Station:
         self._log = log
         self._clock = clock
         self._gate = Gate(vault, COMMAND_SPIS, parser_of(settings.spacecraft), TELECOMMAND_MASK)
-        self._sealers = {spi: Sealer(vault, spi, TELEMETRY_MASK, _RESERVED_BLOCK) for spi in TELEMETRY_SPIS}
+        self._codes = settings.codes
+        self._sealers = {
+            spi: Sealer(vault, spi, TELEMETRY_MASK, _RESERVED_BLOCK, encrypted=settings.encrypted)
+            for spi in TELEMETRY_SPIS
+        }
         self._downlink = Downlink(
-            settings.spacecraft, settings.frame_bytes, settings.rate, self._seal, self._next_unit
+            settings.spacecraft,
+            settings.frame_bytes,
+            settings.rate,
+            self._seal,
+            self._next_unit,
+            settings.idle_rate,
         )
         self._filing = Filing(files_folder(vault.folder), log.place, clock.now_ns())
         folder = vault.folder.absolute().parent / "renewal"
@@ -638,6 +727,7 @@ class Station:
             "playing": int(self._downlink.playing),
             "played_ns": self._downlink.played_ns,
             "unreported": self.unreported,
+            "corrected": self._codes.commands.corrected,
         }
         self._send(LINK, values)
         for progress in self._filing.status():

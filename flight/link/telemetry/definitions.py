@@ -797,11 +797,10 @@ LINK = Packet(
         counter("thinned", "live packets omitted because of the limited rate; the archive contains them"),
         flag("playing", "whether a playback of the archive is running"),
         Field("played_ns", "i8", "ns", "mission time of the newest packet of the playback"),
-        counter(
-            "unreported", "reports of the link that were lost because of invalid values or newer reports"
-        ),
+        counter("unreported", "reports that were lost because of invalid values or newer reports"),
+        counter("corrected", "wrong bits of telecommands that the BCH code has corrected"),
     ),
-    version=2,
+    version=3,
 )
 
 VERIFICATION = Packet(

@@ -34,6 +34,8 @@ def networks(lines: str, commands: str = "{socket: /run/x}") -> list[str]:
         ("udp: '10.20.30.40:5000'", ["10.20.30.0/24"]),
         ("udp: '10.20.30.40:5000', peers: [10.20.30.7]", ["10.20.30.7/32"]),
         ("tcp: 'board:5000', peers: [10.20.0.0/16, 127.0.0.1]", ["10.20.0.0/16", "127.0.0.1/32"]),
+        ("kiss: 'localhost:8001'", ["127.0.0.0/8"]),
+        ("udp: '10.1.1.1:5', peers: [10.2.0.1], kiss: '10.3.3.3:8001'", ["10.2.0.1/32", "10.3.3.0/24"]),
     ],
 )
 def test_without_a_word_the_peers_are_those_around_the_address(lines: str, expected: list[str]) -> None:
@@ -54,6 +56,21 @@ def test_without_a_word_the_peers_are_those_around_the_address(lines: str, expec
         ("udp: '10.0.0.1:5000', peers: []", "`link.peers"),
         ("spacecraft: 5", "`link` has no line"),
         ("tcp: '127.0.0.1:5', telemetry_to: '127.0.0.1:6'", "`link.telemetry_to` goes with `link.udp`"),
+        (
+            "tcp: '127.0.0.1:5', frame_bytes: 1116, coding: {reed_solomon: 5}",
+            r"is 1116: must be a multiple of `link.coding.reed_solomon` \(5\), at most 1115",
+        ),
+        ("tcp: '127.0.0.1:5', frame_bytes: 224, coding: {reed_solomon: 1}", "at most 223"),
+        ("tcp: '127.0.0.1:5', coding: {reed_solomon: 6}", "`link.coding.reed_solomon"),
+        ("tcp: '127.0.0.1:5', frame_bytes: 127", "`link.frame_bytes"),
+        ("tcp: '127.0.0.1:5', command_frame_bytes: 1025", "`link.command_frame_bytes"),
+        ("tcp: '127.0.0.1:5', rate: 1000, idle_rate: 1001", "`link.idle_rate` is 1001: must not be above"),
+        ("kiss: '0.0.0.0:8001'", "`link.kiss` 0.0.0.0"),
+        (
+            "serial: {device: /dev/ttyS1}, call_signs: [A, B]",
+            "`link.call_signs` goes with `link.kiss` or `link.serial.kiss`",
+        ),
+        ("kiss: '127.0.0.1:8001', call_signs: [OK0GND, OK0SAT-16]", "`link.call_signs"),
     ],
 )
 def test_lines_that_make_no_sense_are_refused_with_what_would(lines: str, problem: str) -> None:

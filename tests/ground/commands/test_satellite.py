@@ -201,6 +201,8 @@ def report(stage: Stage, text: str = "text", counter: int = 1, spi: int = 1) -> 
 class Link:
     """A terminal with telemetry from a list."""
 
+    packet_bytes = 987
+
     def __init__(self, *packets: bytes) -> None:
         self.received = list(packets)
         self.sent: list[bytes] = []

@@ -23,10 +23,11 @@ from flight.link.security import NEXT, Association, Vault
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, Packer
 from ground.link import commanding
-from ground.link.terminal import make_keys
+from ground.link.terminal import FRAME_OVERHEAD_BYTES, TerminalSettings, make_keys
 from knightcube.errors import FlightError, UsageError
 
 S = 1_000_000_000
+LONGEST_PACKET = TerminalSettings().command_frame_bytes - FRAME_OVERHEAD_BYTES
 
 
 def report(stage: Stage, text: str = "", counter: int = 0, spi: int = 1) -> Report:
@@ -36,6 +37,8 @@ def report(stage: Stage, text: str = "", counter: int = 0, spi: int = 1) -> Repo
 
 class FakeTerminal:
     """A terminal that keeps what is sent, and answers with given reports."""
+
+    packet_bytes = LONGEST_PACKET
 
     def __init__(self, vault: Vault | None = None, *answers: list[Report]) -> None:
         self.vault = vault
@@ -204,7 +207,7 @@ def test_units_are_sent_within_the_rate(tmp_path: Path) -> None:
     for step in range(1, 41):
         files.transmit(step * S // 20)
     assert all(is_unit(packet, UP) for packet in line.sent)
-    overhead = commanding._FRAME_BYTES
+    overhead = FRAME_OVERHEAD_BYTES
     spent = sum(len(packet) + overhead for packet in line.sent)
     assert 40_000 - 1200 <= spent <= 40_000 + 1200
     before = len(line.sent)
@@ -282,14 +285,40 @@ def test_a_link_needs_the_keys_of_the_ground() -> None:
     parser = argparse.ArgumentParser()
     commanding.add_link_options(parser, parser.add_mutually_exclusive_group())
     options = parser.parse_args(["--link", "tcp:127.0.0.1:9"])
-    assert (options.link, options.keys, options.spacecraft, options.frame_bytes) == (
-        "tcp:127.0.0.1:9",
-        None,
-        0x1A5,
-        1115,
-    )
+    assert (options.link, options.keys) == ("tcp:127.0.0.1:9", None)
     with pytest.raises(UsageError, match="--keys"):
         commanding.terminal_of(options)
+
+
+@pytest.mark.parametrize("extra", [[], ["--spacecraft", "3", "--frame-bytes", "300"]])
+def test_the_settings_of_the_link_are_those_of_the_configuration_and_the_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extra: list[str]
+) -> None:
+    make_keys(tmp_path / "keys")
+    opened: list[Any] = []
+    monkeypatch.setattr(commanding, "open_terminal", lambda *given: opened.append(given))
+    parser = argparse.ArgumentParser()
+    commanding.add_link_options(parser, parser.add_mutually_exclusive_group())
+    base = (Path(__file__).parents[3] / "config" / "orbit.yaml").read_text(encoding="utf-8")
+    section = (
+        "link: {keys: k, udp: '127.0.0.1:9', spacecraft: 7, frame_bytes: 888, command_frame_bytes: 200, "
+        "encrypt_telemetry: false, coding: {randomiser: long, reed_solomon: 4, cltu: randomised}}\n"
+    )
+    base += "commands: {socket: /run/commands}\n"
+    for name, text in (("with.yaml", base + section), ("without.yaml", base)):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    words = ["--link", "127.0.0.1:9", "--keys", str(tmp_path), *extra]
+    commanding.terminal_of(parser.parse_args(words))
+    commanding.terminal_of(parser.parse_args([*words, "--config", str(tmp_path / "with.yaml")]))
+    plain, described = (settings for _, _, settings in opened)
+    own = (3, 300) if extra else None
+    assert (plain.spacecraft, plain.frame_bytes) == (own or (0x1A5, 1115))
+    assert (described.spacecraft, described.frame_bytes) == (own or (7, 888))
+    assert (described.command_frame_bytes, described.encrypted) == (200, False)
+    coding = described.coding
+    assert (coding.randomiser, coding.reed_solomon, coding.cltu) == ("long", 4, "randomised")
+    with pytest.raises(UsageError, match=r"without.yaml: has no section `link`"):
+        commanding.terminal_of(parser.parse_args([*words, "--config", str(tmp_path / "without.yaml")]))
 
 
 def test_the_first_bytes_of_the_packets_are_those_of_the_table() -> None:

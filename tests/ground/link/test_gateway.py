@@ -17,7 +17,7 @@ from typing import cast
 
 import pytest
 
-from flight.link.commands import ChangeMode, CommandPacker, Ping
+from flight.link.commands import ChangeMode, CommandPacker, Ping, Slew
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import HEALTH
 from flight.link.telemetry.packets import Packer
@@ -36,6 +36,8 @@ PATIENCE_S = 60.0
 
 class Satellite:
     """Stands for the terminal: keeps the uplinked frames, and returns the frames of the downlink."""
+
+    packet_bytes = 987
 
     def __init__(self) -> None:
         self.up: list[bytes] = []
@@ -103,6 +105,20 @@ def station() -> Iterator[Station]:
         gateway = Gateway(cast(Terminal, satellite), "127.0.0.1:0", token, complaints.append)
         stack.callback(gateway.close)
         yield Station(gateway, token, satellite, complaints, stack)
+
+
+def test_a_packet_for_a_longer_frame_closes_its_connection_alone(
+    station: Station,
+) -> None:
+    station.satellite.packet_bytes = 21
+    ping, slew = (CommandPacker().pack(command, 1) for command in (Ping(1), Slew(0.1)))
+    line = station.connect(station.line + slew)
+    station.turn()
+    assert closed(line)
+    assert "25 bytes: link.command_frame_bytes allows 21" in station.complaints[-1]
+    station.connect(station.line + ping)
+    station.turn()
+    assert station.satellite.up[-1][:2] == ping[:2]
 
 
 def closed(line: socket.socket) -> bool:

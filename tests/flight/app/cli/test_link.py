@@ -20,6 +20,7 @@ from pathlib import Path
 import pytest
 
 from flight.app.cli import main
+from flight.link.coding import LinkCodes
 from flight.link.commands import PING, CommandPacker, Ping, open_unix
 from flight.link.modes import Mode
 from flight.link.process.commanding import Report, Request, Stage
@@ -132,7 +133,7 @@ def test_a_command_is_scheduled_listed_and_deleted(
 
 def test_a_command_goes_by_a_serial_line_with_a_marker_before_each_frame(lines: dict[str, str]) -> None:
     radio = int(lines["radio"])
-    line = StreamGround("radio", radio, DEFAULTS.frame_bytes, lambda: None)
+    line = StreamGround("radio", radio, LinkCodes(DEFAULTS.frame_bytes).on_ground(), lambda: None)
     terminal = Terminal(line, Vault(Path(lines["place"]) / "keys" / "ground"), TerminalSettings())
     counter = terminal.send(CommandPacker().pack(Ping(3), 1))
     stages = [report.stage for report in terminal.follow(counter, 1, 10.0)]

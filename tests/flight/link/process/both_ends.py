@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from flight.link.coding import LinkCodes
 from flight.link.commands import open_unix
 from flight.link.modes import Mode
 from flight.link.process.commanding import ControlLine, Report, Sent
@@ -44,6 +45,10 @@ class Wire:
     def close(self) -> None:
         pass
 
+    def ground(self) -> GroundWire:
+        """Return the other end."""
+        return GroundWire(self)
+
 
 class GroundWire:
     """The ground's side of a wire."""
@@ -65,13 +70,55 @@ class GroundWire:
         pass
 
 
+class StreamWire(Wire):
+    """A wire on which both ends send streams of bytes, which `noise` damages."""
+
+    def __init__(self, codes: LinkCodes, noise: Callable[[bytes], bytes], kiss: bool = False) -> None:
+        super().__init__()
+        self.noise, self.board, self.far = noise, codes.on_board(kiss), codes.on_ground(kiss)
+        self.received, self.collected = self.board.stream(), self.far.stream()
+
+    def receive(self) -> list[tuple[bytes, Any]]:
+        return [(frame, None) for data, _ in super().receive() for frame in self.received.add(data)]
+
+    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
+        super().send([self.noise(self.board.wrap(frame)) for frame in frames], now_ns)
+
+    def ground(self) -> GroundWire:
+        return GroundStream(self)
+
+
+class GroundStream(GroundWire):
+    """The ground's end of a stream."""
+
+    def __init__(self, wire: StreamWire) -> None:
+        super().__init__(wire)
+        self.stream = wire
+
+    def receive(self) -> list[bytes]:
+        return [frame for data in super().receive() for frame in self.stream.collected.add(data)]
+
+    def send(self, frame: bytes) -> None:
+        super().send(self.stream.noise(self.stream.far.wrap(frame)))
+
+
 class BothEnds:
     """A satellite in orbit and its ground."""
 
-    def __init__(self, place: Path, rate: float = 1e6) -> None:
-        """Make keys and an empty run under `place`."""
+    def __init__(
+        self,
+        place: Path,
+        rate: float = 1e6,
+        settings: TerminalSettings = SETTINGS,
+        idle_rate: float = 0.0,
+        codes: LinkCodes | None = None,
+        noise: Callable[[bytes], bytes] = bytes,
+    ) -> None:
+        """Make keys and an empty run under `place`; with `codes` the wire is a noisy stream."""
         make_keys(place / "keys")
-        self.place, self.rate, self.clock, self.wire = place, rate, ManualClock(), Wire()
+        self.place, self.rate, self.clock = place, rate, ManualClock()
+        self.settings, self.idle_rate, self.codes = settings, idle_rate, codes or LinkCodes()
+        self.wire = Wire() if codes is None else StreamWire(codes, noise)
         run = place / "runs" / "run-000001"
         run.mkdir(parents=True)
         self.log = SegmentStore(run, "flight", 1 << 16, 1 << 24)
@@ -84,13 +131,21 @@ class BothEnds:
 
     def restart(self) -> None:
         """Start another link process, and another terminal."""
-        settings = StationSettings(SETTINGS.spacecraft, SETTINGS.frame_bytes, self.rate)
+        given = self.settings
+        settings = StationSettings(
+            given.spacecraft,
+            given.frame_bytes,
+            self.rate,
+            idle_rate=self.idle_rate,
+            encrypted=given.encrypted,
+            codes=self.codes,
+        )
         control: ControlLine[Sent] = ControlLine(self.place / "commands", self.place)
         self.sky = Vault(self.place / "keys" / "satellite")
         follower = LogFollower(self.place / "runs")
         self.station = Station(settings, self.sky, [self.wire], control, follower, self.clock)
         self.ground = Vault(self.place / "keys" / "ground")
-        self.terminal = Terminal(GroundWire(self.wire), self.ground, SETTINGS)
+        self.terminal = Terminal(self.wire.ground(), self.ground, given, self.codes)
 
     def record(self, *packets: bytes) -> None:
         """Write packets into the flight log."""

@@ -1,0 +1,203 @@
+"""Commands and telemetry over a bare radio: codes, noise, short frames, idle frames, readable telemetry."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.link.coding import LinkCodes, kiss_frame
+from flight.link.commands import CommandPacker, Ping, unpack
+from flight.link.frames import IDLE_CHANNEL, TELEMETRY_HEADER, close_frame, is_idle
+from flight.link.process.station import TncLine
+from flight.link.security import Refusal
+from flight.link.telemetry.definitions import LINK
+from flight.link.telemetry.packets import LAYOUTS
+from flight.schema.sections import LinkCoding
+from ground.link.terminal import TerminalSettings
+from knightcube.errors import FlightError
+from tests.flight.link.process.both_ends import BothEnds
+from tests.flight.link.process.filed_ends import FiledEnds
+
+S = 1_000_000_000
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as opened:
+        yield opened
+
+
+def ping(number: int) -> bytes:
+    """Return the packet of a ping."""
+    return CommandPacker().pack(Ping(number), 1)
+
+
+class Noise:
+    """A channel that inverts single bits, one in about 200 bytes."""
+
+    def __call__(self, data: bytes) -> bytes:
+        bits = np.unpackbits(np.frombuffer(data, np.uint8))
+        bits[64::1600] ^= 1
+        return np.packbits(bits).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("frame_bytes", "coding"),
+    [
+        (1115, LinkCoding(randomiser="long", reed_solomon=5, cltu="randomised")),
+        (128, LinkCoding(randomiser="short", reed_solomon=1, cltu="plain")),
+        (384, LinkCoding(reed_solomon=3, cltu="randomised")),
+    ],
+)
+def test_commands_and_reports_pass_a_channel_with_wrong_bits(
+    stack: ExitStack, tmp_path: Path, frame_bytes: int, coding: LinkCoding
+) -> None:
+    settings = TerminalSettings(frame_bytes=frame_bytes, coding=coding)
+    link = stack.enter_context(
+        closing(BothEnds(tmp_path, 1e5, settings, codes=settings.codes(), noise=Noise()))
+    )
+    counters = [link.terminal.send(ping(number)) for number in range(5)]
+    link.turn(2.5)
+    assert [unpack(data) for data in link.obeyed] == [Ping(number) for number in range(5)]
+    assert [link.stages(counter)[-1] for counter in counters] == ["completed"] * 5
+    assert link.status()["corrected"] == 5, "one wrong bit in each telecommand"
+    assert link.status()["refused_crc"] == 0
+    text = link.terminal.reception()
+    assert " 0 refused, 0 lost" in text
+    assert "; 0 symbols" not in text
+    assert ", 0 codewords" in text
+
+
+def test_without_code_the_same_channel_carries_nothing(stack: ExitStack, tmp_path: Path) -> None:
+    settings = TerminalSettings(frame_bytes=1115)
+    link = stack.enter_context(
+        closing(BothEnds(tmp_path, 1e5, settings, codes=settings.codes(), noise=Noise()))
+    )
+    link.terminal.send(ping(1))
+    link.turn(1.5)
+    assert link.packets == []
+
+
+@pytest.mark.parametrize("encrypted", [True, False])
+def test_telemetry_can_be_readable_for_everybody_and_still_cannot_be_forged(
+    stack: ExitStack, tmp_path: Path, encrypted: bool
+) -> None:
+    link = stack.enter_context(
+        closing(BothEnds(tmp_path, settings=TerminalSettings(frame_bytes=512, encrypted=encrypted)))
+    )
+    link.collect = lambda: None  # type: ignore[method-assign]
+    link.turn(1.5)
+    seen = list(link.wire.down)
+    identifier = LAYOUTS[LINK.name].identifier.to_bytes(2, "big")
+    assert (identifier in b"".join(frame[20:-18] for frame in seen)) is not encrypted
+    assert len(list(link.terminal.take())) > 0
+    link.turn(1.1)
+    genuine = link.wire.down.pop()
+    link.wire.down.clear()
+    for changed in (2, 8, 12, 20, 100, 480, 500):
+        forged = bytearray(genuine)
+        forged[changed] ^= 1
+        link.wire.down.append(close_frame(bytes(forged[:-2])))
+    list(link.terminal.take())
+    assert sum(link.terminal.gate.refused.values()) >= 5, "counts of the header and the salt may differ"
+    assert link.terminal.gate.refused[Refusal.MAC] >= 4
+
+
+@pytest.mark.parametrize("idle_rate", [0.0, 4000.0, 20_000.0])
+def test_idle_frames_keep_the_configured_rate_and_no_telemetry_waits_for_them(
+    stack: ExitStack, tmp_path: Path, idle_rate: float
+) -> None:
+    settings = TerminalSettings(frame_bytes=200)
+    link = stack.enter_context(closing(BothEnds(tmp_path, 1e5, settings, idle_rate)))
+    link.collect = lambda: None  # type: ignore[method-assign]
+    link.turn(10.0)
+    frames, counts = link.wire.down[:], [frame[2] for frame in link.wire.down]
+    idle = [frame for frame in frames if is_idle(frame)]
+    assert {len(frame) for frame in frames} == {200}
+    assert all(TELEMETRY_HEADER.unpack_from(frame)[0] >> 1 & 7 == IDLE_CHANNEL for frame in idle)
+    assert [frame[3] for frame in idle] == [i % 256 for i in range(len(idle))], "their own count"
+    assert counts == [i % 256 for i in range(len(frames))], "all frames share the master channel count"
+    if idle_rate:
+        assert sum(map(len, frames)) == pytest.approx(10.0 * idle_rate, rel=0.03)
+    else:
+        assert idle == []
+    packets = list(link.terminal.take())
+    assert len(packets) >= 10
+    assert (link.terminal.idle_frames, link.terminal.lost_frames) == (len(idle), 0)
+    assert sum(link.terminal.gate.refused.values()) == 0
+
+
+def test_a_command_for_a_longer_frame_is_refused_on_the_ground(stack: ExitStack, tmp_path: Path) -> None:
+    settings = TerminalSettings(frame_bytes=128, command_frame_bytes=128)
+    link = stack.enter_context(closing(BothEnds(tmp_path, settings=settings)))
+    link.terminal.send(ping(1))
+    with pytest.raises(FlightError, match=r"needs a frame of 129 bytes, but link.command_frame_bytes is 128"):
+        link.terminal.send(bytes(92))
+    link.turn()
+    assert [unpack(data) for data in link.obeyed] == [Ping(1)]
+
+
+@pytest.mark.parametrize("command_bytes", [190, 300])
+def test_files_pass_short_frames_in_both_directions(
+    stack: ExitStack, tmp_path: Path, command_bytes: int
+) -> None:
+    link = stack.enter_context(closing(FiledEnds(tmp_path, loss=0.1, up_rate=1e5)))
+    link.settings = TerminalSettings(frame_bytes=128, command_frame_bytes=command_bytes)
+    link.restart()
+    longest: list[int] = []
+    taken = link._left
+
+    def recorded(frames: list[bytes]) -> list[bytes]:
+        longest.extend(map(len, frames))
+        return taken(frames)
+
+    link._left = recorded  # type: ignore[method-assign]
+    data = np.random.default_rng(1).bytes(20_000)
+    (tmp_path / "up").write_bytes(data)
+    link.session.put(tmp_path / "up", "configuration/a.yaml", link.clock.now_ns())
+    link.until_closed()
+    assert max(longest) <= max(command_bytes, 128)
+    assert (tmp_path / "keys" / "files" / "received" / "configuration" / "a.yaml").read_bytes() == data
+
+
+def test_a_tnc_is_connected_again_when_it_was_away() -> None:
+    codes = LinkCodes(128, call_signs=("OK0GND", "OK0SAT"))
+    with socket.create_server(("127.0.0.1", 0)) as first:
+        port = first.getsockname()[1]
+        line = TncLine(f"127.0.0.1:{port}", codes.on_board(kiss=True))
+        line.send([b"lost or not"], 0)
+        tnc, _ = first.accept()
+    with tnc:
+        line.send([b"down"], 1)
+        received = b""
+        while received.count(b"\xc0") < 4:
+            received += tnc.recv(1000)
+        found = codes.on_ground(kiss=True).stream().add(received)
+        assert found[-1] == b"down"
+        command = ping(1)
+        tnc.sendall(codes.on_ground(kiss=True).wrap(command) + kiss_frame(b"other traffic"))
+        while not (taken := line.receive()):
+            pass
+        assert taken == [(command, None)]
+    while line._socket is not None:
+        line.receive()
+    for second in range(7):
+        line.send([b"nobody"], second * S)
+        line.receive()
+    with socket.create_server(("127.0.0.1", port)) as again:
+        again.settimeout(10.0)
+        line.send([b"x"], 20 * S)
+        tnc, _ = again.accept()
+        with tnc:
+            tnc.settimeout(10.0)
+            line.send([b"back"], 21 * S)
+            received = b""
+            while b"back" not in received:
+                received += tnc.recv(1000)
+    line.close()
+    assert line.receive() == []
