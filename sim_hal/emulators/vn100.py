@@ -406,17 +406,27 @@ class OutputStreams:
 
     Attributes:
         muted: registers whose output is silent until the register is written again.
+        foreign: packet and rate divisor of an output that a unit with other firmware has in the flash copy of
+            register 75, or None; the output ends when the register is written.
     """
 
     def __init__(self, registers: RegisterFile) -> None:
         self._registers = registers
         self._streams: dict[int, Stream] = {}
         self.muted: set[int] = set()
+        self.foreign: tuple[bytes, int] | None = None
+        self._sends_foreign = False
 
     def reset(self) -> None:
-        """Remove all output streams."""
+        """Remove all output streams, and begin the foreign output, if there is one."""
         self._streams = {}
         self.muted.clear()
+        self._sends_foreign = self.foreign is not None
+
+    def written(self, number: int) -> None:
+        """End a silent or foreign output of a register that has been written."""
+        self.muted.discard(number)
+        self._sends_foreign = self._sends_foreign and number != BINARY_OUTPUTS[0]
 
     def build(self, device_ns: int) -> None:
         """Rebuild the output streams from the registers. Raises UnitError if the line is too slow."""
@@ -431,6 +441,9 @@ class OutputStreams:
             packet = binary_output(registers.read(number))
             if packet is not None and packet.ports & _OUR_PORT:
                 streams[number] = Stream(packet.divisor, packet.layout.length, packet.pack, device_ns)
+        if self.foreign is not None and self._sends_foreign:
+            packet_, divisor = self.foreign
+            streams[BINARY_OUTPUTS[0]] = Stream(divisor, len(packet_), lambda _: packet_, device_ns)
         # A stream that continues unchanged keeps the time of its last message.
         for number in streams.keys() & self._streams.keys():
             streams[number].sent_ns = self._streams[number].sent_ns
@@ -583,6 +596,14 @@ class Vn100Emulator:
         self._line.baud_rate = baud_rate
         self._build_streams(now_ns)
 
+    def save_foreign_output(self, packet: bytes, divisor: int, now_ns: int) -> None:
+        """Have the flash hold an output of packets that only other firmware sends, and restart from it.
+
+        The unit sends `packet` every `divisor` ticks of 1/800 s, also after later restarts.
+        """
+        self._streams.foreign = packet, divisor
+        self.switch_on(now_ns)
+
     def upset(self, register: int, bit: int, now_ns: int) -> None:
         """Flip a bit of a register that configures the outputs, as radiation can do.
 
@@ -710,7 +731,7 @@ class Vn100Emulator:
             raise UnitError(UNAUTHORIZED)
         before = self.registers.read(number)
         echo = self.registers.write(number, fields[1:])
-        self._streams.muted.discard(number)
+        self._streams.written(number)
         try:
             self._build_streams(now_ns)
         except UnitError:

@@ -8,10 +8,11 @@ impossible are rejected and counted.
 
 The generator `set_up` yields the commands that configure a unit, and the caller decides how to
 wait for the answers. `Recovery` advances by one step at each poll and never blocks. A unit that lost power or
-was reset runs with the settings in its flash memory, possibly at another baud rate. Received packets show
-that the baud rate is correct. If bytes arrive but no packets, the recovery tries other baud rates,
-alternating with the configured rate. At the correct baud rate, the recovery configures the unit again, one
-command at a time.
+was reset runs with the settings in its flash memory, possibly at another baud rate. Received packets, also
+packets of unknown fields, show that the baud rate is correct. If bytes arrive but no packets, the recovery
+first asks the unit at the configured baud rate. If the unit does not answer, the recovery tries other baud
+rates, alternating with the configured rate. At the correct baud rate, the recovery configures the unit again,
+one command at a time. A unit that sends an additional output is configured again as well.
 """
 
 from __future__ import annotations
@@ -239,6 +240,7 @@ class Recovery:
         self._was_reset = False
         self._is_fresh = False
         self._has_written = False
+        self._has_asked = False
 
     def reset(self) -> None:
         """Record that the unit has restarted, and therefore runs with the settings in its flash memory."""
@@ -254,7 +256,7 @@ class Recovery:
             now_ns: current time, ns.
             readings: number of readings received in this poll.
             sentences: ASCII sentences received in this poll.
-            packets: number of valid packets received since the start of the driver.
+            packets: number of valid packets received since the start of the driver, also of unknown fields.
             received: number of bytes received since the start of the driver.
 
         Raises NotResponding if the port is lost.
@@ -265,6 +267,7 @@ class Recovery:
             self._is_fresh = False
         if readings and self._port.baud_rate == self._own_rate and not self._was_reset:
             self._reading_ns = now_ns
+            self._has_asked = False
             if not self._has_written:
                 self._dialogue = None
                 self._listening_since_ns = None
@@ -292,14 +295,16 @@ class Recovery:
     def _seek(self, now_ns: int, packets: int, received: int) -> None:
         """Listen at the current baud rate and then either configure the unit or change the baud rate.
 
-        The unit is configured if valid packets arrive or if the line is silent.
+        The unit is configured if valid packets arrive or if the line is silent. If neither is the case, the
+        unit is first asked at the configured baud rate, because it may send packets that are unknown.
         """
         assert self._listening_since_ns is not None
         if packets > self._packets:
             self._begin(now_ns)
         elif now_ns - self._listening_since_ns >= _LISTEN_NS:
-            if received == self._bytes:
-                # The line is silent, possibly because the output of the unit is switched off.
+            if received == self._bytes or not (self._has_asked or self._port.baud_rate != self._own_rate):
+                # A silent line is possible because the output of the unit is switched off.
+                self._has_asked = received != self._bytes
                 self._begin(now_ns)
             else:
                 self._change_rate()
@@ -383,7 +388,11 @@ class Recovery:
 
 TESLA_PER_GAUSS = 1e-4
 _UNIT_NORM_TOLERANCE = 1e-2
-_CERTAIN = 4  # consecutive unexpected samples after which the unit counts as misconfigured
+_CERTAIN = 4  # unexpected samples or messages after which the unit counts as misconfigured
+_ODD_TIME_NS = 5_000_000_000  # time without an unexpected message after which their count begins again
+_ANSWERS = frozenset(
+    {"RRG", "WRG", "WNV", "RFS", "RST", "ASY", "TAR", "KMD", "KAD", "SGB", "SFB", "SIH", "ERR"}
+)
 
 # Each row lists the packet fields that can contain a quantity, in order of preference.
 _SOURCES = (
@@ -428,7 +437,9 @@ class ReadingConverter:
         self._places: dict[bytes, _Places | None] = {}
         self._device_ns = 0
         self._period_ns = 1_000_000_000 // settings.rate_hz
-        self._odd_steps = self._odd_polls = 0
+        self._odd_steps = self._odd_outputs = 0
+        self._odd_ns = 0
+        self._wanted = layout_of(OUTPUT_SET).header if settings.output == "binary" else b""
         self._sample: tuple[tuple[float, ...], ...] = ()
         self._alike = 0
 
@@ -472,13 +483,31 @@ class ReadingConverter:
             acceleration=settings.mounting @ values[10:],
         )
 
-    def check_for_lines(self, items: Sequence[BinaryPacket | AsciiLine]) -> None:
-        """Detect a unit that sends ASCII measurement lines although it is configured for binary packets."""
-        lines = (item.sentence for item in items if isinstance(item, AsciiLine))
-        found = self._settings.output == "binary" and any(measurement(line) is not None for line in lines)
-        self._odd_polls = self._odd_polls + 1 if found else 0
-        if self._odd_polls == _CERTAIN:
+    def check_for_others(self, items: Sequence[BinaryPacket | AsciiLine], foreign: int, now_ns: int) -> None:
+        """Detect a unit that sends an output that was not requested.
+
+        Args:
+            items: packets and lines received in this poll.
+            foreign: number of packets with unknown fields received in this poll.
+            now_ns: current time, ns.
+        """
+        count = foreign + sum(map(self._is_other, items))
+        if count == 0:
+            return
+        if now_ns - self._odd_ns > _ODD_TIME_NS:
+            self._odd_outputs = 0
+        self._odd_ns = now_ns
+        self._odd_outputs += count
+        if self._odd_outputs >= _CERTAIN:
+            self._odd_outputs = 0
             self._on_reset()
+
+    def _is_other(self, item: BinaryPacket | AsciiLine) -> bool:
+        """Return whether a packet or line is neither the requested output nor an answer."""
+        if isinstance(item, BinaryPacket):
+            return item.layout.header != self._wanted
+        command = item.sentence.command
+        return command not in _ANSWERS and not (command == "QMR" and not self._wanted)
 
     def _binary_sample(self, packet: BinaryPacket) -> _Sample | None:
         header = packet.layout.header
@@ -567,6 +596,7 @@ class Vn100:
         self._recovery = Recovery(port, settings)
         self._converter = ReadingConverter(settings, byte_ns, self._recovery.reset)
         self._last_byte_ns = -1
+        self._foreign = 0
 
     def configure(self) -> None:
         """Configure the unit in its volatile memory. The flash memory is not written.
@@ -599,12 +629,12 @@ class Vn100:
         found = (self._converter.reading(item) for item in items)
         readings = [reading for reading in found if reading is not None]
         if self._settings.configure:
-            self._converter.check_for_lines(items)
             sentences = [item.sentence for item in items if not isinstance(item, BinaryPacket)]
-            parser = self._parser
-            self._recovery.advance(
-                self._clock.now_ns(), len(readings), sentences, parser.packets, parser.bytes_received
-            )
+            parser, now_ns = self._parser, self._clock.now_ns()
+            foreign, self._foreign = parser.foreign - self._foreign, parser.foreign
+            self._converter.check_for_others(items, foreign, now_ns)
+            packets = parser.packets + parser.foreign
+            self._recovery.advance(now_ns, len(readings), sentences, packets, parser.bytes_received)
         return readings
 
     def link(self) -> ImuLink:

@@ -13,6 +13,10 @@ polynomial 0x07 in section 4.2 of the manual is wrong.
 `StreamParser` finds valid packets after or inside corrupted data, because the search continues one byte after
 an invalid candidate. The computing time and memory of `StreamParser` are limited by the length of the longest
 possible packet.
+
+Packets with other fields have an unknown length, such as packets of satellite navigation or with extension
+of firmware 3. `StreamParser` counts such a packet if the bytes up to the next packet with the same header
+have a valid CRC. The packet shows that the unit sends at the present baud rate.
 """
 
 from __future__ import annotations
@@ -314,6 +318,9 @@ _START = re.compile(rb"[\xfa$]")
 _LINE = re.compile(rb"\$VN[\x20-\x23\x25-\x7e]{0,%d}\r?\n" % (LONGEST_LINE - 5))
 _LINE_BEGUN = re.compile(rb"\$(?:V(?:N[\x20-\x23\x25-\x7e]{0,%d}\r?)?)?" % (LONGEST_LINE - 5))
 
+_FOREIGN_HEADER, _FOREIGN_LONGEST = 4, 600
+"""Compared bytes of the headers of unknown packets, and maximum length (bytes) of an unknown packet."""
+
 _LONG_AGO_NS = -(1 << 62)
 _FALSE = 0
 _INCOMPLETE = -1
@@ -327,6 +334,7 @@ class StreamParser:
         packets: number of packets and lines with a valid checksum.
         bad_checksum: number of complete packets and lines with a wrong checksum.
         discarded_bytes: number of bytes outside valid packets and lines.
+        foreign: number of packets among the discarded bytes with unknown fields and a valid checksum.
     """
 
     def __init__(self, byte_ns: float = 0.0, longest: int = 512) -> None:
@@ -342,6 +350,8 @@ class StreamParser:
         self.packets = 0
         self.bad_checksum = 0
         self.discarded_bytes = 0
+        self.foreign = 0
+        self._unknown = bytearray()
         self._longest = longest
         self._buffer = bytearray()
         self._previous_ns = _LONG_AGO_NS
@@ -363,12 +373,11 @@ class StreamParser:
         position, end = 0, len(buffer)
         while position < end:
             start = _START.search(buffer, position)
+            begin = end if start is None else start.start()
+            self._discard(position, begin)
+            position = begin
             if start is None:
-                self.discarded_bytes += end - position
-                position = end
                 break
-            self.discarded_bytes += start.start() - position
-            position = start.start()
             span = self._span(position)
             if span == _INCOMPLETE:
                 break
@@ -377,7 +386,7 @@ class StreamParser:
                 early_ns = round((end - position - span) * self.byte_ns)
                 item = self._decode(position, span, max(self._previous_ns, arrival_ns - early_ns))
             if item is None:
-                self.discarded_bytes += 1
+                self._discard(position, position + 1)
                 position += 1
             else:
                 self.packets += 1
@@ -385,7 +394,31 @@ class StreamParser:
                 position += span
         del buffer[:position]
         self._previous_ns = arrival_ns
+        if self._unknown:
+            self._count_foreign()
         return found
+
+    def _discard(self, begin: int, end: int) -> None:
+        """Count the bytes from offset `begin` to `end`, and keep them for the search of unknown packets."""
+        self.discarded_bytes += end - begin
+        self._unknown += self._buffer[begin:end]
+
+    def _count_foreign(self) -> None:
+        """Count the packets with unknown fields, each of which extends to the next packet with its header."""
+        unknown, start, pending = self._unknown, self._unknown.find(SYNC), -1
+        while 0 <= start < len(unknown) - _FOREIGN_HEADER:
+            header = unknown[start : start + _FOREIGN_HEADER]
+            after = unknown.find(header, start + _FOREIGN_HEADER, start + _FOREIGN_LONGEST)
+            if after >= 0 and crc16(unknown[start + 1 : after]) == 0:
+                self.foreign += 1
+                start, pending = after, -1
+                continue
+            if pending < 0 and after < 0 and len(unknown) - start < _FOREIGN_LONGEST:
+                pending = start
+            start = unknown.find(SYNC, start + 1)
+        if pending >= 0:
+            start = pending
+        del unknown[: start if start >= 0 else len(unknown)]
 
     def _span(self, position: int) -> int:
         """Return the length (bytes) of a packet or line at offset `position`, or _FALSE, or _INCOMPLETE."""
