@@ -112,7 +112,7 @@ class BinaryPacket:
         return self.values[self.layout.places[field]]
 
 
-def crc16(data: bytes) -> int:
+def crc16(data: bytes | bytearray) -> int:
     """Return the CRC-16/XMODEM of `data` (polynomial 0x1021, initial value 0)."""
     return crc_hqx(data, 0)
 
