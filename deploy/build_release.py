@@ -102,8 +102,9 @@ class Build:
             shutil.copytree(packages, place, symlinks=True, ignore=ours, dirs_exist_ok=True)
 
     def _test(self, python: Path) -> None:
-        """Test a release: import its modules, print its version, and fly ten seconds in lock-step."""
+        """Test a release: import its modules, print its version, run its link, and fly ten seconds."""
         self._run([python, "-c", "import flight.app.flight, flight.loop.worker"])
+        self._run([python, "-c", "from flight.app.cli.link import self_test; self_test()"])
         self._run([python, "-m", "flight", "--version"])
         with tempfile.TemporaryDirectory() as folder:
             words = ["run", self._source / "config/step_demo.yaml", "--duration", SELF_TEST_S]

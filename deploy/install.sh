@@ -23,6 +23,7 @@ usage: install.sh [--config FILE] [--wheels DIR | --venv DIR] [--python PYTHON] 
 Folders:
   /opt/knightcube/releases  the software: the current and the previous release
   /opt/knightcube/bin    fly, coils-off         /etc/knightcube          configuration
+  /opt/knightcube/spare  second copy of bin
   /opt/knightcube/venv   link to the current    /var/lib/knightcube      flight logs, state
   /etc/systemd/system    the units              /etc/udev/rules.d        device names
   /etc/modules-load.d    i2c-dev
@@ -184,10 +185,21 @@ build_release() {
 
 # Have the new release fly from the next start on. What starts it is placed first, and serves both releases.
 switch_release() {
-    for file in coils-off fly releases.py safe_state.py renewal.py open_bundle.py board_dropin.py; do
-        place 755 "$deploy/$file" "$prefix/bin/$file"
+    programs='coils-off fly releases.py safe_state.py renewal.py open_bundle.py board_dropin.py'
+    for folder in "$prefix/bin" "$prefix/spare"; do
+        for file in $programs; do
+            place 755 "$deploy/$file" "$folder/$file"
+        done
+        place 644 "$source/hal/buses/smbus_byte.py" "$folder/smbus_byte.py"
+        # The checksums come last: an interrupted update leaves one folder that agrees with its checksums.
+        if [ -n "$dry" ]; then
+            echo "would write: $folder/sums"
+        else
+            (cd "$folder" && sha256sum $programs smbus_byte.py >.sums)
+            place 644 "$folder/.sums" "$folder/sums"
+            rm -f "$folder/.sums"
+        fi
     done
-    place 644 "$source/hal/buses/smbus_byte.py" "$prefix/bin/smbus_byte.py"
     run "$release/venv/bin/python" "$deploy/build_release.py" "$prefix" switch "$(basename "$release")"
 }
 

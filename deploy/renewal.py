@@ -1,3 +1,4 @@
+#!/usr/bin/env -S python3 -I -S
 """Renews configuration and release of a board, and supervises each renewal until the ground confirms it.
 
 The timer knightcube-renewal.timer runs `renewal.py` as root every ten seconds. Each run reads the state,

@@ -1,3 +1,4 @@
+#!/usr/bin/env -S python3 -I -S
 """Safe state of a board after repeated failures of the flight, with the coils at zero until the next attempt.
 
 The service knightcube-safe.service runs this program, which needs only Python's standard library and the

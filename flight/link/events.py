@@ -172,7 +172,7 @@ RESOURCE_NORMAL = _info(77, "resource-normal", "a resource is within its limits 
 RELEASE_LEFT = _fault(
     79,
     "release-left",
-    "the current release or releases.py is damaged or did not start; the text names the release in use",
+    "the current release or the launcher is damaged or did not start; the text names the release in use",
 )
 COMMANDED = _info(80, "commanded", "a command was executed")
 COMMAND_REFUSED = _warning(81, "command-refused", "a command was refused; the text gives the reason")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -28,8 +29,8 @@ case "$*" in
     *"-m pip "*"-r "*) mkdir -p "$packages/numpy"; echo numpy >"$packages/numpy/numpy.py" ;;
     *"-m pip "*) mkdir -p "$packages/ground"; cp "$home/label" "$packages/flight/label" ;;
     *"-m flight run /"*"step_demo.yaml"*) grep -q . "$packages/flight/label" ;;
-    *"-m flight --version"* | *"import flight"*) ;;
-    *"-m flight run "*) echo "flies $(cat "$packages/flight/label")" ;;
+    *"-m flight --version"* | *"import flight"* | *"import self_test"*) ;;
+    *"-m flight run "* | *"-m flight link "*) echo "flies $(cat "$packages/flight/label")" ;;
     *)  # an isolated Python would not find the modules of this folder
         [ "$1" != -I ] || shift
         PYTHONPATH={ROOT} exec {sys.executable} "$@" ;;
@@ -76,14 +77,21 @@ class FakeBoard:
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    def fly(self) -> tuple[str, str]:
-        """Start as the service does; return the label of what flew, "" for nothing, and the complaints.
+    def unit_words(self, unit: str, setting: str = "ExecStart") -> list[str]:
+        """Return the command of a unit up to the program of the launcher, on the files of this board."""
+        text = (DEPLOY / unit).read_text(encoding="utf-8").replace("\\\n", "")
+        (line,) = re.findall(rf"^{setting}=-?(/bin/sh -c '.*)$", text, re.MULTILINE)
+        return shlex.split(line.replace("$$", "$").replace("/opt/knightcube", str(self.prefix)))[:4]
 
-        The line that reports an ordinary start of the current release is left out.
+    def fly(self, *program: str) -> tuple[str, str]:
+        """Start the flight; return the label of what flew, "" for nothing, and the complaints.
+
+        The line that reports an ordinary start of the current release is left out. Without the words of a
+        `program`, such as those of a unit, the first copy of the launcher starts the flight.
         """
         state = self.root / "state"
         state.mkdir(exist_ok=True)
-        words = [str(self.prefix / "bin/fly"), "/etc/knightcube/flight.yaml"]
+        words = [*(program or [str(self.prefix / "bin/fly")]), "run", "/etc/knightcube/flight.yaml"]
         own = {**os.environ, "STATE_DIRECTORY": str(state)}
         done = subprocess.run(words, env=own, cwd=state, capture_output=True, text=True, check=False)
         complaints = re.sub(r"fly: release \S+ flies \(whole\): releases.py chose it\n", "", done.stderr)

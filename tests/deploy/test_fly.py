@@ -326,7 +326,91 @@ def test_a_whole_release_flies_after_any_flipped_bit_of_the_record(board: FakeBo
     assert set(flown) <= {"new", "old"}
 
 
-def test_what_fly_imports_as_a_trial_is_what_the_installer_imports() -> None:
-    (trial,) = re.findall(r"'(import flight\..*)'", (DEPLOY / "fly").read_text(encoding="utf-8"))
-    assert f'"{trial}"' in (DEPLOY / "build_release.py").read_text(encoding="utf-8")
-    subprocess.run([sys.executable, "-c", trial], cwd=ROOT, check=True)
+def _damaged_copy(board: FakeBoard, name: str) -> str:
+    """Start the flight as its unit does; return what flew and whether the damage of a file was reported."""
+    (board.root / "state" / TRIALS).unlink(missing_ok=True)
+    label, said = board.fly(*board.unit_words("knightcube.service"))
+    folder = board.prefix / name.partition("/")[0]
+    first = name.startswith("bin/")
+    assert (f"{folder} is damaged or cannot be read" in said) == first, (name, said)
+    assert ("the first copy of the launcher is damaged" in said) == first, (name, said)
+    return label
+
+
+PROGRAMS = ("fly", "releases.py", "coils-off", "safe_state.py", "smbus_byte.py", "renewal.py", "sums")
+
+
+@pytest.mark.parametrize("damage", ["flip", "missing", "a FIFO"])
+@pytest.mark.parametrize("copy", ["bin", "spare"])
+def test_any_damaged_file_of_the_launcher_leaves_the_current_release_flying(
+    board: FakeBoard, copy: str, damage: str
+) -> None:
+    for number, name in enumerate(PROGRAMS if damage == "flip" else ("fly", "coils-off")):
+        path = board.prefix / copy / name
+        whole = path.read_bytes()
+        if damage == "flip":
+            path.write_bytes(_flips(whole, 8)[number])
+        elif damage == "missing":
+            path.unlink()
+        else:
+            _fifo(path)
+        if damage != "a FIFO" or name == "fly":  # sha256sum is killed after 10 s at a FIFO
+            assert _damaged_copy(board, f"{copy}/{name}") == "new"
+        path.unlink(missing_ok=True)
+        path.write_bytes(whole)
+        path.chmod(0o755)
+    assert _damaged_copy(board, "none") == "new"
+
+
+def test_where_no_checksum_can_be_compared_the_first_copy_starts(board: FakeBoard) -> None:
+    for copy in ("bin", "spare"):
+        (board.prefix / copy / "sums").write_text("damaged\n", encoding="ascii")
+    label, said = board.fly(*board.unit_words("knightcube.service"))
+    assert label == "new"
+    assert said.count("is damaged or cannot be read") == 2
+
+
+@pytest.mark.parametrize(
+    ("unit", "setting", "program"),
+    [
+        ("knightcube.service", "ExecStartPre", "coils-off"),
+        ("knightcube.service", "ExecStopPost", "coils-off"),
+        ("knightcube-safe.service", "ExecStartPre", "coils-off"),
+        ("knightcube-safe.service", "ExecStart", "safe_state.py"),
+        ("knightcube-link.service", "ExecStart", "fly"),
+        ("knightcube-renewal.service", "ExecStart", "renewal.py"),
+    ],
+)
+def test_every_unit_runs_the_second_copy_of_a_program_whose_first_copy_is_damaged(
+    board: FakeBoard, unit: str, setting: str, program: str
+) -> None:
+    words = board.unit_words(unit, setting)
+    assert words[3] == program
+    spare = board.prefix / "spare"
+    for copy in ("bin", "spare"):
+        (board.prefix / copy / program).write_text(f"#!/bin/sh\necho {copy} $*\n", encoding="ascii")
+    sums = subprocess.run(["sha256sum", program], cwd=spare, capture_output=True, check=True).stdout
+    (spare / "sums").write_bytes(sums)
+    done = subprocess.run([*words, "a b"], capture_output=True, text=True, check=True)
+    assert done.stdout == "spare a b\n"
+
+
+def test_the_link_counts_its_own_starts_and_falls_back_alone(board: FakeBoard) -> None:
+    own = board.root / "link"
+    own.mkdir()
+    words = [*board.unit_words("knightcube-link.service"), "link", "/etc/knightcube/flight.yaml"]
+    flown = []
+    for _ in range(4):
+        environment = {**os.environ, "STATE_DIRECTORY": str(own)}
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+        flown.append(done.stdout)
+    assert flown == ["flies new\n"] * 3 + ["flies old\n"]
+    assert board.fly() == ("new", "")
+
+
+@pytest.mark.parametrize("program", ["run", "link"])
+def test_what_fly_imports_as_a_trial_is_what_the_installer_imports(program: str) -> None:
+    text = (DEPLOY / "fly").read_text(encoding="utf-8")
+    (modules,) = re.findall(rf"^    {program}\) modules='(.*)' ;;$", text, re.MULTILINE)
+    assert modules in (DEPLOY / "build_release.py").read_text(encoding="utf-8")
+    subprocess.run([sys.executable, "-c", f"import {modules}"], cwd=ROOT, check=True)

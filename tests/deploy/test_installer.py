@@ -46,7 +46,13 @@ class Image:
         return done.returncode, done.stdout + done.stderr
 
     def install(self, *words: str) -> tuple[int, str]:
-        return self.call("--venv", sys.prefix, *words)
+        """Install with an environment that runs the code of this folder."""
+        python = self.root.parent / "environment" / "bin" / "python"
+        if not python.exists():
+            python.parent.mkdir(parents=True)
+            python.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} "$@"\n', encoding="utf-8")
+            python.chmod(0o755)
+        return self.call("--venv", str(python.parents[1]), *words)
 
     def text(self, name: str) -> str:
         return (self.root / name).read_text(encoding="utf-8")
@@ -57,7 +63,7 @@ class Image:
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Image:
-    image = Image(tmp_path_factory.mktemp("installed"))
+    image = Image(tmp_path_factory.mktemp("installed") / "image")
     status, output = image.install("--config", str(TESTBED))
     assert status == 0, output
     return image

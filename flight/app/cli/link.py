@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import signal
+import socket
 import sys
 import tempfile
 import threading
@@ -14,9 +15,25 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from flight.app.service import SeparationInhibit, StartRetry, StoppedError, accepted_config, retried_start
+from flight.app.service import (
+    FlownRelease,
+    SeparationInhibit,
+    StartRetry,
+    StoppedError,
+    accepted_config,
+    retried_start,
+)
 from flight.link.coding import LinkCodes
+from flight.link.frames import (
+    LONGEST_FRAME,
+    TELECOMMAND_HEADER,
+    TELECOMMAND_MASK,
+    TelecommandHeader,
+    close_frame,
+)
+from flight.link.process import directives
 from flight.link.process.commanding import ControlLine, Sent
+from flight.link.process.directives import Listing
 from flight.link.process.downlink import LogFollower
 from flight.link.process.station import (
     Line,
@@ -27,7 +44,16 @@ from flight.link.process.station import (
     TncLine,
     UdpLine,
 )
-from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
+from flight.link.security import (
+    COMMAND_SPIS,
+    OVERHEAD_BYTES,
+    TELEMETRY_SPIS,
+    Association,
+    Sealer,
+    Vault,
+    new_key,
+)
+from flight.link.telemetry.packets import CRC_BYTES
 from flight.schema.document import ConfigError, config_path
 from flight.schema.reader import parse, peer_networks
 from flight.schema.sections import Link
@@ -115,7 +141,12 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
         status = f"link open on {opened.names}"
         _say("; ".join(filter(None, (status, retry.summary()))))
         overseer.ready(status)
+        release = FlownRelease(os.environ)
+        if release.note:
+            opened.station.report_problem("release", release.note)
+        release.serve(SystemClock(), stack)
         opened.station.run(ended, lambda text: _say(f"link: {text}"), overseer.feed_watchdog)
+        release.end()
 
 
 def _judge(config_path: Path, log: Path) -> _JudgedLink:
@@ -183,6 +214,39 @@ def _open_lines(section: Link, codes: LinkCodes, clock: SystemClock, stack: Exit
     if section.kiss is not None:
         add(TncLine(section.kiss, codes.on_board(kiss=True)))
     return lines
+
+
+def self_test() -> None:
+    """Run a link on this machine until it has obeyed one command over UDP. Raises FlightError after 20 s.
+
+    The installation of a release runs this test.
+    """
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="knightcube-")))
+        keys = [folder / "satellite" / "keys", folder / "ground"]
+        shared = [Association(spi, 1, 0, new_key()) for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)]
+        for place in keys:
+            place.mkdir(parents=True)
+            for association in shared:
+                Vault(place).write(association)
+        line = UdpLine("127.0.0.1:0")
+        stack.callback(line.close)
+        settings = StationSettings(1, LONGEST_FRAME, 1e5)
+        control: ControlLine[Sent] = ControlLine(folder / "commands", folder)
+        station = Station(settings, Vault(keys[0]), [line], control, LogFollower(folder), SystemClock())
+        ground = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        ground.settimeout(0.02)
+        packet = directives.pack(Listing(), 0)
+        length = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + len(packet) + CRC_BYTES
+        header = TelecommandHeader(settings.spacecraft, 0, 0).pack(length)
+        frame, _ = Sealer(Vault(keys[1]), COMMAND_SPIS[0], TELECOMMAND_MASK).seal(header, packet)
+        ground.sendto(close_frame(frame), ("127.0.0.1", line.port))
+        for _ in range(1000):
+            station.turn()
+            with suppress(TimeoutError):
+                if station.obeyed and ground.recv(LONGEST_FRAME):
+                    return
+    raise FlightError("self-test: the link obeyed no command over UDP")
 
 
 def _say(text: str) -> None:

@@ -537,6 +537,15 @@ class Station:
         return len(self._filing.status())
 
     @property
+    def obeyed(self) -> int:
+        """Number of commands that were accepted and obeyed."""
+        return self._gate.admitted - self._refused_commands
+
+    def report_problem(self, name: str, text: str) -> None:
+        """Report a problem of the start to the ground under the name of a part of the software."""
+        self._report(Report(0, 0, Stage.FAILED, name, text))
+
+    @property
     def unreported(self) -> int:
         """Number of reports that were never sent because packing failed or the queue was full."""
         return self._unpacked + self._downlink.displaced
