@@ -264,14 +264,25 @@ class ObjectTracking(Section, frozen=True, kw_only=True):
     coast: Positive = 15.0
 
 
+# fmt: off
+PixelName = Literal[
+    "GREY", "Y10", "Y12", "Y14", "Y16", "Y16-BE", "Y10P", "Y12P", "Y10B", "YUYV", "UYVY", "MJPG",
+    "BA81", "GBRG", "GRBG", "RGGB", "BG10", "GB10", "BA10", "RG10", "BG12", "GB12", "BA12", "RG12",
+    "BYR2", "GB16", "GR16", "RG16", "pBAA", "pGAA", "pgAA", "pRAA", "pBCC", "pGCC", "pgCC", "pRCC",
+]
+# fmt: on
+"""Names of the pixel formats of V4L2 that `hal.drivers.pixel_formats` reads."""
+
+
 class V4l2Device(Section, frozen=True, kw_only=True, tag_field="kind", tag="v4l2"):
     """A Video for Linux camera (`hal.drivers.v4l2_camera`).
 
-    The value `gain` is in the camera's own steps, and `stamp_delay` is in s.
+    The value `gain` is in the camera's own steps, and `stamp_delay` is in s. The pixel format is the name
+    that `v4l2-ctl --list-formats` prints. Bayer mosaics and Motion JPEG are converted to grey images.
     """
 
     path: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-camera"
-    pixel_format: Literal["GREY", "Y10", "Y12", "Y16"] = "GREY"
+    pixel_format: PixelName = "GREY"
     gain: int | None = None
     stamp: Literal["told", "start", "end"] = "told"
     stamp_delay: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0

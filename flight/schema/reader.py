@@ -28,16 +28,14 @@ from knightcube.gnc.control.coil_map import LEAST_SPREAD
 Refuse = Callable[[str, str], None]
 """Function that raises the error about a value; its arguments are the value's dotted name and the problem."""
 
-PIXEL_BITS = {
-    "GREY": range(8, 9),
-    "Mono8": range(8, 9),
-    "Y10": range(10, 11),
-    "Mono10": range(10, 11),
-    "Y12": range(12, 13),
-    "Mono12": range(12, 13),
-    "Y16": range(9, 17),
-    "Mono16": range(9, 17),
+_BITS_OF = {
+    range(8, 9): "GREY Mono8 YUYV UYVY MJPG BA81 GBRG GRBG RGGB",
+    range(10, 11): "Y10 Mono10 Y10P Y10B BG10 GB10 BA10 RG10 pBAA pGAA pgAA pRAA",
+    range(12, 13): "Y12 Mono12 Y12P BG12 GB12 BA12 RG12 pBCC pGCC pgCC pRCC",
+    range(14, 15): "Y14",
+    range(9, 17): "Y16 Y16-BE Mono16 BYR2 GB16 GR16 RG16",
 }
+PIXEL_BITS = {name: bits for bits, names in _BITS_OF.items() for name in names.split()}
 """Permitted numbers of bits per pixel of each pixel format."""
 LOOPBACK = IPv4Network("127.0.0.0/8")
 _LARGEST_CORRECTION = 0.3

@@ -29,6 +29,7 @@ class CameraCounts:
         delivered: number of frames returned by `poll` or ready to be returned.
         spoiled: number of frames that the device flagged as damaged.
         short: number of incomplete frames.
+        absurd: number of frames with an impossible time stamp.
         contradictory: number of frames that followed the previous frame sooner than the exposure time allows.
         missed: number of frames that never arrived, from gaps in the frame numbers.
         openings: number of times the camera was opened.
@@ -37,6 +38,7 @@ class CameraCounts:
     delivered: int = 0
     spoiled: int = 0
     short: int = 0
+    absurd: int = 0
     contradictory: int = 0
     missed: int = 0
     openings: int = 0
@@ -86,8 +88,9 @@ class ServedCamera:
         Raises DeviceError if the camera cannot be opened. If `patient` is true, the camera counts as lost
         instead and is opened later.
 
-        The camera is reopened if no frame arrives within `PATIENCE_NS` plus six exposure times after a
-        trigger. A free-running camera may need several exposures until a new exposure time is effective.
+        The camera is reopened if no frame arrives within `PATIENCE_NS` plus six exposure times after the
+        first trigger without an answer. A free-running camera may need several exposures until a new exposure
+        time is effective.
         """
         self.name = device.name
         self.counts = device.counts
@@ -167,7 +170,8 @@ class ServedCamera:
             asked, self._asked = self._asked, None
         if asked is not None:
             exposure_ns, trigger_ns = asked
-            self._deadline_ns = trigger_ns + _MOST_EXPOSURES * exposure_ns + PATIENCE_NS
+            if self._deadline_ns is None:
+                self._deadline_ns = trigger_ns + _MOST_EXPOSURES * exposure_ns + PATIENCE_NS
             self._device.expose(exposure_ns, trigger_ns)
         frame = self._device.collect()
         if frame is None and self._deadline_ns is not None and self._clock.now_ns() > self._deadline_ns:

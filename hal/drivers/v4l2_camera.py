@@ -1,4 +1,4 @@
-"""Driver of free-running monochrome cameras (Video for Linux 2) with manual exposure.
+"""Driver of free-running cameras (Video for Linux 2) with manual exposure.
 
 A free-running camera has no trigger. The camera exposes frames continuously, and the kernel stamps each frame
 with the monotonic time. A trigger selects the first frame whose exposure begins after the trigger. All other
@@ -21,6 +21,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import importlib.util
 import mmap
 import os
 from collections.abc import Iterator
@@ -35,6 +36,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hal.drivers.camera import CameraCounts, FrameNumbers
+from hal.drivers.pixel_formats import PIXEL_FORMATS, PixelCoding, PixelError, fourcc, fourcc_name
 from hal.interfaces.devices import Frame
 from hal.interfaces.errors import CorruptData, DeviceError, NotResponding, OutOfRange, Refused
 from hal.interfaces.wires import Clock
@@ -255,16 +257,6 @@ class Filled:
     flags: int
 
 
-def fourcc(name: str) -> int:
-    """Return the numeric code of a pixel format from its name of up to four letters."""
-    return int.from_bytes(name.ljust(4).encode("ascii"), "little")
-
-
-def fourcc_name(code: int) -> str:
-    """Return the name of a pixel format from its numeric code."""
-    return code.to_bytes(4, "little").decode("ascii", "replace").rstrip()
-
-
 class VideoDevice:
     """Open video device /dev/videoN with its frame buffers."""
 
@@ -379,13 +371,9 @@ class VideoDevice:
         """Return a buffer to the kernel, so that it can be filled again."""
         self._ask(QBUF, _numbered(index))
 
-    def pixels(self, index: int, layout: PixelLayout, kind: np.dtype[Any]) -> npt.NDArray[Any]:
-        """Return a copy (rows, columns) of the pixels in a buffer, without the padding of the rows."""
-        memory = self._maps[index]
-        view: npt.NDArray[Any] = np.ndarray(
-            (layout.rows, layout.columns), kind, memory, strides=(layout.stride, kind.itemsize)
-        )
-        return view.astype(kind.newbyteorder("="), order="C")
+    def data(self, index: int, used_bytes: int) -> npt.NDArray[np.uint8]:
+        """Return a copy (n,) of the used bytes in a buffer."""
+        return np.frombuffer(self._maps[index], np.uint8, used_bytes).copy()
 
     def close(self) -> None:
         """Stop streaming and close the device. Calling `close` again has no effect."""
@@ -415,15 +403,6 @@ def _numbered(index: int) -> Buffer:
     return Buffer(index=index, type=VIDEO_CAPTURE, memory=MMAP)
 
 
-PIXEL_KINDS: dict[str, np.dtype[Any]] = {
-    "GREY": np.dtype("u1"),
-    "Y10": np.dtype("<u2"),
-    "Y12": np.dtype("<u2"),
-    "Y16": np.dtype("<u2"),
-}
-"""Luma-only pixel formats of V4L2, stored in the low bits of 8 or 16 bits per pixel."""
-
-
 class Stamp(Enum):
     """Meaning of the kernel's time stamp: as flagged by the driver, start of exposure, or end of exposure."""
 
@@ -439,7 +418,7 @@ class V4l2Settings:
     Attributes:
         path: path of the device, such as /dev/knightcube-camera.
         columns, rows: size of the image, pixels.
-        pixel_format: name of a pixel format in PIXEL_KINDS.
+        pixel_format: name of a pixel format in PIXEL_FORMATS.
         exposure_ns: usual exposure time, ns; the frame interval is set to the same value.
         gain: gain in the camera's own units, None to leave the gain unchanged.
         stamp: meaning of the time stamps.
@@ -460,9 +439,9 @@ class V4l2Settings:
     buffers: int = 4
 
     @property
-    def kind(self) -> np.dtype[Any]:
-        """Numpy type of a pixel."""
-        return PIXEL_KINDS[self.pixel_format]
+    def pixels(self) -> PixelCoding:
+        """Layout of the pixels."""
+        return PIXEL_FORMATS[self.pixel_format]
 
 
 UVC_STAMPS = Path("/sys/module/uvcvideo/parameters/hwtimestamps")
@@ -472,6 +451,8 @@ _STAMP_AHEAD_NS = 10_000_000
 # tolerance of the frame interval, relative to the exposure time
 _INTERVAL_SLACK = 0.05
 _CONTRADICTIONS = 3
+# consecutive absurd time stamps after which the camera is reopened
+_ABSURD = 8
 
 
 class ExposureTiming:
@@ -485,26 +466,37 @@ class ExposureTiming:
         self._counts = counts
         self._arrival_stamps = False
         self._contradictions = 0
+        self._absurd = 0  # consecutive frames with an absurd time stamp
+        self._stamp_ns = 0  # last valid time stamp
 
     def begin(self, driver: str) -> None:
         """Reset the detection for a newly opened camera; `driver` is the name of its kernel driver."""
         self._arrival_stamps = driver == "uvcvideo" and not _uvc_uses_device_clock()
-        self._contradictions = 0
+        self._contradictions = self._absurd = self._stamp_ns = 0
 
-    def start_of(self, filled: Filled, exposure_ns: int) -> int:
-        """Return the host time (ns) of the start of a frame's exposure.
+    def start_of(self, filled: Filled, exposure_ns: int) -> int | None:
+        """Return the host time (ns) of the start of a frame's exposure, or None for an absurd time stamp.
 
-        Raises CorruptData if the time stamp is not from the monotonic clock.
+        A time stamp must not be in the future, nor earlier than that of the previous frame. Raises
+        CorruptData after several consecutive absurd time stamps, and for time stamps of another clock.
         """
         if filled.flags & STAMP_MASK != STAMP_MONOTONIC:
             raise CorruptData(self._name, "the time stamps of its frames are not from the monotonic clock")
         ahead_ns = filled.stamp_ns - self._clock.now_ns()
-        if ahead_ns > _STAMP_AHEAD_NS:
-            raise CorruptData(
-                self._name,
-                f"a frame is stamped {ahead_ns * 1e-9:.3f} s ahead of the monotonic clock: "
-                "has uvcvideo been loaded with clock=CLOCK_REALTIME?",
-            )
+        if ahead_ns > _STAMP_AHEAD_NS or filled.stamp_ns < self._stamp_ns:
+            self._counts.absurd += 1
+            self._absurd += 1
+            if self._absurd >= _ABSURD:
+                # A clock that has stepped back must not block the camera after it is opened again.
+                self._absurd = self._stamp_ns = 0
+                raise CorruptData(
+                    self._name,
+                    f"{_ABSURD} frames in a row have absurd time stamps, the last one "
+                    f"{ahead_ns * 1e-9:.3f} s ahead of the monotonic clock: has uvcvideo been "
+                    "loaded with clock=CLOCK_REALTIME?",
+                )
+            return None
+        self._absurd, self._stamp_ns = 0, filled.stamp_ns
         flagged_start = filled.flags & STAMP_SOURCE_MASK == STAMP_START_OF_EXPOSURE
         stamp = self._settings.stamp
         at_start = stamp is Stamp.START or (
@@ -579,6 +571,8 @@ def identity(name: str, device: VideoDevice) -> tuple[str, str]:
 def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelLayout:
     """Set the image format. Raises Refused or CorruptData if the camera does not support the format."""
     name = settings.path
+    if settings.pixels.is_compressed and importlib.util.find_spec("PIL") is None:
+        raise Refused(name, "Motion JPEG needs Pillow: pip install 'knightcube-flight[images]'")
     layout = device.set_format(settings.columns, settings.rows, settings.pixel_format)
     if layout.fourcc != settings.pixel_format:
         offered = ", ".join(device.formats()) or "none"
@@ -589,7 +583,7 @@ def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelL
             f"{card} gives {layout.columns} x {layout.rows} pixels, not {settings.columns} x "
             f"{settings.rows}: `v4l2-ctl --list-formats-ext` lists its sizes",
         )
-    if layout.stride < layout.columns * settings.kind.itemsize:
+    if layout.stride < settings.pixels.row_bytes(layout.columns):
         raise CorruptData(name, f"{card} reports rows of {layout.stride} bytes for {layout.columns} pixels")
     return layout
 
@@ -642,7 +636,7 @@ class V4l2Camera:
         self.counts = CameraCounts()
         self._settings = settings
         self._clock = clock
-        self._kind = settings.kind
+        self._pixels = settings.pixels
         self._timing = ExposureTiming(settings, clock, self.counts)
         self._device: VideoDevice | None = None
         self._layout = PixelLayout(0, 0, "", 0)
@@ -650,7 +644,7 @@ class V4l2Camera:
         self._asked_steps = 0
         self._exposure_ns = 0  # exposure time reported by the camera
         self._numbers = FrameNumbers(_SEQUENCE_MODULUS)
-        self._before: tuple[int, int] | None = None  # number and time stamp of the last frame
+        self._before: tuple[int, int | None] | None = None  # number and valid time stamp of the last frame
         self._trigger_ns: int | None = None
         self._changed_ns = 0
         self._to_settle = 0
@@ -753,25 +747,45 @@ class V4l2Camera:
     def _judge(self, device: VideoDevice, filled: Filled) -> Frame | None:
         """Return the frame in a buffer if it is the selected frame, otherwise None."""
         number = self._numbers.number(filled.sequence)
-        before, self._before = self._before, (number, filled.stamp_ns)
+        before = self._before
         if before is not None:
             self.counts.missed += max(0, number - before[0] - 1)
-        layout = self._layout
-        if filled.flags & FLAG_ERROR:
-            self.counts.spoiled += 1
+        start_ns = self._start_of(filled)
+        self._before = number, None if start_ns is None else filled.stamp_ns
+        if start_ns is None:
             return None
-        if filled.used_bytes < layout.stride * (layout.rows - 1) + layout.columns * self._kind.itemsize:
-            self.counts.short += 1
-            return None
-        start_ns = self._timing.start_of(filled, self._exposure_ns)
         if start_ns >= self._changed_ns and self._to_settle > 0:
             self._to_settle -= 1
             return None
         if self._trigger_ns is None or start_ns < max(self._trigger_ns, self._changed_ns):
             return None
-        if before is not None and number == before[0] + 1:
+        if before is not None and before[1] is not None and number == before[0] + 1:
             interval_ns = filled.stamp_ns - before[1]
             if self._timing.contradicts(interval_ns, self._exposure_ns):
                 return None
-        pixels = device.pixels(filled.index, layout, self._kind)
+        pixels = self._pixels_of(device, filled)
+        if pixels is None:
+            return None
         return Frame(number, start_ns, self._exposure_ns, self._clock.now_ns(), pixels)
+
+    def _start_of(self, filled: Filled) -> int | None:
+        """Return the start (ns) of a frame's exposure, or None for a damaged or absurdly timed frame."""
+        layout, pixels = self._layout, self._pixels
+        if filled.flags & FLAG_ERROR:
+            self.counts.spoiled += 1
+            return None
+        least = layout.stride * (layout.rows - 1) + pixels.row_bytes(layout.columns)
+        if filled.used_bytes < (1 if pixels.is_compressed else least):
+            self.counts.short += 1
+            return None
+        return self._timing.start_of(filled, self._exposure_ns)
+
+    def _pixels_of(self, device: VideoDevice, filled: Filled) -> npt.NDArray[Any] | None:
+        """Return the image in a buffer, or None if the data are damaged."""
+        layout = self._layout
+        data = device.data(filled.index, filled.used_bytes)
+        try:
+            return self._pixels.image(data, layout.columns, layout.rows, layout.stride)
+        except PixelError:
+            self.counts.spoiled += 1
+            return None

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from hal.drivers import v4l2_camera as v4l2
-from hal.drivers.v4l2_camera import fourcc
+from hal.drivers.pixel_formats import PIXEL_FORMATS, fourcc
 
 MILLISECOND_NS = 1_000_000
 
@@ -50,6 +50,8 @@ class IoctlCamera:
         frozen: the sequence number stands still.
         belies_exposure: frames come at `shortest_ns` however long they should be exposed.
         stopped: no more frames come.
+        absurd: stamps of single frames, by their numbers.
+        raw: what each frame holds instead of a pattern, and how many bytes of it are used.
         held_ns: by how much frames come late.
         draws: frames have a pattern, each another; else what lay there.
     """
@@ -71,6 +73,8 @@ class IoctlCamera:
         self.spoil: set[int] = set()
         self.shorten: set[int] = set()
         self.frozen = self.belies_exposure = self.stopped = False
+        self.absurd: dict[int, int] = {}
+        self.raw: bytes | None = None
         self.held_ns = 0
         self.first_sequence = 0
         self.knobs = {
@@ -135,11 +139,11 @@ class IoctlCamera:
 
     @property
     def _row_bytes(self) -> int:
-        return self.sizes[self._kind][0] * (1 if self._kind == "GREY" else 2) + self.padding
+        return PIXEL_FORMATS[self._kind].row_bytes(self.sizes[self._kind][0]) + self.padding
 
     @property
     def _image_bytes(self) -> int:
-        return self._row_bytes * self.sizes[self._kind][1]
+        return self._row_bytes * self.sizes[self._kind][1] or 65536
 
     @property
     def _slot_bytes(self) -> int:
@@ -249,10 +253,13 @@ class IoctlCamera:
         stamp_ns = start_ns if self.stamp_source == v4l2.STAMP_START_OF_EXPOSURE else end_ns
         if self.stamps_packets:
             stamp_ns = start_ns + exposure_ns
-        stamp_ns += self.stamp_offset_ns
+        stamp_ns = self.absurd.get(number, stamp_ns + self.stamp_offset_ns)
         flags = self.clock_flag | self.stamp_source | (v4l2.FLAG_ERROR if number in self.spoil else 0)
         used = self._image_bytes // 2 if number in self.shorten else self._image_bytes
-        if self.draws:
+        if self.raw is not None:
+            used = len(self.raw)
+            os.pwrite(self._memory, self.raw, index * self._slot_bytes)
+        elif self.draws:
             self._draw(index, next(self.level))
         buffer = v4l2.Buffer(
             index=index, type=v4l2.VIDEO_CAPTURE, bytesused=used, flags=flags, sequence=number

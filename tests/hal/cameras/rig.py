@@ -27,6 +27,7 @@ from tests.manual_clock import ManualClock
 
 EXPOSURE_NS = 40_000_000
 STEP_NS = 2_000_000
+SETTLED_NS = 400_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +120,13 @@ def video_rig(kernel: IoctlCamera, clock: ManualClock, **changes: object) -> Vid
     settings = V4l2Settings(**(wanted | changes))  # type: ignore[arg-type]  # the values are the tests' own
     camera = ServedCamera(V4l2Camera(settings, clock), clock)
     return VideoRig(Rig(camera, clock, (48, 64), kernel.unplug), camera, kernel, clock)
+
+
+def settled(kernel: IoctlCamera, clock: ManualClock, **changes: object) -> VideoRig:
+    """Return a camera whose frames all have the exposure that was set."""
+    made = video_rig(kernel, clock, **changes)
+    made.rig.wait(SETTLED_NS)
+    return made
 
 
 def require_aravis() -> None:

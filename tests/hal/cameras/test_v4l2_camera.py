@@ -13,19 +13,11 @@ from hal.drivers import v4l2_camera as v4l2
 from hal.drivers.v4l2_camera import Stamp, VideoDevice
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
 from tests.hal.cameras.ioctl_camera import IoctlCamera, Knob
-from tests.hal.cameras.rig import EXPOSURE_NS, VideoRig, video_rig
+from tests.hal.cameras.rig import EXPOSURE_NS, settled, video_rig
 from tests.manual_clock import ManualClock
 
 SECOND_NS = 1_000_000_000
-SETTLED_NS = 400_000_000
 MICROSECOND_NS = 1_000
-
-
-def settled(kernel: IoctlCamera, clock: ManualClock, **changes: object) -> VideoRig:
-    """Return a camera whose frames all have the exposure that was set."""
-    made = video_rig(kernel, clock, **changes)
-    made.rig.wait(SETTLED_NS)
-    return made
 
 
 def test_the_first_whole_exposure_after_the_trigger_is_taken(kernel: IoctlCamera, clock: ManualClock) -> None:

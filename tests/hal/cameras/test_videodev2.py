@@ -7,11 +7,14 @@ import platform
 import shutil
 import subprocess
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from flight.schema.devices import PixelName
+from flight.schema.reader import PIXEL_BITS
 from hal.drivers import v4l2_camera as v4l2
-from hal.drivers.v4l2_camera import fourcc, fourcc_name
+from hal.drivers.pixel_formats import PIXEL_FORMATS, fourcc, fourcc_name
 
 # Of linux/videodev2.h on x86-64.
 CODES = {
@@ -51,6 +54,16 @@ MEMBERS = [
     ("v4l2_format", v4l2.Format, ("fmt",)),
     ("v4l2_queryctrl", v4l2.QueryControl, ("minimum", "maximum", "step", "flags")),
 ]
+BAYER = {
+    "8": "BA81 GBRG GRBG RGGB",
+    "10": "BG10 GB10 BA10 RG10",
+    "12": "BG12 GB12 BA12 RG12",
+    "16": "BYR2 GB16 GR16 RG16",
+    "10P": "pBAA pGAA pgAA pRAA",
+    "12P": "pBCC pGCC pgCC pRCC",
+}
+"""Names of the Bayer formats with the orders BGGR, GBRG, GRBG and RGGB, by the end of the kernel's names."""
+MONO = {"Mono8", "Mono10", "Mono12", "Mono16"}
 CONSTANTS = {
     "V4L2_BUF_FLAG_ERROR": v4l2.FLAG_ERROR,
     "V4L2_BUF_FLAG_TIMESTAMP_MASK": v4l2.STAMP_MASK,
@@ -71,10 +84,16 @@ CONSTANTS = {
     "V4L2_CID_EXPOSURE_AUTO": v4l2.EXPOSURE_AUTO,
     "V4L2_EXPOSURE_MANUAL": v4l2.EXPOSURE_MANUAL,
     "V4L2_CID_EXPOSURE_ABSOLUTE": v4l2.EXPOSURE_ABSOLUTE,
-    "V4L2_PIX_FMT_GREY": fourcc("GREY"),
-    "V4L2_PIX_FMT_Y10": fourcc("Y10"),
-    "V4L2_PIX_FMT_Y12": fourcc("Y12"),
-    "V4L2_PIX_FMT_Y16": fourcc("Y16"),
+    **{f"V4L2_PIX_FMT_{name}": fourcc(name) for name in ("GREY", "Y10", "Y12", "Y14", "Y16", "Y10P", "YUYV")},
+    "V4L2_PIX_FMT_UYVY": fourcc("UYVY"),
+    "V4L2_PIX_FMT_Y16_BE": fourcc("Y16-BE"),
+    "V4L2_PIX_FMT_Y10BPACK": fourcc("Y10B"),
+    "V4L2_PIX_FMT_MJPEG": fourcc("MJPG"),
+    **{
+        f"V4L2_PIX_FMT_S{order}{depth}": fourcc(name)
+        for depth, names in BAYER.items()
+        for order, name in zip(("BGGR", "GBRG", "GRBG", "RGGB"), names.split(), strict=True)
+    },
 }
 
 
@@ -88,7 +107,10 @@ def test_requests_are_the_published_ones() -> None:
 
 
 def test_names_of_pixel_formats_survive_their_code() -> None:
-    assert [fourcc_name(fourcc(name)) for name in ("GREY", "Y10", "Y16")] == ["GREY", "Y10", "Y16"]
+    assert [fourcc_name(fourcc(name)) for name in PIXEL_FORMATS] == list(PIXEL_FORMATS)
+    assert set(PIXEL_FORMATS) == set(get_args(PixelName)) == {*PIXEL_BITS} - MONO
+    for name, coding in PIXEL_FORMATS.items():
+        assert coding.bits in PIXEL_BITS[name]
 
 
 def test_all_agree_with_this_machines_own_header(tmp_path: Path) -> None:

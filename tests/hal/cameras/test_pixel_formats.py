@@ -1,0 +1,224 @@
+"""Pixel formats as the kernel's documentation lays them out, byte by byte."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from hal.drivers.pixel_formats import PIXEL_FORMATS, PixelError
+from hal.interfaces.errors import NotResponding, Refused
+from tests.hal.cameras.ioctl_camera import IoctlCamera
+from tests.hal.cameras.rig import settled, video_rig
+from tests.manual_clock import ManualClock
+
+BAYER = [name for name, coding in PIXEL_FORMATS.items() if coding.is_bayer]
+ORDERS = {"BA81": "BGGR", "GBRG": "GBRG", "GRBG": "GRBG", "RGGB": "RGGB"}
+
+
+def read(name: str, data: bytes, columns: int, rows: int = 1, stride: int = 0) -> npt.NDArray[Any]:
+    coding = PIXEL_FORMATS[name]
+    found: npt.NDArray[Any] = coding.image(
+        np.frombuffer(data, np.uint8), columns, rows, stride or coding.row_bytes(columns)
+    )
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "pixels"),
+    [
+        # Y'00[9:2], Y'01[9:2], Y'02[9:2], Y'03[9:2], Y'03[1:0] Y'02[1:0] Y'01[1:0] Y'00[1:0]
+        ("Y10P", "ff 00 80 01 e4", [0x3FC, 0x001, 0x202, 0x007]),
+        # Y'00[11:4], Y'01[11:4], Y'01[3:0] Y'00[3:0]
+        ("Y12P", "ab 12 3c", [0xABC, 0x123]),
+        # Y'00[9:2], Y'00[1:0] Y'01[9:4], Y'01[3:0] Y'02[9:6], Y'02[5:0] Y'03[9:8], Y'03[7:0]
+        ("Y10B", "ff c0 00 0a 01", [0x3FF, 0x000, 0x002, 0x201]),
+        # Y'00[7:0], Y'00[9:8] in the low bits of the second byte
+        ("Y10", "34 02 ff 03", [0x234, 0x3FF]),
+        ("Y12", "bc 0a ff 0f", [0xABC, 0xFFF]),
+        ("Y14", "ff 3f 01 00", [0x3FFF, 1]),
+        ("Y16", "34 12 ff ff", [0x1234, 0xFFFF]),
+        # Y'00[15:8], Y'00[7:0]
+        ("Y16-BE", "12 34 ff fe", [0x1234, 0xFFFE]),
+        ("GREY", "00 7f ff", [0, 127, 255]),
+        # Y'0, Cb0, Y'1, Cr0
+        ("YUYV", "10 80 20 81 30 82 40 83", [0x10, 0x20, 0x30, 0x40]),
+        # Cb0, Y'0, Cr0, Y'1
+        ("UYVY", "80 10 81 20", [0x10, 0x20]),
+    ],
+)
+def test_the_bytes_of_the_documentation_are_the_pixels(name: str, data: str, pixels: list[int]) -> None:
+    assert read(name, bytes.fromhex(data), len(pixels)).tolist() == [pixels]
+
+
+@given(st.integers(1, 40), st.integers(1, 6), st.integers(0, 9), st.integers(0, 2**32 - 1))
+def test_packed_pixels_are_read_again_with_padded_rows(
+    columns: int, rows: int, padding: int, seed: int
+) -> None:
+    image = np.random.default_rng(seed).integers(0, 1 << 10, (rows, columns))
+    wide = np.zeros((rows, -(-columns // 4) * 4), dtype=int)
+    wide[:, :columns] = image
+    lines = {"Y10P": b"", "Y10B": b"", "Y12P": b""}
+    for row in wide.tolist():
+        end = b"\xaa" * padding
+        for a, b, c, d in zip(*[iter(row)] * 4, strict=True):
+            low = a & 3 | (b & 3) << 2 | (c & 3) << 4 | (d & 3) << 6
+            lines["Y10P"] += bytes([a >> 2, b >> 2, c >> 2, d >> 2, low])
+            lines["Y10B"] += (a << 30 | b << 20 | c << 10 | d).to_bytes(5, "big")
+        pairs = list(zip(*[iter(row[: -(-columns // 2) * 2])] * 2, strict=True))
+        lines["Y12P"] += b"".join(bytes([a >> 4, b >> 4, a & 15 | (b & 15) << 4]) for a, b in pairs)
+        lines = {name: data + end for name, data in lines.items()}
+    for name, data in lines.items():
+        stride = PIXEL_FORMATS[name].row_bytes(columns) + padding
+        found = read(name, data, columns, rows, stride)
+        assert found.dtype == np.uint16
+        assert np.array_equal(found, image)
+
+
+def mosaic(order: str, colours: dict[str, int], shape: tuple[int, int]) -> npt.NDArray[np.int_]:
+    tile = np.array([[colours[order[0]], colours[order[1]]], [colours[order[2]], colours[order[3]]]])
+    return np.tile(tile, (shape[0] // 2, shape[1] // 2))
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_each_order_of_a_mosaic_gives_the_same_grey_to_its_edges(name: str) -> None:
+    raw = mosaic(ORDERS[name], {"R": 40, "G": 200, "B": 120}, (8, 12)).astype(np.uint8)
+    grey = read(name, raw.tobytes(), 12, 8)
+    assert grey.dtype == np.uint8
+    assert np.unique(grey).tolist() == [(40 + 2 * 200 + 120) // 4]
+
+
+@pytest.mark.parametrize("name", BAYER)
+def test_every_depth_of_a_mosaic_keeps_its_range(name: str) -> None:
+    coding = PIXEL_FORMATS[name]
+    data = b"\xff" * (coding.row_bytes(8) * 4)
+    if coding.packing == "<u2":
+        data = ((1 << coding.bits) - 1).to_bytes(2, "little") * 32
+    assert np.unique(read(name, data, 8, 4)).tolist() == [(1 << coding.bits) - 1]
+
+
+def test_a_red_star_on_a_mosaic_stays_where_it_is() -> None:
+    y, x = np.mgrid[:32, :32]
+    sensitive = mosaic("RGGB", {"R": 100, "G": 35, "B": 10}, (32, 32)) / 100.0
+    for place in ((15.0, 16.0), (15.4, 16.7), (16.2, 15.1)):
+        star = 40_000.0 * np.exp(-0.5 * ((y - place[0]) ** 2 + (x - place[1]) ** 2) / 1.5**2)
+        raw = np.round(star * sensitive).astype("<u2")
+        grey = read("RG16", raw.tobytes(), 32, 32).astype(float)
+        found = np.array([(grey * y).sum(), (grey * x).sum()]) / grey.sum()
+        assert np.abs(found - place).max() < 0.05
+
+
+def jpeg(image: npt.NDArray[np.uint8], mode: str = "L") -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(image).convert(mode).save(file, "JPEG", quality=95)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB"])
+def test_motion_jpeg_is_decoded_to_its_luma(mode: str) -> None:
+    y, x = np.mgrid[:48, :64]
+    image = (x * 2 + y).astype(np.uint8)
+    found = read("MJPG", jpeg(image, mode), 64, 48)
+    assert found.dtype == np.uint8
+    assert np.abs(found.astype(int) - image).max() <= 4
+
+
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (b"", "damaged JPEG"),
+        (b"\xff\xd8\xff" + bytes(100), "damaged JPEG"),
+        (jpeg(np.zeros((48, 64), np.uint8))[:-200], "damaged JPEG"),
+        (jpeg(np.zeros((24, 32), np.uint8)), "a JPEG of 32 x 24 pixels, not 64 x 48"),
+    ],
+)
+def test_a_damaged_jpeg_is_named(data: bytes, problem: str) -> None:
+    with pytest.raises(PixelError, match=problem):
+        read("MJPG", data, 64, 48)
+
+
+@given(st.binary(max_size=600), st.sampled_from([*PIXEL_FORMATS]), st.integers(1, 20), st.integers(1, 20))
+def test_any_bytes_are_an_image_or_an_error(data: bytes, name: str, columns: int, rows: int) -> None:
+    try:
+        found = read(name, data, columns, rows)
+    except PixelError:
+        return
+    assert found.shape == (rows, columns)
+
+
+def test_frames_of_a_packed_camera_arrive_as_pixels(kernel: IoctlCamera, clock: ManualClock) -> None:
+    kernel.sizes = {"Y10P": (64, 48)}
+    kernel.raw = bytes([0x40, 0x80, 0xC0, 0xFF, 0b11_10_01_00] * 16 * 48)
+    video = settled(kernel, clock, pixel_format="Y10P")
+    pixels = video.rig.next_frame().pixels
+    assert pixels.shape == (48, 64)
+    assert pixels[7, 8:12].tolist() == [0x100, 0x201, 0x302, 0x3FF]
+    video.camera.close()
+
+
+def test_frames_of_a_jpeg_camera_arrive_and_damaged_ones_are_counted(
+    kernel: IoctlCamera, clock: ManualClock
+) -> None:
+    kernel.sizes = {"MJPG": (64, 48)}
+    kernel.raw = jpeg(np.full((48, 64), 77, np.uint8))
+    video = settled(kernel, clock, pixel_format="MJPG")
+    assert int(video.rig.next_frame().pixels[20, 20]) == 77
+    kernel.raw = kernel.raw[:200]
+    video.camera.trigger(40_000_000)
+    assert video.rig.frame_within(200_000_000) is None
+    assert video.camera.counts.spoiled > 0
+    video.camera.close()
+
+
+def test_motion_jpeg_without_pillow_is_refused_with_its_cure(
+    kernel: IoctlCamera, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel.sizes = {"MJPG": (64, 48)}
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(Refused, match=r"Motion JPEG needs Pillow: pip install 'knightcube-flight\[images\]'"):
+        video_rig(kernel, clock, pixel_format="MJPG")
+
+
+@pytest.mark.parametrize("absurd_ns", [10**18, 0, 1, 86_400 * 10**9])
+def test_a_frame_with_an_absurd_stamp_costs_that_frame_alone(
+    kernel: IoctlCamera, clock: ManualClock, absurd_ns: int
+) -> None:
+    video = settled(kernel, clock)
+    last = max(kernel.exposures)
+    kernel.absurd = {last + 2: absurd_ns}
+    video.rig.wait(60_000_000)
+    first = video.rig.next_frame()
+    assert first.sequence not in kernel.absurd
+    assert abs(first.exposure_start_ns - kernel.exposures[first.sequence][0]) < 1000
+    video.rig.wait(200_000_000)
+    counts = video.camera.counts
+    assert (counts.absurd, counts.contradictory, counts.openings, counts.missed) == (1, 0, 1, 0)
+    video.camera.close()
+
+
+def test_a_stall_is_measured_from_the_first_unanswered_trigger(
+    kernel: IoctlCamera, clock: ManualClock
+) -> None:
+    video = settled(kernel, clock)
+    assert video.rig.next_frame() is not None
+    kernel.stopped = True
+    begin_ns = clock.now_ns()
+
+    def trigger_every_second() -> None:
+        while clock.now_ns() - begin_ns < 20_000_000_000:
+            video.camera.trigger(40_000_000)
+            video.rig.wait(1_000_000_000)
+
+    with pytest.raises(NotResponding, match="no frame arrived after the trigger"):
+        trigger_every_second()
+    assert clock.now_ns() - begin_ns < 5_000_000_000
+    kernel.stopped = False
+    video.rig.wait(2_500_000_000)
+    assert video.rig.next_frame() is not None
+    video.camera.close()
