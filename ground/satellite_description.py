@@ -300,8 +300,8 @@ def _coil_lines(satellite: Satellite) -> list[Line]:
 def _current_lines(satellite: Satellite) -> list[Line]:
     """Return the simulated errors of the currents, in proportion to those of the configuration `orbit`."""
     least = min(coil.current_limit for coil in satellite.coils)
-    fields = np.zeros((3, 3))
-    for index, coil in enumerate(satellite.coils[:3]):
+    fields = np.zeros((3, max(3, len(satellite.coils))))
+    for index, coil in enumerate(satellite.coils):
         fields[:, index] = np.array(coil.axis) * _STRAY_FIELD / coil.current_limit
     rows = ", ".join(f"[{', '.join(f'{value:.2g}' for value in row)}]" for row in fields)
     return [

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flight.schema.devices import Camera, UnitCalibration, WideCamera
+from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.drivers.ads1115 import StringWiring
@@ -194,6 +195,11 @@ def assemble_coils(
 ) -> CoilHardware:
     """Build the coil hardware; the function `now_ns` returns the simulation time."""
     coils, truth = config.coils, section.truth
+    if truth.resistance is not None and len(truth.resistance) != len(coils.slots):
+        problem = (
+            f"has {len(truth.resistance)} values: give one value for each of the {len(coils.slots)} coils"
+        )
+        raise ConfigError("simulation.truth.resistance", problem)
     pwm = EmulatedPca9685(coils.address, now_ns)
     wired = wirings(coils.channels, truth.resistance or coils.resistance, coils.signs, coils.limits)
     supply = truth.supply_voltage or coils.supply_voltage
@@ -206,6 +212,17 @@ def assemble_coils(
         monitor = EmulatedIna219(fitted.address, now_ns, circuit.mean_supply, fitted.shunt)
     bus = EmulatedI2cBus([pwm] if monitor is None else [pwm, monitor])
     return CoilHardware(bus, pwm, monitor, circuit)
+
+
+def _coil_field(config: Config, section: Simulation) -> FloatArray:
+    """Return the matrix (3, n), T/A, from the coil currents to their field at the magnetometer."""
+    count = len(config.coils.slots)
+    rows = section.coil_field or ((0.0,) * count,) * 3
+    for row in rows:
+        if len(row) not in {len(config.coils.windings), count}:
+            problem = f"has {len(row)} values in a row: give one value for each of the {count} coils"
+            raise ConfigError("simulation.coil_field", problem)
+    return np.array([(*row, 0.0, 0.0)[:count] for row in rows])
 
 
 def _unit(
@@ -221,7 +238,7 @@ def _unit(
     errors, known = description_errors(config, section), config.inertial_unit.calibration
     gyro_matrix, field_matrix = np.array(known.gyro_matrix), np.array(known.field_matrix)
     gyro_matrix, offset = gyro_matrix @ errors.gyro, np.array(known.field_bias)
-    coil_field, bias = np.array(section.coil_field), np.array(section.imu.field_bias) + errors.field_bias
+    coil_field, bias = _coil_field(config, section), np.array(section.imu.field_bias) + errors.field_bias
     sense = world.motion
     if coil_field.any() or bias.any() or errors is not NO_ERRORS or known != UnitCalibration():
 

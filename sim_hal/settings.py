@@ -15,8 +15,10 @@ from msgspec import Meta
 
 from flight.schema.devices import Winding
 from flight.schema.values import Inertia, NotNegative, Positive, Quaternion, Section
+from hal.interfaces.devices import MOST_COILS
 
 Vector = tuple[float, float, float]
+PerCoil = Annotated[tuple[float, ...], Meta(min_length=1, max_length=MOST_COILS)]
 Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
 ExclusionAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 
@@ -148,11 +150,14 @@ class Latency(Section, frozen=True, kw_only=True):
 
 
 class Truth(Section, frozen=True, kw_only=True):
-    """True constants of the world that differ from those of the flight configuration."""
+    """True constants of the world that differ from those of the flight configuration.
+
+    `resistance` has one value (ohm) for each coil.
+    """
 
     inertia: Positive | None = None
     field: Positive | None = None
-    resistance: tuple[Positive, Positive, Positive] | None = None
+    resistance: Annotated[tuple[Positive, ...], Meta(min_length=1, max_length=MOST_COILS)] | None = None
     supply_voltage: Positive | None = None
 
 
@@ -264,7 +269,8 @@ class FaultEntry(Section, frozen=True, kw_only=True):
 class Simulation(Section, frozen=True, kw_only=True):
     """The section `simulation`; `world` is a key of `sim_hal.worlds.world.WORLDS` or `module:factory`.
 
-    `coil_field` (3, 3), T/A, maps the coil currents to the coils' field at the magnetometer in body axes.
+    The three rows of `coil_field`, T/A, map the coil currents to the coils' field at the magnetometer in body
+    axes. A row has one value for each coil.
     """
 
     seed: Annotated[int, Meta(ge=0)] = 1
@@ -273,7 +279,7 @@ class Simulation(Section, frozen=True, kw_only=True):
     release: Release | None = None
     thread: Thread = Thread()
     current_noise: NotNegative = 0.0
-    coil_field: tuple[Vector, Vector, Vector] = ((0.0, 0.0, 0.0),) * 3
+    coil_field: tuple[PerCoil, PerCoil, PerCoil] | None = None
     imu: ImuNoise = ImuNoise()
     sky: SkySection = SkySection()
     objects: Annotated[tuple[SkyObject, ...], Meta(max_length=32)] = ()

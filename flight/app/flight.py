@@ -465,8 +465,8 @@ def _tasks(
         times = horizon_camera_settings(config.wide_cameras)
         use = body.estimation.horizon_cameras
         horizon_cameras = HorizonCameraTask(devices.horizon_cameras, use, times, services)
-    limits = np.array(config.coils.limits)
-    coils = CoilDriveSettings(body.control.dipoles, limits, body.control.free_axis)
+    limits, resistance = np.array(config.coils.limits), np.array(config.coils.resistance)
+    coils = CoilDriveSettings(body.control.dipoles, limits, body.control.free_axis, resistance)
     drive = CoilDrive(devices.coils, devices.power, body.estimation.coil_monitor, coils, services)
     steering = Steering(body, drive, services)
     low_rate, low_for = config.detumble.low_rate, config.detumble.low_for

@@ -20,7 +20,7 @@ from flight.loop.facts import Services
 from flight.loop.state import Learned, learned_of
 from flight.schema.sections import Config
 from hal.interfaces.devices import CoilState, Frame, GpsReading, ImuReading, StringReading
-from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.gnc.estimation.estimate import Estimate, Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, Measurement
@@ -358,12 +358,19 @@ class BodyEstimation(Protocol):
         return learned_of(estimate)
 
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Accept that the coil monitor multiplied the described dipoles of the coils by `change` (3,).
+        """Accept that the coil monitor multiplied the described dipoles of the coils by `change` (n,).
 
-        The relative standard deviations of the corrected dipoles are `deviations` (3,). The default does
+        The relative standard deviations of the corrected dipoles are `deviations` (n,). The default does
         nothing. It is for a filter that does not estimate the coils separately.
         """
         del change, deviations
+
+    def coils_used(self, used: BoolArray) -> None:
+        """Accept that the coils `used` (n,) are in use now, while the others are isolated.
+
+        The default does nothing. It is for a body whose estimation does not depend on the allocation.
+        """
+        del used
 
     def knowledge(self) -> Knowledge:
         """Return how well the attitude is known now."""

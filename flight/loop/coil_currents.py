@@ -79,7 +79,7 @@ class Bounds:
         noise: error bound (A) of the current monitor.
     """
 
-    full_current: tuple[float, float, float]
+    full_current: tuple[float, ...]
     uncertainty: float
     gain: float
     noise: float
@@ -111,7 +111,7 @@ An error of 7 % that is common to all readings is included in the gain error.
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """A reading (A) of the supply current, and the current (3, v), A, predicted for each axis and variant.
+    """A reading (A) of the supply current, and the current (n, v), A, predicted for each axis and variant.
 
     The prediction consists of the mean over the time window (`mean`), its error bound without chopping
     (`slack`) and the error bound due to chopping (`chopped`). A reading that is `clipped` is a lower bound of
@@ -128,7 +128,7 @@ class Predicted:
 def predict(
     current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling, clipped: bool = False
 ) -> Predicted:
-    """Predict the current of each variant for the commands (k, 3), A, in the time window of a reading."""
+    """Predict the current of each variant for the commands (k, n), A, in the time window of a reading."""
     full = np.array(bounds.full_current)[:, None]
     drawn = supply_currents(commands.T, full)
     count = len(commands)
@@ -163,7 +163,7 @@ def fits(
     fault: CoilFault | None = None,
 ) -> bool:
     """Return whether `fault` on `axis`, together with the known faults, explains nearly all readings."""
-    variants: list[CoilFault | None] = [known.get(number) for number in range(3)]
+    variants: list[CoilFault | None] = [known.get(number) for number in range(len(bounds.full_current))]
     if axis is not None:
         variants[axis] = fault
     current = np.array([one.current for one in evidence])

@@ -5,7 +5,7 @@ In each cycle, the loop passes the commands (`commanded`, `interrupted`), the sa
 reads the results: `verdicts`, `available`, `resting`, `braked`, `at_rest`, `probe`, `suspicion` and
 `monitor_doubted`. No call waits.
 
-The current monitor measures the sum of |I| over the three H-bridges. The current monitor cannot detect a
+The current monitor measures the sum of |I| over all H-bridges. The current monitor cannot detect a
 reversed coil, and it detects an open coil only while that coil is driven. Every reading is compared with the
 prediction of each hypothesis (`flight.loop.coil_currents`). A hypothesis is that all coils are healthy, or
 that one axis is open, shorted, or has one leg of an input stuck. A verdict is given when the hypothesis
@@ -47,7 +47,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
@@ -65,7 +64,6 @@ from flight.loop.coil_currents import (
     predict,
 )
 from flight.loop.coil_response import (
-    AXES,
     LARGEST_GAIN,
     LONGEST_REST_NS,
     CoilCommands,
@@ -77,7 +75,7 @@ from flight.loop.coil_response import (
     ResponseSettings,
 )
 from flight.loop.coil_self_test import SelfTest, SelfTestSettings
-from hal.interfaces.devices import NO_AXES, Axes, PowerReading
+from hal.interfaces.devices import COIL_NAMES, NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import BoolArray, FloatArray
 
 _SURE = 2
@@ -102,7 +100,7 @@ class StuckLeg:
     """Searches for an output leg that is stuck high, by zero commands and braking of the bridges.
 
     Attributes:
-        brake: flags of the bridges that must be braked now.
+        brake: indices of the bridges that must be braked now.
         rest: whether all currents must be commanded to zero now.
         suspicion: reason for the search; empty if there is no search.
     """
@@ -202,7 +200,7 @@ class StuckLeg:
             list(supplied.at_rest),
             tuple(supplied.at_rest),
         )
-        self.brake, self.rest = _only(supplied.at_rest), True
+        self.brake, self.rest = frozenset(supplied.at_rest), True
         self._await()
 
     def _put_to_rest(self, supplied: Supplied) -> None:
@@ -223,7 +221,7 @@ class StuckLeg:
             self.reset()
             return
         self._step = _Step.ONE_RELEASED
-        self.brake = _only([axis for axis in self._braked if axis != self._left[0]])
+        self.brake = frozenset(self._braked) - {self._left[0]}
         self._await()
 
     def _give_up(self) -> None:
@@ -238,10 +236,6 @@ class StuckLeg:
 def _reason(supplied: Supplied) -> str:
     due = f"{1e3 * max(supplied.least, 0.0):.0f} to {1e3 * supplied.most:.0f} mA"
     return f"supply current {1e3 * supplied.current:.0f} mA, expected {due}"
-
-
-def _only(axes: Sequence[int]) -> Axes:
-    return 0 in axes, 1 in axes, 2 in axes
 
 
 _PROOFS = 2
@@ -284,7 +278,7 @@ class BrakeProof:
 
 @dataclass(frozen=True, slots=True)
 class CoilVerdict:
-    """The fault of one axis, where the axes 0, 1 and 2 are x, y and z."""
+    """The fault of one axis, which is the index of a coil."""
 
     axis: int
     fault: CoilFault
@@ -320,7 +314,7 @@ class CoilMonitorSettings:
         absent: axes without a coil.
     """
 
-    full_current: tuple[float, float, float]
+    full_current: tuple[float, ...]
     current_uncertainty: float = 3.5e-3
     gain_error: float = 0.2
     monitor_noise: float = 1.5e-3
@@ -345,8 +339,8 @@ class Probe:
     The two halves of the wave last `half_ns` each, with the currents +`current` and -`current` (A).
     """
 
-    def __init__(self, current: float, half_ns: int) -> None:
-        self._current = current
+    def __init__(self, current: float, half_ns: int, coils: int) -> None:
+        self._current, self._coils = current, coils
         self._half_ns = half_ns
         self._running: tuple[int, int] | None = None  # axis, and start time (ns)
         self._tried: set[int] = set()
@@ -371,7 +365,7 @@ class Probe:
         self._tried.clear()
 
     def wave(self, now_ns: int) -> FloatArray | None:
-        """Return the probe's currents (3,), A, at `now_ns`, or None while no wave is running."""
+        """Return the probe's currents (n,), A, at `now_ns`, or None while no wave is running."""
         if self._running is None:
             return None
         axis, since_ns = self._running
@@ -379,7 +373,7 @@ class Probe:
         if half >= 2:
             self._running = None
             return None
-        wave = np.zeros(3)
+        wave = np.zeros(self._coils)
         wave[axis] = self._current * (1.0 if half == 0 else -1.0)
         return wave
 
@@ -427,7 +421,8 @@ class CoilMonitor:
             0  # time (ns) since which the circuit has not changed, as far as a reading can show
         )
         self._evidence = Evidence(self._bounds)
-        self._probe = Probe(settings.probe_current, settings.probe_half_ns)
+        coils = len(settings.full_current)
+        self._probe = Probe(settings.probe_current, settings.probe_half_ns, coils)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
         self._self_test: SelfTest | None = None
@@ -439,9 +434,9 @@ class CoilMonitor:
         # Fault that the motion contradicts, while another coil is probed for comparison.
         self._compared: tuple[int, CoilFault] | None = None
         self._verdicts: dict[int, CoilVerdict] = {}
-        self.correction = CoilCorrection()
+        self.correction = CoilCorrection(coils)
         self._news: list[str] = []  # texts of the changes of the correction
-        self._trials = [0, 0, 0]
+        self._trials = [0] * coils
         self._speed = math.inf
         # Axes that are kept at zero current, with start time (ns) and reason.
         self._rests: dict[int, tuple[int, str]] = {}
@@ -458,14 +453,14 @@ class CoilMonitor:
 
     @property
     def available(self) -> BoolArray:
-        """Flags (3,) of the axes with a coil that is not broken, for `knightcube.gnc.control.allocation`."""
+        """Flags (n,) of the axes with a coil that is not broken, for `knightcube.gnc.control.allocation`."""
         broken = self._verdicts.keys() | self._settings.absent
-        return np.array([axis not in broken for axis in range(3)])
+        return np.array([axis not in broken for axis in range(len(self._trials))])
 
     @property
     def resting(self) -> BoolArray:
-        """Flags (3,) of the axes that are kept at zero current because their sign changed too often."""
-        return np.array([axis in self._rests for axis in range(3)])
+        """Flags (n,) of the axes that are kept at zero current because their sign changed too often."""
+        return np.array([axis in self._rests for axis in range(len(self._trials))])
 
     @property
     def suspicion(self) -> str:
@@ -485,14 +480,11 @@ class CoilMonitor:
 
     @property
     def braked(self) -> Axes:
-        """Flags of the bridges to brake: those with a leg stuck high, and those under test in the search."""
+        """Indices of the bridges to brake: with a leg stuck high, or under test in the search."""
         if not self._verdicts:
             return self._leg.brake
-        x, y, z = (
-            asked or (axis in self._verdicts and self._verdicts[axis].fault in _BRAKED)
-            for axis, asked in enumerate(self._leg.brake)
-        )
-        return x, y, z
+        stuck = {axis for axis, verdict in self._verdicts.items() if verdict.fault in _BRAKED}
+        return self._leg.brake | stuck
 
     @property
     def at_rest(self) -> bool:
@@ -518,7 +510,7 @@ class CoilMonitor:
                 self._trials[axis] += 1
                 self._release(axis)
                 count = f"{self._trials[axis]} of {self._settings.trials}"
-                return axis, f"coil {AXES[axis]} is tried again, {count}"
+                return axis, f"coil {COIL_NAMES[axis]} is tried again, {count}"
         return None
 
     def news(self) -> list[str]:
@@ -535,7 +527,7 @@ class CoilMonitor:
     def commanded(
         self, time_ns: int, currents: FloatArray, braked: Axes = NO_AXES, written_ns: int | None = None
     ) -> None:
-        """Record the currents (3,), A, and brakes in force at `time_ns`, written at `written_ns` if given.
+        """Record the currents (n,), A, and brakes in force at `time_ns`, written at `written_ns` if given.
 
         The currents are those on the wire.
         """
@@ -579,7 +571,7 @@ class CoilMonitor:
                     return
         if response is self._slow:
             feeble = [axis for axis in response.axes(Finding.FEEBLE) if axis not in known]
-            self._weak = f"coil {AXES[feeble[0]]}: {response.text(feeble[0])}" if feeble else ""
+            self._weak = f"coil {COIL_NAMES[feeble[0]]}: {response.text(feeble[0])}" if feeble else ""
             if feeble:
                 self._probe_weak_coil(feeble[0], now_ns)
 
@@ -598,7 +590,8 @@ class CoilMonitor:
         if self.correction.reverse(axis, now_ns, in_tumble=in_tumble):
             self._apply(axis, seen, now_ns)
         else:
-            self._rests[axis] = now_ns, f"coil {AXES[axis]}: {seen}; its sign changed too often, kept at zero"
+            why = f"coil {COIL_NAMES[axis]}: {seen}; its sign changed too often, kept at zero"
+            self._rests[axis] = now_ns, why
 
     def _apply(self, axis: int, seen: str, now_ns: int) -> None:
         """Report a change of the correction, and judge the motion again without the earlier evidence."""
@@ -626,7 +619,7 @@ class CoilMonitor:
         return problem
 
     def _tell(self, axis: int, seen: str) -> None:
-        self._news.append(f"coil {AXES[axis]}: {seen}; {self.correction.text(axis)}")
+        self._news.append(f"coil {COIL_NAMES[axis]}: {seen}; {self.correction.text(axis)}")
 
     def _end_rests(self, now_ns: int, speed: float) -> None:
         """Use the axes at zero current again, if the body is slow or after a long time."""
@@ -671,13 +664,13 @@ class CoilMonitor:
 
     @property
     def probe(self) -> FloatArray | None:
-        """Currents (3,), A, on the wire that replace all commands during a probe; None without a probe."""
+        """Currents (n,), A, on the wire that replace all commands during a probe; None without a probe."""
         return self._probe.wave(self._commands.newest_ns) if self._commands else None
 
     def test_wave(self, wanted: FloatArray) -> FloatArray | None:
-        """Return the currents (3,), A, on the wire that test a coil now; None without a test.
+        """Return the currents (n,), A, on the wire that test a coil now; None without a test.
 
-        The test replaces the `wanted` effective currents (3,), A, which are small.
+        The test replaces the `wanted` effective currents (n,), A, which are small.
         """
         if self._self_test is None or not self._commands:
             return None
@@ -803,7 +796,7 @@ class CoilMonitor:
         if not works and self._is_contradicted(axis, fault):
             if self._begin_comparison(axis, fault, now_ns):
                 return
-            why = f"{self._strangeness}; yet the motion shows no change of coil {AXES[axis]}"
+            why = f"{self._strangeness}; yet the motion shows no change of coil {COIL_NAMES[axis]}"
             self._witness.doubt_monitor(why, now_ns)
         else:
             self._give(axis, fault, now_ns, self._strangeness)
@@ -818,7 +811,7 @@ class CoilMonitor:
         If the current monitor measures the current of the other coil, the monitor works, and its reading of
         the suspected coil is believed.
         """
-        ends_ns = self._probe.begin(set(range(3)) - {axis} - self._known.keys(), now_ns)
+        ends_ns = self._probe.begin(set(range(len(self._trials))) - {axis} - self._known.keys(), now_ns)
         if ends_ns is None or self._compared is not None:
             return False
         self._compared = axis, fault
@@ -847,7 +840,7 @@ class CoilMonitor:
             self._judge_ns = ends_ns + _READING_NS
 
     def _give(self, axis: int, fault: CoilFault, now_ns: int, why: str) -> None:
-        text = f"coil {AXES[axis]} {fault.value} ({why})"
+        text = f"coil {COIL_NAMES[axis]} {fault.value} ({why})"
         self._verdicts[axis] = CoilVerdict(axis, fault, now_ns, text)
 
     def _reset(self) -> None:

@@ -9,8 +9,8 @@ healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the co
 standard deviation of the gain is large, and the axis is not judged. A gain larger than `LARGEST_GAIN` is
 physically impossible. A gain larger than `LARGEST_GAIN` shows that the model is wrong, and no axis is judged.
 
-The torques of three coils are normal to the field, so that the three gains can hardly be separated from each
-other within a short time. The gain of each coil is therefore estimated with the other two coils assumed
+The torques of the coils are normal to the field, so that their gains can hardly be separated from each
+other within a short time. The gain of each coil is therefore estimated with the other coils assumed
 healthy within the accuracy of their description. An axis is judged only if a fault of this axis explains the
 motion clearly better than a fault of another axis. A coil is considered reversed if this hypothesis is far
 more likely than that of healthy coils.
@@ -56,7 +56,7 @@ _NOTED_LATE_NS = 25_000_000
 class CoilCommands:
     """A record of the commanded currents and the braking.
 
-    The attribute `braked` holds flags of the bridges that are braked now.
+    The attribute `braked` holds the indices of the bridges that are braked now.
     """
 
     def __init__(self, reach_ns: int) -> None:
@@ -76,7 +76,7 @@ class CoilCommands:
         return self._commands[-1][0]
 
     def note(self, time_ns: int, currents: tuple[float, ...], braked: Axes) -> None:
-        """Record the currents (3,), A, and the braking in force from `time_ns` on."""
+        """Record the currents (n,), A, and the braking in force from `time_ns` on."""
         if braked != self.braked:
             self._braked_ns, self.braked = time_ns, braked
         self._commands.append((time_ns, currents))
@@ -89,7 +89,7 @@ class CoilCommands:
         return time_ns >= max(self._braked_ns, self._commands[0][0])
 
     def window(self, begin_ns: int, end_ns: int) -> FloatArray:
-        """Return the commands (k, 3), A, that may be in force between two times, in equal steps."""
+        """Return the commands (k, n), A, that may be in force between two times, in equal steps."""
         later = iter(self._commands)
         _, currents = next(later)
         following = next(later, None)
@@ -118,7 +118,7 @@ class CoilCommands:
             reading.newest,
             least=float(sure.min()) * (1.0 - error) - slack,
             most=highest * (1.0 + error) + slack + sum(bounds.full_current[axis] for axis in free),
-            at_rest=[axis for axis in range(3) if not driven[axis] and axis not in known],
+            at_rest=[axis for axis in range(len(driven)) if not driven[axis] and axis not in known],
             driven=any(driven),
             spread=highest - lowest,
         )
@@ -196,29 +196,31 @@ deviations of the former."""
 _CLEARLY, _CERTAINLY, _WORSE = 9.0, 20.0, 25.0
 """Thresholds for the differences of weighted sums of squares between hypotheses. A fault of one coil must
 explain the motion better than a fault of another coil by the first threshold, and a reversed coil better than
-three healthy coils by the second threshold. A fit of all gains may explain the motion better than a fault of
+healthy coils by the second threshold. A fit of all gains may explain the motion better than a fault of
 one coil by less than the third threshold."""
 
 
 class CoilResponse:
-    """Estimates the torque gains of the three coils over a sliding window.
+    """Estimates the torque gains of the coils over a sliding window.
 
     Attributes:
-        gain, sigma: gains (3,) of the newest fit, and their standard deviations (3,), infinite before the
+        gain, sigma: gains (n,) of the newest fit, and their standard deviations (n,), infinite before the
             first fit.
         fastest: largest body rate (rad/s) within the window of the newest fit.
-        largest: largest physically possible gains (3,), relative to the dipole of the recorded currents.
+        largest: largest physically possible gains (n,), relative to the dipole of the recorded currents.
     """
 
     def __init__(self, settings: ResponseSettings) -> None:
         self._settings = settings
-        dipoles = np.eye(3) * settings.dipole_per_ampere
-        if np.ndim(settings.dipole_per_ampere) == 2:
-            dipoles = np.asarray(settings.dipole_per_ampere)
+        dipoles = np.asarray(settings.dipole_per_ampere)
+        if dipoles.ndim == 0:
+            dipoles = np.eye(3) * dipoles
         strongest = float(np.linalg.norm(dipoles, axis=0).max())
         self._per_field = strongest * np.linalg.inv(settings.inertia).T
         # Row a is the direction of coil a, times its strength relative to that of the strongest coil.
         self._directions: FloatArray = dipoles.T / strongest
+        self._count_of_coils = coils = len(self._directions)
+        self._each = np.arange(coils)
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)[:, None]
         count = len(self._free)
@@ -228,44 +230,45 @@ class CoilResponse:
         if count == 3:
             self._gyroscopic = gyroscopic_coefficients(settings.inertia)
             self._modes = coefficient_modes(settings.inertia, settings.errors)
-        # Fit parameters: three gains, torsion and damping of each free axis, and a weight of each error mode.
-        spreads = [_GAIN_PRIOR] * 3 + [settings.torsion] * count + [settings.damping] * count
+        # Fit parameters: the gains, torsion and damping of each free axis, and a weight of each error mode.
+        spreads = [_GAIN_PRIOR] * coils + [settings.torsion] * count + [settings.damping] * count
         spreads += [1.0] * len(self._modes)
         self._prior: FloatArray = 1.0 / np.array(spreads) ** 2
         # Prior weight (inverse variance) of a healthy coil's gain, whose error is uniform within a bound.
         self._healthy = 3.0 / max(settings.errors.coil_gain, _LEAST_GAIN_ERROR) ** 2
-        self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
+        self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0,) * coils)])
         self._known_ns = 0
         self._last_ns = 0
-        self.gain: FloatArray = np.ones(3)
-        self.largest: FloatArray = np.full(3, LARGEST_GAIN)
-        self.sigma: FloatArray = np.full(3, np.inf)
+        self.gain: FloatArray = np.ones(coils)
+        self.largest: FloatArray = np.full(coils, LARGEST_GAIN)
+        self.sigma: FloatArray = np.full(coils, np.inf)
         self.reset()
 
     def reset(self) -> None:
         """Discard all samples."""
-        self._asked: FloatArray = np.zeros((3, 3))
-        # Samples: time (ns), time since the previous sample (s), rate (3,), field (3,) and currents (3,).
+        coils = self._count_of_coils
+        self._asked: FloatArray = np.zeros((coils, 3))
+        # Samples: time (ns), time since the previous sample (s), rate (3,), field (3,) and currents (n,).
         self._samples: list[tuple[int, float, FloatArray, FloatArray, tuple[float, ...]]] = []
         self._previous: tuple[float, FloatArray, FloatArray, FloatArray] | None = None
         self._turned: FloatArray = np.zeros(3)
         self._spun: FloatArray = np.zeros(6)  # integrals of the rate products, rad^2/s
         self._quiet_field: FloatArray | None = None
-        # Each bin has a row (f, 6 + k) for its f free axes.
-        # The first columns are three coil accelerations and the observed acceleration.
+        # Each bin has a row (f, n + 3 + k) for its f free axes.
+        # The first columns are n coil accelerations and the observed acceleration.
         # The other columns are mean rate, angle, and the accelerations by the k error modes.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
         self.fastest = 0.0
         self._weights: FloatArray = np.zeros(len(self._modes))  # weights of the error modes, newest fit
-        # Each bin has a residual, with its time (ns) and the commanded acceleration of each coil (3, 3).
-        # The acceleration per ampere (3, 3), the residual (3,) and the error modes' (3, k) follow.
+        # Each bin has a residual, with its time (ns) and the commanded acceleration of each coil (3, n).
+        # The acceleration per ampere (3, n), the residual (3,) and the error modes' (3, k) follow.
         self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]] = deque()
-        self._in_a_row = {finding: [0, 0, 0] for finding in Finding}
-        self.sigma = np.full(3, np.inf)
+        self._in_a_row = {finding: [0] * coils for finding in Finding}
+        self.sigma = np.full(coils, np.inf)
 
     def commanded(self, time_ns: int, currents: tuple[float, ...]) -> None:
-        """Record the currents (3,), A, in force from `time_ns` on."""
+        """Record the currents (n,), A, in force from `time_ns` on."""
         if currents == self._commands[-1][1]:
             return
         self._commands.append((time_ns, currents))
@@ -320,7 +323,7 @@ class CoilResponse:
     def axes(self, finding: Finding) -> list[int]:
         """Return the axes for which a finding held in the last `persistence` fits."""
         counts = self._in_a_row[finding]
-        return [axis for axis in range(3) if counts[axis] >= self._settings.persistence]
+        return [axis for axis, count in enumerate(counts) if count >= self._settings.persistence]
 
     def is_healthy(self, axis: int) -> bool:
         """Return whether an axis had the gain of a healthy coil in the last `persistence` fits."""
@@ -347,7 +350,7 @@ class CoilResponse:
 
     @property
     def strength(self) -> FloatArray | None:
-        """Angular acceleration (3,), rad/s^2 per ampere, by each coil in the field of the coils' last pause.
+        """Angular acceleration (n,), rad/s^2 per ampere, by each coil in the field of the coils' last pause.
 
         The result is None before the first pause.
         """
@@ -384,16 +387,18 @@ class CoilResponse:
         mean_rate = 0.5 * (rate + before[1])
         self._turned = self._turned + mean_rate * span
         spin = (spun - before[3]) / span
-        row = np.empty((3, 6 + len(self._modes)))
-        row[:, :3] = (asked - before[2]).T / span
-        row[:, 3] = (rate - before[1]) / span - self._gyroscopic @ spin
-        row[:, 4], row[:, 5], row[:, 6:] = mean_rate, self._turned, (self._modes @ spin).T
+        coils = self._count_of_coils
+        row = np.empty((3, coils + 3 + len(self._modes)))
+        row[:, :coils] = (asked - before[2]).T / span
+        row[:, coils] = (rate - before[1]) / span - self._gyroscopic @ spin
+        row[:, coils + 1], row[:, coils + 2] = mean_rate, self._turned
+        row[:, coils + 3 :] = (self._modes @ spin).T
         self._rows.append(row[self._free])
         self._speeds.append(math.sqrt(float(np.square(turning).sum(axis=1).max())))
         row *= self._mask
-        remainder = row[:, 3] - row[:, :3].sum(axis=1)
+        remainder = row[:, coils] - row[:, :coils].sum(axis=1)
         per_ampere = per_ampere[-1].T * self._mask
-        self._remainders.append((self._last_ns, row[:, :3], per_ampere, remainder, row[:, 6:]))
+        self._remainders.append((self._last_ns, row[:, :coils], per_ampere, remainder, row[:, coils + 3 :]))
         while self._remainders[0][0] < self._last_ns - self._settings.memory_ns:
             self._remainders.popleft()
         if len(self._rows) < self._settings.least_bins:
@@ -416,7 +421,7 @@ class CoilResponse:
         # The gain of a coil that has just failed differs between the whole window and its newest half.
         newest = fits[min(1, len(fits) - 1)]
         steady = np.abs(newest.gain - whole.gain) < _STEADY * newest.sigma
-        for axis in range(3):
+        for axis in range(self._count_of_coils):
             shown = [fit for fit in fits if fit.possible and fit.is_reversed[axis]]
             shown = [fit for fit in shown if fit.gain[axis] < self._settings.highest_reversed]
             if shown:
@@ -425,48 +430,50 @@ class CoilResponse:
             self._count(axis, whole.possible, alone=alone, is_reversed=bool(shown), is_steady=is_steady)
 
     def _solved(self, rows: Sequence[FloatArray], span: float) -> MotionFit:
-        """Fit all gains freely, and fit each gain with the other two coils assumed healthy.
+        """Fit all gains freely, and fit each gain with the other coils assumed healthy.
 
-        `rows` (n, f, 6 + k) are those of neighbouring bins, and `span` is the time (s) from bin to bin.
+        `rows` (m, f, n + 3 + k) are those of m neighbouring bins, and `span` is the time (s) from bin to bin.
         """
-        count = len(self._free)
+        count, coils = len(self._free), self._count_of_coils
         white = self._whitened(rows, span)
         inputs = np.zeros((len(white), count, len(self._prior)))
-        inputs[:, :, :3], inputs[:, :, 3 + 2 * count :] = white[:, :, :3], white[:, :, 6:]
+        inputs[:, :, :coils] = white[:, :, :coils]
+        inputs[:, :, coils + 2 * count :] = white[:, :, coils + 3 :]
         for place in range(count):
-            inputs[:, place, 3 + place] = -white[:, place, 5]
-            inputs[:, place, 3 + count + place] = -white[:, place, 4]
-        matrix, outputs = inputs.reshape(-1, len(self._prior)), white[:, :, 3].reshape(-1)
+            inputs[:, place, coils + place] = -white[:, place, coils + 2]
+            inputs[:, place, coils + count + place] = -white[:, place, coils + 1]
+        matrix, outputs = inputs.reshape(-1, len(self._prior)), white[:, :, coils].reshape(-1)
         normal, right = matrix.T @ matrix + np.diag(self._prior), matrix.T @ outputs
-        # Eliminate the nuisance parameters, which leaves three equations for the gains.
-        others = np.linalg.inv(normal[3:, 3:])
-        coupling = others @ normal[3:, :3]
+        # Eliminate the nuisance parameters, which leaves one equation for each gain.
+        prior, rest = self._prior[:coils], right[coils:]
+        others = np.linalg.inv(normal[coils:, coils:])
+        coupling = others @ normal[coils:, :coils]
         gains = GainEquations(
-            normal[:3, :3] - np.diag(self._prior[:3]) - normal[:3, 3:] @ coupling,
-            right[:3] - right[3:] @ coupling,
-            float(outputs @ outputs - right[3:] @ others @ right[3:]),
+            normal[:coils, :coils] - np.diag(prior) - normal[:coils, coils:] @ coupling,
+            right[:coils] - rest @ coupling,
+            float(outputs @ outputs - rest @ others @ rest),
         )
-        freely = gains.solve(self._prior[:3])
-        spread = max(1.0, freely.cost / max(len(outputs) - count - 3, 1))
+        freely = gains.solve(prior)
+        spread = max(1.0, freely.cost / max(len(outputs) - count - coils, 1))
         # If a gain is impossible even within its uncertainty, the model is wrong.
         sigmas = np.sqrt(spread * freely.variances)
         possible = bool((np.abs(freely.gains) - 3.0 * sigmas < self.largest).all())
-        healthy = np.full(3, self._healthy)
-        one_free = [gains.solve(np.where(axis == _EACH, self._prior[:3], healthy)) for axis in range(3)]
+        healthy = np.full(coils, self._healthy)
+        one_free = [gains.solve(np.where(axis == self._each, prior, healthy)) for axis in range(coils)]
         costs = [fit.cost / spread for fit in one_free]
         sound_cost = gains.solve(healthy).cost / spread
         alone, is_reversed = [], []
-        for axis in range(3):
+        for axis in range(coils):
             # Limit of the sum of squares of a hypothesis that only this axis is broken.
-            limit = min(costs[other] for other in range(3) if other != axis) - _CLEARLY
+            limit = min(costs[other] for other in range(coils) if other != axis) - _CLEARLY
             limit = min(limit, freely.cost / spread + _WORSE)
-            reversed_cost = gains.solve(healthy, np.where(axis == _EACH, -1.0, 1.0)).cost / spread
+            reversed_cost = gains.solve(healthy, np.where(axis == self._each, -1.0, 1.0)).cost / spread
             alone.append(costs[axis] < limit)
             is_reversed.append(reversed_cost < min(limit, sound_cost - _CERTAINLY))
         return MotionFit(
             np.array([fit.gains[axis] for axis, fit in enumerate(one_free)]),
             np.sqrt(spread * np.array([fit.variances[axis] for axis, fit in enumerate(one_free)])),
-            (others @ right[3:] - coupling @ freely.gains)[2 * count :],
+            (others @ rest - coupling @ freely.gains)[2 * count :],
             possible,
             tuple(alone),
             tuple(is_reversed),
@@ -501,7 +508,7 @@ class CoilResponse:
             counts[axis] = counts[axis] + 1 if holds else 0
 
     def _whitened(self, bins: Sequence[FloatArray], span: float) -> FloatArray:
-        """Return the rows (n, f, 6 + k) of bins, with noise of variance 1 and without a constant part.
+        """Return the rows (m, f, n + 3 + k) of m bins, with noise of variance 1 and without a constant part.
 
         The noise of the mean rate of a bin enters two differences of neighbouring bins with opposite signs.
         """
@@ -531,7 +538,7 @@ class MotionFit(NamedTuple):
     """Fit of the gains over some bins.
 
     Attributes:
-        gain, sigma: gain (3,) of each coil with the other coils assumed healthy, and standard deviation (3,)
+        gain, sigma: gain (n,) of each coil with the other coils assumed healthy, and standard deviation (n,)
             of this gain.
         weights: weights (k,) of the error modes.
         possible: whether the gains of all axes are physically possible.
@@ -548,7 +555,7 @@ class MotionFit(NamedTuple):
 
 
 class GainFit(NamedTuple):
-    """Gains (3,), their variances (3,), and the weighted sum of squares of all residuals.
+    """Gains (n,), their variances (n,), and the weighted sum of squares of all residuals.
 
     The sum includes the deviations of the parameters from their expected values.
     """
@@ -559,9 +566,9 @@ class GainFit(NamedTuple):
 
 
 class GainEquations(NamedTuple):
-    """Normal equations of the three gains; the sum of squares at gains g is g S g - 2 t g + c.
+    """Normal equations of the n gains; the sum of squares at gains g is g S g - 2 t g + c.
 
-    The matrix S is `matrix` (3, 3), the vector t is `right` (3,), and c is `constant`.
+    The matrix S is `matrix` (n, n), the vector t is `right` (n,), and c is `constant`.
     """
 
     matrix: FloatArray
@@ -569,7 +576,7 @@ class GainEquations(NamedTuple):
     constant: float
 
     def solve(self, weights: FloatArray, expected: FloatArray | None = None) -> GainFit:
-        """Fit gains with the prior weights (3,) of the expected gains (3,), which are 1 by default."""
+        """Fit gains with the prior weights (n,) of the expected gains (n,), which are 1 by default."""
         prior = weights if expected is None else weights * expected
         covariance = np.linalg.inv(self.matrix + np.diag(weights))
         right = self.right + prior
@@ -577,10 +584,6 @@ class GainEquations(NamedTuple):
         # The expected gains are 1 or -1, so that the weights are also the sum of their squares.
         cost = self.constant + float(weights.sum() - right @ gains)
         return GainFit(gains, np.asarray(covariance.diagonal(), dtype=np.float64), cost)
-
-
-AXES = "xyz"
-_EACH = np.arange(3)
 
 
 LONGEST_REST_NS = 600_000_000_000
@@ -593,24 +596,25 @@ class CoilCorrection:
     """Sign and gain of each coil relative to its description, and the reviews that are due.
 
     Attributes:
-        factors: dipole (3,) of each coil relative to the described dipole at the same current: 1 for a
+        factors: dipole (n,) of each coil relative to the described dipole at the same current: 1 for a
             healthy coil, -1 for a reversed coil.
-        deviations: relative standard deviations (3,) of the estimated gains; zero for coils without an
+        deviations: relative standard deviations (n,) of the estimated gains; zero for coils without an
             estimated gain.
     """
 
-    def __init__(self) -> None:
-        self.factors: FloatArray = np.ones(3)
-        self.deviations: FloatArray = np.zeros(3)
-        self._changes: list[list[int]] = [[], [], []]  # times (ns) of the changes of sign
+    def __init__(self, coils: int = 3) -> None:
+        """Start with `coils` healthy coils."""
+        self.factors: FloatArray = np.ones(coils)
+        self.deviations: FloatArray = np.zeros(coils)
+        self._changes: list[list[int]] = [[] for _ in range(coils)]  # times (ns) of the changes of sign
         self._unreviewed: set[int] = set()
 
     def effective(self, wire: FloatArray) -> FloatArray:
-        """Return the currents (3,), A, with which healthy coils would have the same dipole as the coils."""
+        """Return the currents (n,), A, with which healthy coils would have the same dipole as the coils."""
         return self.factors * wire
 
     def wire(self, effective: FloatArray) -> FloatArray:
-        """Return the currents (3,), A, of the coils that cause the dipole of the effective currents (3,)."""
+        """Return the currents (n,), A, of the coils that cause the dipole of the effective currents (n,)."""
         return effective / self.factors
 
     @property
@@ -647,15 +651,16 @@ class CoilCorrection:
         return True
 
     def restore(self, factors: FloatArray, deviations: FloatArray) -> str:
-        """Start from the factors (3,) of an earlier boot; return why they were rejected, or "".
+        """Start from the factors (n,) of an earlier boot; return why they were rejected, or "".
 
         Args:
             factors: signs and gains of the coils.
             deviations: relative standard deviations of the gains.
         """
         sizes = np.abs(factors)
-        if factors.shape != (3,) or not ((sizes >= LEAST_GAIN) & (sizes <= 1.0)).all():
-            return f"{factors.tolist()}: not three factors from {LEAST_GAIN:g} to 1 or with the opposite sign"
+        if factors.shape != self.factors.shape or not ((sizes >= LEAST_GAIN) & (sizes <= 1.0)).all():
+            number = f"not {len(self.factors)} factors"
+            return f"{factors.tolist()}: {number} from {LEAST_GAIN:g} to 1 or with the opposite sign"
         self.factors, self.deviations = factors.copy(), deviations.copy()
         return ""
 
@@ -686,8 +691,8 @@ class MotionWitness:
         doubt: the reason why the current monitor is considered wrong; empty while it is trusted.
     """
 
-    def __init__(self, response: CoilResponse | None, full_current: tuple[float, float, float]) -> None:
-        """Set the current `full_current` (3,), A, of each coil that is fully on."""
+    def __init__(self, response: CoilResponse | None, full_current: tuple[float, ...]) -> None:
+        """Set the current `full_current` (n,), A, of each coil that is fully on."""
         self._response = response
         self._full_current = full_current
         self._doubted_ns = -_DOUBTED_FOR_NS
@@ -763,7 +768,7 @@ class Evidence:
         segments = [segment for segment in self._segments if segment]
         return [
             (axis, fault)
-            for axis in range(3)
+            for axis in range(len(self._bounds.full_current))
             if axis not in known
             for fault in ELECTRICAL
             if all(fits(segment, self._bounds, known, axis, fault) for segment in segments)

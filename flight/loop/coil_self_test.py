@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.loop.coil_response import AXES, CoilResponse
+from flight.loop.coil_response import CoilResponse
+from hal.interfaces.devices import COIL_NAMES
 from knightcube.astro.arrays import BoolArray, FloatArray
 
 
@@ -26,7 +27,7 @@ class SelfTestSettings:
 
     Attributes:
         interval_ns: longest time (ns) without evidence about a coil, after which the coil is tested.
-        limits: largest currents (3,), A, of a test.
+        limits: largest currents (n,), A, of a test.
     """
 
     interval_ns: int
@@ -74,9 +75,9 @@ class SelfTest:
         self._tested.clear()
 
     def wave(self, wanted: FloatArray, usable: BoolArray, now_ns: int) -> FloatArray | None:
-        """Return the currents (3,), A, of a test instead of the `wanted` effective currents (3,), or None.
+        """Return the currents (n,), A, of a test instead of the `wanted` effective currents (n,), or None.
 
-        Only coils that are `usable` (3,) are tested.
+        Only coils that are `usable` (n,) are tested.
         """
         if (np.abs(wanted) > _QUIET * self._settings.limits).any():
             self._loud_ns, self._running = now_ns, None
@@ -101,7 +102,7 @@ class SelfTest:
         if not self._tested or self._running or now_ns - max(self._tested.values()) < _REPORT_NS:
             return ""
         tested, self._tested = sorted(self._tested), {}
-        return "; ".join(f"coil {AXES[axis]}: {self._response.text(axis)}" for axis in tested)
+        return "; ".join(f"coil {COIL_NAMES[axis]}: {self._response.text(axis)}" for axis in tested)
 
     def _begin(self, usable: BoolArray, now_ns: int) -> None:
         """Begin the test of the next coil that is due."""

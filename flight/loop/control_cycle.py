@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.link.modes import STEERING, Mode
-from flight.link.telemetry.definitions import ATTITUDE
+from flight.link.telemetry.definitions import ATTITUDE, COIL_CURRENTS
 from flight.loop import horizon_cameras as horizon_task
 from flight.loop import imaging as imaging_task
 from flight.loop.body import PLANNER, ControlOutput, FlightBody, Steered, Target
@@ -22,7 +22,8 @@ from flight.loop.imaging import Imaging
 from flight.loop.modes import ModeControl
 from flight.loop.navigation import CoilKnowledge, CurrentValidity, Navigation, Positioning, SunSensing
 from flight.loop.steering import CoilDrive, Steering
-from hal.interfaces.devices import CoilState, ImuReading
+from hal.interfaces.devices import MOST_COILS, CoilState, ImuReading
+from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.estimation.estimate import ATTITUDE as ATTITUDE_ERROR
 from knightcube.gnc.estimation.estimate import RATE, Estimate
 
@@ -111,7 +112,7 @@ class ControlCycle:
         # The coil driver's thread may have sent the last command late.
         coils = tasks.drive.state()
         validity = self._knowledge.look(coils, now_ns, suspected=tasks.drive.is_suspect)
-        tasks.navigation.correct_coils(tasks.drive.correction)
+        tasks.navigation.correct_coils(tasks.drive.correction, tasks.drive.available)
         tasks.navigation.commanded(coils, tasks.drive.effective(coils), validity)
         readings = tasks.navigation.update(now_ns)
         if not coils.error:
@@ -188,6 +189,9 @@ class ControlCycle:
         self._body.view.record_cycle(output)
         if record.cycle.slot % ATTITUDE_EVERY:
             return output
+        if len(steered.currents) > 3:
+            command, written = (_padded(currents) for currents in (steered.currents, output.written.current))
+            self._recorder.record(COIL_CURRENTS, now_ns, command=command, written=written)
         reference = steered.reference
         self._recorder.record(
             ATTITUDE,
@@ -203,6 +207,11 @@ class ControlCycle:
             dipole=steered.dipole.tolist(),
         )
         return output
+
+
+def _padded(currents: FloatArray) -> list[float]:
+    """Return the currents (n,), A, of the coils, followed by NaN for coils that are not fitted."""
+    return [*currents.tolist(), *[math.nan] * (MOST_COILS - len(currents))]
 
 
 def _sigmas(estimate: Estimate | None, part: slice) -> list[float]:

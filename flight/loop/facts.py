@@ -26,6 +26,7 @@ from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.log import Recorder
 from flight.loop.executive import JobRunner
 from flight.schema.sections import CONTROL_RATE_HZ, Config
+from hal.interfaces.devices import COIL_NAMES
 from hal.interfaces.wires import Clock
 from knightcube.errors import FlightError
 
@@ -123,7 +124,7 @@ SLEW_LATE = Fact("slew-late", events.SLEW_LATE, modes=frozenset({Mode.SLEW}))
 HOLDING = Fact("holding", events.HOLDING, modes=frozenset({Mode.SLEW, Mode.TESTBED_DEMO}))
 COIL_FAULT = Fact("coil-fault", events.COIL_FAULT, events.COIL_RECOVERED)
 COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN = (
-    Fact(f"coil-{axis}-broken", events.COIL_BROKEN, latching=True) for axis in "xyz"
+    Fact(f"coil-{name}-broken", events.COIL_BROKEN, latching=True) for name in COIL_NAMES[:3]
 )
 COIL_SUSPECT = Fact("coil-suspect", events.COIL_SUSPECT)
 COMMANDS_DOUBTED = Fact("commands-doubted", events.COMMANDS_DOUBTED, events.COMMANDS_TRUSTED)
@@ -152,6 +153,18 @@ CLOCK_OFF = Fact("clock-off", events.CLOCK_OFF, after=2)
 FIELD_REFUSED = Fact("field-refused", events.FIELD_REFUSED, events.FIELD_TRUSTED)
 WIDE_LOST = Fact("wide-lost", events.WIDE_LOST, events.WIDE_RECOVERED)
 WIDE_FALSE = Fact("wide-false", events.WIDE_FALSE, events.WIDE_TRUSTED, after=3)
+COIL_4_BROKEN, COIL_5_BROKEN, COIL_6_BROKEN = (
+    Fact(f"coil-{name}-broken", events.COIL_BROKEN, latching=True) for name in COIL_NAMES[3:]
+)
+COILS_BROKEN = (
+    COIL_X_BROKEN,
+    COIL_Y_BROKEN,
+    COIL_Z_BROKEN,
+    COIL_4_BROKEN,
+    COIL_5_BROKEN,
+    COIL_6_BROKEN,
+)
+"""Facts that a coil is broken, in the order of the coils."""
 
 FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isinstance(value, Fact))
 

@@ -18,10 +18,11 @@ from flight.link.telemetry.definitions import RUN
 from flight.loop.body import ControlOutput, FlightBody, SteeringState
 from flight.loop.control_cycle import ControlCycle, LoopTasks
 from flight.loop.executive import Cycle, CyclicExecutive, RateGroup
-from flight.loop.facts import COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN, Services
+from flight.loop.facts import COILS_BROKEN, Services
 from flight.loop.health import CONTROL, ResourceReader
 from flight.loop.state import StateKeeper
 from flight.schema.sections import CONTROL_RATE_HZ, Config
+from hal.interfaces.devices import COIL_NAMES
 from hal.interfaces.wires import SECOND_NS
 
 
@@ -37,18 +38,15 @@ class RunLabel:
 
 @dataclass(frozen=True, slots=True)
 class FlightProgress:
-    """Progress of a flight: times (s), coil currents (3,), A, and a text about target and attitude."""
+    """Progress of a flight: times (s), coil currents (n,), A, and a text about target and attitude."""
 
     mission_time: float
     duration: float
     attitude: str
-    currents: tuple[float, float, float]
+    currents: tuple[float, ...]
     state: str
     slips: int
     events: int
-
-
-_BROKEN = {"x": COIL_X_BROKEN, "y": COIL_Y_BROKEN, "z": COIL_Z_BROKEN}
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +187,9 @@ class FlightLoop:
             faults=counts[Severity.FAULT],
             warnings=counts[Severity.WARNING],
             causes=causes,
-            coils_left_out=tuple(axis for axis, fact in _BROKEN.items() if facts.holds(fact)),
+            coils_left_out=tuple(
+                name for name, fact in zip(COIL_NAMES, COILS_BROKEN, strict=True) if facts.holds(fact)
+            ),
             coils_at_zero=not coils.error and not coils.current.any(),
             coil_error=coils.error,
         )
@@ -221,7 +221,7 @@ class FlightLoop:
             control_period_ns=self._groups[0].period_ns,
             duration=config.duration,
             coil_resistance=[
-                math.nan if k in coils.absent else ohm for k, ohm in enumerate(coils.resistance)
+                math.nan if k in coils.absent else ohm for k, ohm in enumerate(coils.resistance[:3])
             ],
             supply_voltage=coils.supply_voltage,
             current_limit=max(coils.limits),
@@ -266,12 +266,11 @@ class FlightLoop:
         self._record_performance(now_ns)
         if self._show is None:
             return
-        x, y, z = output.steered.currents.tolist() if output is not None else (0.0, 0.0, 0.0)
         progress = FlightProgress(
             (now_ns - self._services.recorder.epoch_ns) * 1e-9,
             self._config.duration,
             self._body.view.progress(output),
-            (x, y, z),
+            tuple(output.steered.currents.tolist()) if output is not None else (),
             state.name.lower(),
             sum(group.slips for group in self._groups),
             self._services.events.count,

@@ -13,6 +13,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from flight.link import events
 from flight.link.telemetry.definitions import FIX, GPS_LINK, IMU
 from flight.loop import facts
@@ -32,7 +34,7 @@ from hal.interfaces.devices import (
 )
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS
-from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 
@@ -137,6 +139,7 @@ class Navigation:
         self._bytes_since_ns = 0
         self._doubted = False
         self._coil_factors = estimation.coil_monitor.correction.factors
+        self._available = estimation.coil_monitor.available
         self.speed = 0.0
         """Body rate (rad/s) of the newest reading, including the gyro bias."""
 
@@ -151,14 +154,18 @@ class Navigation:
         """Return the counters of the inertial unit's serial line."""
         return self._link
 
-    def correct_coils(self, correction: CoilCorrection) -> None:
-        """Pass a change of the coils' signs and gains to the estimation."""
+    def correct_coils(self, correction: CoilCorrection, available: BoolArray) -> None:
+        """Pass a change of the coils' signs and gains, and of the available coils (n,), to the estimation."""
+        if available is not self._available:
+            before, self._available = self._available, available
+            if not np.array_equal(before, available):
+                self._estimation.coils_used(available)
         if correction.factors is not self._coil_factors:
             change, self._coil_factors = correction.factors / self._coil_factors, correction.factors
             self._estimation.coils_corrected(change, correction.deviations)
 
     def commanded(self, in_force: CoilState, currents: FloatArray, known: CurrentValidity) -> None:
-        """Pass the effective coil currents (3,), A, and whether they are known, to the filter."""
+        """Pass the effective coil currents (n,), A, and whether they are known, to the filter."""
         if known.uncertain_since_ns is not None:
             self._filter.mark_unknown(known.uncertain_since_ns)
         self._filter.command(max(in_force.written_ns, known.since_ns), currents, known=known.now)

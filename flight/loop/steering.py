@@ -29,8 +29,6 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.allocation import allocate
 from knightcube.gnc.estimation.estimate import Estimate
 
-_BROKEN = (facts.COIL_X_BROKEN, facts.COIL_Y_BROKEN, facts.COIL_Z_BROKEN)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoilDriveSettings:
@@ -38,21 +36,23 @@ class CoilDriveSettings:
 
     Attributes:
         dipoles: dipole moment of each coil per ampere (3, n), m^2, body axes, one column per coil.
-        limits: largest current (3,), A, of each coil.
+        limits: largest current (n,), A, of each coil.
         free_axis: unit vector (3,) of the only axis about which the body can rotate, or None for a free body.
+        resistance: resistance (n,) of each coil, ohm, or None for equal coils.
     """
 
     dipoles: FloatArray
     limits: FloatArray
     free_axis: FloatArray | None
+    resistance: FloatArray | None = None
 
 
 class CoilDrive:
     """Commands the coils, and monitors their response.
 
     Attributes:
-        command: effective currents (3,), A, of the command in this cycle.
-        available: flags (3,) of the axes that are not excluded.
+        command: effective currents (n,), A, of the command in this cycle.
+        available: flags (n,) of the axes that are not excluded.
     """
 
     def __init__(
@@ -72,14 +72,15 @@ class CoilDrive:
         self._reported: set[int] = set()  # axes whose verdict was reported
         self._braked = NO_AXES
         self.available = watch.available
-        self.command: FloatArray = np.zeros(3)
+        self._nothing: FloatArray = np.zeros(len(settings.limits))
+        self.command = self._nothing
 
     def state(self) -> CoilState:
         """Return the command that the PWM chip holds at present."""
         return self._coils.state()
 
     def effective(self, in_force: CoilState) -> FloatArray:
-        """Return the effective currents (3,), A, of the command that the PWM chip holds."""
+        """Return the effective currents (n,), A, of the command that the PWM chip holds."""
         return self._watch.correction.effective(in_force.current)
 
     @property
@@ -143,7 +144,7 @@ class CoilDrive:
 
     def trust(self, now_ns: int) -> None:
         """Use all axes again, as commanded by the ground. If a fault persists, it will be detected again."""
-        for axis in range(3):
+        for axis in range(len(self._nothing)):
             self._watch.forget(axis)
         self._reported.clear()
         self.isolate()
@@ -153,12 +154,12 @@ class CoilDrive:
         for verdict in self._watch.verdicts:
             if verdict.axis not in self._reported:
                 self._reported.add(verdict.axis)
-                self._facts.update(_BROKEN[verdict.axis], True, now_ns, verdict.text)
+                self._facts.update(facts.COILS_BROKEN[verdict.axis], True, now_ns, verdict.text)
 
     def _begin_trial(self, axis: int, text: str, now_ns: int) -> None:
         """Use a coil again that the monitor tries without a command."""
         self._reported.discard(axis)
-        self._facts.release(_BROKEN[axis])
+        self._facts.release(facts.COILS_BROKEN[axis])
         self.isolate()
         self._events.report(events.COIL_TRUSTED, now_ns, text)
 
@@ -191,19 +192,20 @@ class CoilDrive:
                     limits,
                     usable.astype(float),
                     settings.free_axis,
+                    settings.resistance,
                 ).currents
         probe = watch.probe
         if probe is None and testable:
             probe = watch.test_wave(currents)
         wire = watch.correction.wire(currents) if probe is None else probe
         if watch.at_rest:
-            wire = np.zeros(3)
+            wire = self._nothing
         self.command = watch.correction.effective(wire)
         self._coils.command(wire)
 
     def zero(self) -> None:
         """Command zero current."""
-        self.command = np.zeros(3)
+        self.command = self._nothing
         self._coils.command(self.command)
 
     def _brake(self, axes: Axes) -> None:

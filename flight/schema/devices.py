@@ -26,7 +26,7 @@ from flight.schema.values import (
     Vector,
 )
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.control.coil_map import CoilMap
+from knightcube.gnc.control.coil_map import CoilMap, missing_direction
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
 
@@ -124,9 +124,10 @@ class Winding(Section, frozen=True, kw_only=True):
 class Coils(Section, frozen=True, kw_only=True):
     """The PWM chip, the H-bridges and the coils; `bus` is the number or device file of the I2C bus.
 
-    The list `windings` has one entry per coil. A satellite has two or three coils. With two coils, the flight
-    application treats the axis across both like that of a broken coil (`slots`). A dipole moment along the
-    magnetic field makes no torque, and is therefore added so that the missing coil needs no current.
+    The list `windings` has one entry per coil. A satellite has two to six coils. If the coils lie in a plane,
+    the flight application treats the axis across the plane like that of a broken coil (`slots`). A dipole
+    moment along the magnetic field makes no torque, and is therefore added so that the missing coil needs no
+    current. More than three coils share a dipole moment so that they heat least.
     """
 
     bus: Bus = 1
@@ -139,19 +140,23 @@ class Coils(Section, frozen=True, kw_only=True):
     @property
     def absent(self) -> frozenset[int]:
         """Indices of the entries of `slots` that have no coil."""
-        return frozenset({2}) if len(self.windings) == 2 else frozenset()
+        return frozenset(range(len(self.windings), len(self.slots)))
 
     @property
     def slots(self) -> tuple[Winding, ...]:
-        """The three coils as the flight application numbers them, where a third coil may not be fitted.
+        """The coils as the flight application numbers them, where the last coil may not be fitted.
 
-        The coil that is not fitted lies along the normal of the other two. It has half the dipole moment of
-        the weaker one, so that plans are careful about this axis, and two free PWM channels.
+        Coils in a plane are followed by a coil along the normal that is not fitted. This coil has half the
+        dipole moment of the weakest one, so that plans are careful about this axis, and two free PWM
+        channels.
         """
-        if len(self.windings) != 2:
+        axes = np.array([coil.direction() for coil in self.windings]).T
+        normal = missing_direction(axes)
+        if normal is None:
             return self.windings
-        first, second = self.windings
-        x, y, z = np.cross(first.direction(), second.direction()).tolist()
+        if len(self.windings) == 2:
+            normal = np.cross(axes[:, 0], axes[:, 1])
+        x, y, z = normal.tolist()
         used = {channel for k, coil in enumerate(self.windings) for channel in coil.pins(k)}
         a, b = [channel for channel in range(16) if channel not in used][:2]
         weaker = min(
@@ -159,8 +164,7 @@ class Coils(Section, frozen=True, kw_only=True):
         )
         half = 0.5 * weaker.strength()
         return (
-            first,
-            second,
+            *self.windings,
             Winding(
                 axis=(x, y, z),
                 dipole_per_ampere=half,
@@ -193,7 +197,7 @@ class Coils(Section, frozen=True, kw_only=True):
     def map(self) -> CoilMap:
         """Return the map from dipole moments to currents of a satellite's coils.
 
-        Raises ConfigError for a coil without dipole moment, and UsageError if the coils lie in a plane.
+        Raises ConfigError for a coil without dipole moment, and UsageError if all coils are parallel.
         """
         strength = np.array([coil.strength() for coil in self.slots])
         dipoles = np.array([coil.direction() for coil in self.slots]).T * strength

@@ -21,9 +21,9 @@ from flight.schema.orbit import Craft, ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
 from flight.schema.values import Quaternion, Vector, check_aim
+from hal.interfaces.devices import MOST_COILS
 from knightcube.astro.inertia import inertia_problem
 from knightcube.errors import UsageError
-from knightcube.gnc.control.coil_map import LEAST_SPREAD
 
 Refuse = Callable[[str, str], None]
 """Function that raises the error about a value; its arguments are the value's dotted name and the problem."""
@@ -128,14 +128,15 @@ def _check_satellite_coils(coils: Coils, refuse: Refuse) -> None:
             key = "coils.current_limit" if coil.current_limit is None else f"{place}.current_limit"
             problem = f"is {limit:g}: the supply drives {reached:.3g} A through {coil.resistance:g} ohm"
             refuse(key, problem)
-    if len(coils.windings) == 2:
-        first, second = (coil.direction() for coil in coils.windings)
-        if np.linalg.norm(np.cross(first, second)) < LEAST_SPREAD:
-            refuse("coils.windings", "are two parallel coils: give one of them another axis")
     try:
-        coils.map()
+        slots = coils.slots
     except UsageError as error:
         refuse("coils.windings", str(error))
+    else:
+        if len(slots) > MOST_COILS:
+            x, y, z = slots[-1].axis
+            normal = f"[{x:.2f}, {y:.2f}, {z:.2f}]"
+            refuse("coils.windings", f"lie in one plane: tilt one coil towards its normal {normal}")
 
 
 def _check_craft(craft: Craft, refuse: Refuse) -> None:
@@ -195,12 +196,17 @@ def _check_coils(config: Config, refuse: Refuse) -> None:
     coils = config.coils
     for index, coil in enumerate(coils.windings):
         if not any(coil.axis):
-            refuse(f"coils.windings[{index}].axis", "is zero: give the direction of the coil's dipole moment")
-    if not 2 <= len(coils.windings) <= 3:
-        refuse("coils.windings", f"has {len(coils.windings)} entries: two or three coils are flown")
+            problem = f"is {list(coil.axis)}: give the direction of the coil's dipole moment"
+            refuse(f"coils.windings[{index}].axis", problem)
+    count = len(coils.windings)
+    if not 2 <= count <= MOST_COILS:
+        refuse("coils.windings", f"has {count} entries: 2 to {MOST_COILS} coils can be flown")
     used = [channel for index, coil in enumerate(coils.windings) for channel in coil.pins(index)]
     if len(set(used)) != len(used):
-        refuse("coils.windings", f"use a channel of the PWM chip twice: {used}")
+        twice = next(channel for channel in used if used.count(channel) > 1)
+        free = [channel for channel in range(16) if channel not in used]
+        cure = f"give one of the two coils other `channels`, of {free}"
+        refuse("coils.windings", f"use channel {twice} of the PWM chip twice: {cure}")
     if config.power_monitor is not None and config.power_monitor.address == config.coils.address:
         refuse(
             "power_monitor.address",

@@ -1,4 +1,4 @@
-"""Driver of three torque coils on a PCA9685 and SN754410 H-bridges. Any failure leads to zero current.
+"""Driver of up to six torque coils on a PCA9685 and SN754410 H-bridges. Any failure leads to zero current.
 
 Each coil is driven by an H-bridge with two inputs A and B (Sease 2013, Table 5.2, eq. 5.33). A signed count n
 from -4096 to 4096 gives the direction and the duty. For n > 0, input A is high for n/4096 of the PWM period
@@ -30,7 +30,7 @@ from typing import TypeVar
 import numpy as np
 
 from hal.drivers.pca9685 import BLOCK_CHANNELS, CHANNELS, COUNTS, FULL_OFF, FULL_ON, Pca9685, PwmCounts
-from hal.interfaces.devices import NO_AXES, Axes, CoilState, FloatArray
+from hal.interfaces.devices import COIL_NAMES, MOST_COILS, NO_AXES, Axes, CoilState, FloatArray
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
 from hal.interfaces.wires import Clock, Ticker
 
@@ -69,7 +69,7 @@ class CoilWiring:
         return self.channel_a, self.channel_b
 
 
-Wirings = tuple[CoilWiring, CoilWiring, CoilWiring]
+Wirings = tuple[CoilWiring, ...]
 
 
 def wirings(
@@ -78,7 +78,7 @@ def wirings(
     signs: Sequence[int],
     limits: Sequence[float],
 ) -> Wirings:
-    """Return the wiring of the three coils. Raises OutOfRange for an invalid resistance, sign or limit.
+    """Return the wiring of the coils. Raises OutOfRange for an invalid resistance, sign or limit.
 
     Args:
         channels: PWM channels of the bridge inputs A and B for each coil.
@@ -86,11 +86,10 @@ def wirings(
         signs: +1 for each coil, or -1 for a coil whose leads are swapped.
         limits: maximum current of each coil, A.
     """
-    x, y, z = (
+    return tuple(
         CoilWiring(a, b, ohm, sign, limit)
         for (a, b), ohm, sign, limit in zip(channels, resistance, signs, limits, strict=True)
     )
-    return x, y, z
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +115,7 @@ class CoilSettings:
 
     def __post_init__(self) -> None:
         for quantity, value, low, high, unit in (
-            ("number of coils", len(self.coils), 3, 3, ""),
+            ("number of coils", len(self.coils), 1, MOST_COILS, ""),
             ("supply voltage", self.supply_voltage, 0.1, 36.0, "V"),
             ("current limit", self.current_limit, 1e-3, 1.0, "A"),
             ("stale_after", self.stale_after, 0.05, 0.4, "s"),
@@ -134,8 +133,8 @@ class CoilSettings:
     def blocks(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
         """Return the bridge inputs grouped into blocks of consecutive PWM channels: (first channel, inputs).
 
-        Each block is written in one transaction. The bridge inputs are numbered 0 to 5 in the order xA, xB,
-        yA, yB, zA, zB.
+        Each block is written in one transaction. The bridge inputs are numbered in the order xA, xB, yA, yB,
+        and so on.
         """
         channels = [channel for coil in self.coils for channel in coil.channels]
         blocks: list[tuple[int, tuple[int, ...]]] = []
@@ -209,10 +208,8 @@ def _pulse(counts: int) -> PwmCounts:
     return FULL_ON if counts >= COUNTS else (0, counts)
 
 
-Counts = tuple[int, int, int]
-"""Signed PWM counts of the three coils, from -4096 to 4096."""
-
-ZERO: Counts = (0, 0, 0)
+Counts = tuple[int, ...]
+"""Signed PWM count of each coil, from -4096 to 4096."""
 
 
 class CommandMailbox:
@@ -221,20 +218,20 @@ class CommandMailbox:
     Attributes:
         lock: lock of all attributes; re-entrant, because a signal handler may request zero while its own
             thread holds the lock.
-        braked: flags of the bridges to be braked.
+        braked: indices of the bridges to be braked.
         number: number of requests (commands, withdrawals and brakes) so far.
-        command: requested currents of the three coils, A.
+        command: requested current of each coil, A.
         command_ns: host time of the newest command, ns; -1 before the first command.
         saturated: whether the current of any coil was limited.
         stale: whether the command was too old and was replaced by zero.
     """
 
-    def __init__(self, clock: Clock, stale_ns: int) -> None:
-        """Accept commands, and replace a command that is older than `stale_ns` by zero."""
+    def __init__(self, clock: Clock, stale_ns: int, coils: int) -> None:
+        """Accept commands for `coils` coils, and replace a command that is older than `stale_ns` by zero."""
         self.lock = threading.RLock()
         self.braked = NO_AXES
         self.number = 0
-        self.command: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self.command = self._at_rest = (0.0,) * coils
         self.command_ns = -1
         self.saturated = False
         self.stale = False
@@ -242,7 +239,7 @@ class CommandMailbox:
         self._stale_ns = stale_ns
         self._wanted: Counts | None = None  # None requests zero
 
-    def put(self, command: tuple[float, float, float], counts: Counts, saturated: bool) -> None:
+    def put(self, command: tuple[float, ...], counts: Counts, saturated: bool) -> None:
         """Store a new command (A) with the corresponding signed PWM counts."""
         with self.lock:
             self.command = command
@@ -262,7 +259,7 @@ class CommandMailbox:
         """Withdraw the command and request zero current."""
         with self.lock:
             self._wanted = None
-            self.command = (0.0, 0.0, 0.0)
+            self.command = self._at_rest
             self.saturated = False
             self.stale = False
             self.number += 1
@@ -275,9 +272,9 @@ class CommandMailbox:
                 self.saturated = False
                 self.stale = True
                 self.number += 1
-            x, y, z = self._wanted or ZERO
-            brake_x, brake_y, brake_z = self.braked
-            counts = 0 if brake_x else x, 0 if brake_y else y, 0 if brake_z else z
+            counts = self._wanted or (0,) * len(self.command)
+            if self.braked:
+                counts = tuple(0 if axis in self.braked else value for axis, value in enumerate(counts))
             return counts, self.braked, self.number
 
 
@@ -291,7 +288,7 @@ class CoilOutputs:
 
     Attributes:
         written: signed PWM counts of the coils that the chip acknowledged last.
-        braked: flags of the braked bridges.
+        braked: indices of the braked bridges.
         written_ns: host time since which these counts are written, ns; -1 before the first write.
         failing: whether the last transaction failed, so that the state of the chip is unknown.
         faults: number of failed transactions since start.
@@ -300,7 +297,7 @@ class CoilOutputs:
 
     def __init__(self, pca: Pca9685, clock: Clock, settings: CoilSettings, lock: RLock) -> None:
         """Use a PWM chip. The lock protects the attributes `written`, `braked` and `written_ns`."""
-        self.written = ZERO
+        self.written = self._zero = (0,) * len(settings.coils)
         self.braked = NO_AXES
         self.written_ns = -1
         self.failing = False
@@ -322,7 +319,7 @@ class CoilOutputs:
     def configure(self) -> None:
         """Configure the chip with all outputs off, without retries. Raises DeviceError."""
         self._pca.configure()
-        self._record(ZERO, NO_AXES)
+        self._record(self._zero, NO_AXES)
         self._postpone_check()
 
     def check_is_due(self) -> bool:
@@ -358,10 +355,10 @@ class CoilOutputs:
         """Write zero, then brake the bridges of `braked`. Return whether the chip acknowledged the writes."""
         try:
             self._pca.all_off()
-            self._record(ZERO, NO_AXES)
+            self._record(self._zero, NO_AXES)
             # A chip that has lost its configuration would misinterpret a block of counts.
-            if any(braked) and not self.failing:
-                self.write(ZERO, braked)
+            if braked and not self.failing:
+                self.write(self._zero, braked)
         except NotResponding as error:
             self.count(error)
             return False
@@ -392,7 +389,7 @@ class CoilOutputs:
         """Return whether the chip has kept its configuration, and whether it has also kept its outputs."""
         held = self._pca.is_configured()
         # Zero is not read back, because zero is written again in each period.
-        driven = any(self.written) or any(self.braked)
+        driven = any(self.written) or bool(self.braked)
         return held, held and (not driven or self.keeps_written())
 
     def _postpone_check(self) -> None:
@@ -405,8 +402,8 @@ class CoilOutputs:
     def _channel_blocks(self, counts: Counts, braked: Axes) -> list[tuple[int, list[PwmCounts]]]:
         """Return the first channel and the PWM counts of each block of consecutive channels."""
         pins: list[PwmCounts] = []
-        for value, held in zip(counts, braked, strict=True):
-            pins += brake() if held else inputs_for(value)
+        for axis, value in enumerate(counts):
+            pins += brake() if axis in braked else inputs_for(value)
         return [(first, [pins[member] for member in members]) for first, members in self._blocks]
 
     def _record(self, counts: Counts, braked: Axes) -> None:
@@ -419,7 +416,6 @@ class CoilOutputs:
 
 SERVE_PERIOD_NS = 50_000_000
 _OFF_PATIENCE = 0.3  # longest time (s) for which `off` waits for the lock
-_AXES = "xyz"
 
 
 class PwmTorqueCoils:
@@ -435,7 +431,7 @@ class PwmTorqueCoils:
         )
         # mean current (A) of one count, with the sign of the coil
         self._signed = tuple(coil.sign * step for coil, step in zip(settings.coils, self._steps, strict=True))
-        self._mailbox = CommandMailbox(clock, round(settings.stale_after * 1e9))
+        self._mailbox = CommandMailbox(clock, round(settings.stale_after * 1e9), len(settings.coils))
         self._outputs = CoilOutputs(pca, clock, settings, self._mailbox.lock)
         self._running = False
         self._ticker: Ticker | None = None
@@ -466,7 +462,7 @@ class PwmTorqueCoils:
                 self._ticker = self._clock.ticker(DEVICE, SERVE_PERIOD_NS, self._serve)
 
     def command(self, currents: FloatArray) -> None:
-        """Request coil currents (3,), A. Never waits for the bus.
+        """Request the current of each coil (n,), A. Never waits for the bus.
 
         Currents above the limit are limited. For a wrong shape or a value that is not finite, the coils are
         set to zero and OutOfRange is raised. Raises Refused before `start` and after `close`.
@@ -479,14 +475,12 @@ class PwmTorqueCoils:
             if ticker is not None:
                 ticker.kick()
             raise problem
-        x, y, z = values.tolist()
-        counts_x, limited_x = self._counts(0, x)
-        counts_y, limited_y = self._counts(1, y)
-        counts_z, limited_z = self._counts(2, z)
+        command: tuple[float, ...] = tuple(values.tolist())
+        counts = [self._counts(axis, current) for axis, current in enumerate(command)]
         with self._mailbox.lock:
             if ticker is None or not self._running:
                 raise Refused(DEVICE, "a command before start() or after close()")
-            self._mailbox.put((x, y, z), (counts_x, counts_y, counts_z), limited_x or limited_y or limited_z)
+            self._mailbox.put(command, tuple(count for count, _ in counts), any(cut for _, cut in counts))
         ticker.kick()
 
     def brake(self, axes: Axes) -> None:
@@ -553,12 +547,12 @@ class PwmTorqueCoils:
             self.off()
 
     def _problem(self, values: FloatArray) -> OutOfRange | None:
-        if values.shape != (3,):
-            return OutOfRange(DEVICE, "number of currents", values.size, 3, 3, "")
+        if values.shape != (number := len(self._steps),):
+            return OutOfRange(DEVICE, "number of currents", values.size, number, number, "")
         for axis, value in enumerate(values.tolist()):
             if not math.isfinite(value):
                 bound = mean_current(self._largest[axis], self._steps[axis])
-                return OutOfRange(DEVICE, f"current of coil {_AXES[axis]}", value, -bound, bound, "A")
+                return OutOfRange(DEVICE, f"current of coil {COIL_NAMES[axis]}", value, -bound, bound, "A")
         return None
 
     def _counts(self, axis: int, current: float) -> tuple[int, bool]:

@@ -13,9 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
-Axes = tuple[bool, bool, bool]
-"""One flag for each of the coils x, y and z."""
-NO_AXES: Axes = (False, False, False)
+MOST_COILS = 6
+"""Largest number of coils: two complete sets of three, for which the telemetry packets have room."""
+COIL_NAMES = ("x", "y", "z", "4", "5", "6")
+"""Names of the coils in messages, in order of the list; a fourth and further coil is named by its number."""
+Axes = frozenset[int]
+"""Indices of coils in the order of `COIL_NAMES`."""
+NO_AXES: Axes = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,13 +242,13 @@ class InertialUnit(Protocol):
 
 
 class TorqueCoils(Protocol):
-    """Driver of three torque coils, which sets the currents to zero after any failure."""
+    """Driver of the torque coils, which sets the currents to zero after any failure."""
 
     def start(self) -> None:
         """Configure the PWM chip with all outputs off. Raises DeviceError if the chip does not answer."""
 
     def command(self, currents: FloatArray) -> None:
-        """Request coil currents (3,), A. Never waits for the bus.
+        """Request the current of each coil (n,), A. Never waits for the bus.
 
         Currents above the limit are limited. If a value is not finite, the coils are set to zero and
         OutOfRange is raised.

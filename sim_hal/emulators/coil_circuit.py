@@ -7,7 +7,7 @@ PWM period 20 ms (SN754410 and PCA9685 data sheets). While the two inputs of a b
 the current V/R. Equal inputs of a bridge short-circuit the coil.
 
 A bridge draws the coil current from the supply only while the bridge's inputs differ, so the supply current
-is chopped. `ChoppedSupply` integrates the supply current of three bridges exactly over any time window.
+is chopped. `ChoppedSupply` integrates the supply current of all bridges exactly over any time window.
 
 The emulated INA219 has the registers and the conversion times of the real chip (TI SBOS448G). A conversion
 result is the mean supply current over the conversion window, computed when the bus reads the result. Noise,
@@ -145,7 +145,7 @@ _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
 
 
 class CoilCircuit:
-    """Three coils on one PWM chip, updated at every I2C STOP that may have changed an output."""
+    """The coils on one PWM chip, updated at every I2C STOP that may have changed an output."""
 
     def __init__(
         self,
@@ -177,19 +177,20 @@ class CoilCircuit:
         self._uncertainty = uncertainty
         self._bus_voltage = truth.supply_voltage if bus_voltage is None else bus_voltage
         self._supply_voltage = truth.supply_voltage
-        self._conditions = [CoilCondition.SOUND] * 3
-        self._stuck = [_FREE] * 3
-        self._short_ohm = [1.0, 1.0, 1.0]
-        self._bridges = [_OFF] * 3
-        self._values = [0.0, 0.0, 0.0]
-        self._drawn = [0.0, 0.0, 0.0]  # supply current (A) of each bridge while driving its coil
-        self._currents: FloatArray = np.zeros(3)
+        count = len(self._coils)
+        self._conditions = [CoilCondition.SOUND] * count
+        self._stuck = [_FREE] * count
+        self._short_ohm = [1.0] * count
+        self._bridges = [_OFF] * count
+        self._values = [0.0] * count
+        self._drawn = [0.0] * count  # supply current (A) of each bridge while driving its coil
+        self._currents: FloatArray = np.zeros(count)
         self._supply = ChoppedSupply()
         chip.on_stop = self.update
         self.update(0)
 
     def currents(self) -> FloatArray:
-        """Return the mean coil currents (3,), A, at the present PWM outputs."""
+        """Return the mean current of each coil (n,), A, at the present PWM outputs."""
         return self._currents
 
     def become(self, axis: int, condition: CoilCondition, short_ohm: float = 5.0) -> None:
@@ -201,7 +202,8 @@ class CoilCircuit:
 
     def update(self, written: int) -> None:
         """Update the currents after a STOP; `written` is the bit mask of the written PWM channels."""
-        draws = self._generator.random(3).tolist() if written else (0.5, 0.5, 0.5)
+        count = len(self._coils)
+        draws = self._generator.random(count).tolist() if written else [0.5] * count
         for axis, (coil, channels, step, limit) in enumerate(self._coils):
             stuck_a, stuck_b = self._stuck[axis]
             pulse_a = stuck_a or self._chip.high(coil.channel_a)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hal.drivers.pca9685 import CHANNELS, LED0_ON_L, MODE1, MODE2, PRE_SCALE
+from hal.interfaces.devices import COIL_NAMES
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.coil_circuit import CALIBRATION, CONFIG, CoilCondition
 from sim_hal.emulators.serial_line import LineFaults
@@ -391,13 +392,13 @@ def _upset(name: str, begin: Begin, registers: tuple[int, ...], bits: int, meani
 
 
 def _coil(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
-    circuit, axis = bench.hardware.circuit, "xyz".index(fault.device[-1])
+    circuit, axis = bench.hardware.circuit, COIL_NAMES.index(fault.device[-1])
     circuit.become(axis, CoilCondition(fault.kind), given.get("ohm", 0.0))
     return lambda: circuit.become(axis, CoilCondition.SOUND)
 
 
 def _coil_faults(axis: str) -> tuple[FaultKind, ...]:
-    """Return the faults of the coil and the bridge of an axis x, y or z."""
+    """Return the faults of a coil and its bridge, where `axis` is the name of the coil."""
     ohm = Parameter(5.0, 0.1, 1000.0, "ohm")
     return (
         _fault(f"coil-{axis}: open", "broken wire: no current", _coil),
@@ -537,7 +538,7 @@ _ALL = (
     _fault("bus: arbitration", "another master always wins", _busy_bus, adds=True),
     _fault("bus: hang", "the clock line is held low", _hanging_bus, adds=True),
     _fault("bus: intermittent", _LOW_AT_TIMES, intermittently(_hanging_bus), _turns(), adds=True),
-    *(fault for axis in "xyz" for fault in _coil_faults(axis)),
+    *(fault for axis in COIL_NAMES for fault in _coil_faults(axis)),
     *_frame_faults("camera"),
     _fault("gps: off", "no power; afterwards configuration and satellites are lost", _gps_off),
     _fault("gps: silent", "no byte arrives", _on_line, adds=True),

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from flight.schema.sections import Config
+from hal.interfaces.devices import COIL_NAMES
 from knightcube.errors import UsageError
 from sim_hal.faults.bench import Bench, FaultKind, Removal, Where
 from sim_hal.faults.catalogue import CATALOGUE
@@ -173,6 +174,8 @@ def fitted(device: str, config: Config) -> bool:
     """Return whether a configuration has the device of a fault."""
     if device == "planner":
         return config.replan_period() is not None
+    if device.startswith(("coil-", "bridge-")):
+        return COIL_NAMES.index(device[-1]) < len(config.coils.slots)
     section = _SECTIONS.get(device)
     return section is None or getattr(config, section) not in (None, ())
 
@@ -190,6 +193,8 @@ def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tupl
         if not fitted(device, config):
             section = _SECTIONS.get(device)
             cure = f"the configuration needs a `{section}` section" if section else "the body plans no paths"
+            if device.startswith(("coil-", "bridge-")):
+                cure = f"the configuration has {len(config.coils.windings)} coils"
             raise UsageError(f"fault {str(fault)!r}: this flight has no {device}: {cure}")
         if fault.kind.name == "imu: baud" and fault.parameters["rate"] == config.inertial_unit.baud_rate:
             raise UsageError(f"fault {str(fault)!r}: the unit has this rate already: give another rate")

@@ -385,17 +385,28 @@ class LoadModel:
         self._faces = craft.faces
         self._drag, self._sunlight = multiples.drag, multiples.solar_pressure
         self._gradient = math.sqrt(3.0 * multiples.gravity_gradient * GRAVITATIONAL_PARAMETER)
-        a, b, c, d, e, f, g, h, i = craft.coil_dipole.ravel().tolist()
-        self._coils: Matrix = (a, b, c, d, e, f, g, h, i)
+        # Coils in groups of three, where missing coils of the last group have no dipole.
+        missing = -craft.coil_dipole.shape[1] % 3
+        self._idle = [0.0] * missing
+        coils = np.pad(craft.coil_dipole, ((0, 0), (0, missing)))
+        groups = [coils[:, first : first + 3].ravel().tolist() for first in range(0, coils.shape[1], 3)]
+        self._coils: list[Matrix] = [(a, b, c, d, e, f, g, h, i) for a, b, c, d, e, f, g, h, i in groups]
         x, y, z = craft.constant_dipole.tolist()
         self._constant: Floats = (x, y, z)
         x, y, z = craft.sunlit_dipole.tolist()
         self._sunlit: Floats = (x, y, z)
         self._walking = craft.walking_dipole
 
-    def coil_dipole(self, currents: Floats) -> Floats:
-        """Return the dipole moment (3,), A m^2, of the coils at currents (3,), A."""
-        return turned(self._coils, currents)
+    def coil_dipole(self, currents: tuple[float, ...]) -> Floats:
+        """Return the dipole moment (3,), A m^2, of the coils at currents (n,), A."""
+        x, y, z, *others = currents
+        dipole = turned(self._coils[0], (x, y, z))
+        if others:
+            a, b, c = dipole
+            x, y, z = [*others, *self._idle]
+            d, e, f = turned(self._coils[1], (x, y, z))
+            dipole = a + d, b + e, c + f
+        return dipole
 
     def residual_dipole(self, around: OrbitEnvironment) -> Floats:
         """Return the residual dipole (3,), A m^2, body axes."""
@@ -436,9 +447,9 @@ LONGEST_STEP = 0.1
 
 @dataclass(frozen=True, slots=True)
 class CoilSupply:
-    """Resistance (3,), ohm, and supply voltage (V) of the coils."""
+    """Resistance (n,), ohm, and supply voltage (V) of the coils."""
 
-    resistance: tuple[float, float, float]
+    resistance: tuple[float, ...]
     voltage: float
 
 
@@ -481,7 +492,7 @@ class FreeBody:
         self._state: State = (a, b, c, d, 0.0, 0.0, 0.0)
         self._start_ns, self._release_ns = start_ns, NEVER
         self._held = True
-        self._acting: Floats = ZERO
+        self._acting: tuple[float, ...] = (0.0,) * len(supply.resistance)
         self._read: tuple[State, BodyMotion | None] = self._state, None
         self._slot = -1
         self._torque, self._residual = ZERO, ZERO
@@ -499,10 +510,10 @@ class FreeBody:
         """Advance the world to `time_ns` under the present coil currents."""
         if time_ns <= self.time_ns:
             return
-        x, y, z = self._currents().tolist()
-        if (x, y, z) != self._acting:
+        currents = tuple(self._currents().tolist())
+        if currents != self._acting:
             self._integrate()
-            self._acting = x, y, z
+            self._acting = currents
         self.time_ns = time_ns
 
     def motion(self, time_ns: int) -> BodyMotion:
@@ -555,7 +566,9 @@ class FreeBody:
             torques=lambda: self._torques(around, state, acting),
         )
 
-    def _torques(self, around: OrbitEnvironment, state: State, acting: Floats) -> dict[str, FloatArray]:
+    def _torques(
+        self, around: OrbitEnvironment, state: State, acting: tuple[float, ...]
+    ) -> dict[str, FloatArray]:
         """Return the torque (3,), N m, body axes, of each disturbance in `CAUSES`."""
         turn = matrix(*state[:4])
         attitude = quaternion.multiply(self._from_principal, np.array(state[:4]))
@@ -587,9 +600,12 @@ class FreeBody:
         start, end = self._seconds(self._done_ns), self._seconds(self.time_ns)
         if end <= start:
             return
-        (x, y, z), (a, b, c) = self._acting, self._supply.resistance
-        self.energy += (end - start) * (a * x * x + b * y * y + c * z * z)
-        self.supply_energy += (end - start) * self._supply.voltage * (abs(x) + abs(y) + abs(z))
+        heat = drawn = 0.0
+        for current, ohm in zip(self._acting, self._supply.resistance, strict=True):
+            heat += ohm * current * current
+            drawn += abs(current)
+        self.energy += (end - start) * heat
+        self.supply_energy += (end - start) * self._supply.voltage * drawn
         steps = steps_within(end - start, math.hypot(*self._state[4:]), LONGEST_STEP)
         for step in range(steps):
             self._step(start + (end - start) * step / steps, start + (end - start) * (step + 1) / steps)
@@ -658,7 +674,7 @@ def built_craft(
     `description`. Raises ConfigError as `craft_model`.
     """
     built = build(craft or craft_model(section), section.disturbances, errors)
-    return _differing(built, description)
+    return built if description is NO_ERRORS else _differing(built, description)
 
 
 def craft_model(section: FreeBodySection, config: Config | None = None) -> CraftModel:
@@ -719,8 +735,7 @@ def _differing(craft: TrueCraft, errors: DescriptionErrors) -> TrueCraft:
 def coil_supply(inputs: WorldInputs) -> CoilSupply:
     """Return the true resistance and supply voltage of the coils of a configuration."""
     coils, truth = inputs.config.coils, inputs.section.truth
-    x, y, z = truth.resistance or coils.resistance
-    return CoilSupply((x, y, z), truth.supply_voltage or coils.supply_voltage)
+    return CoilSupply(truth.resistance or coils.resistance, truth.supply_voltage or coils.supply_voltage)
 
 
 def make(inputs: WorldInputs) -> FreeBody:

@@ -47,7 +47,7 @@ class TestbedModel:
         field: horizontal magnetic field, T.
         stiffness: torsional stiffness of the thread, N m/rad.
         damping: damping by thread and air, N m s/rad.
-        resistance: resistance (3,) of the coils, ohm.
+        resistance: resistance of each of the three coils, ohm.
         supply_voltage: voltage across a coil that is fully on, V.
     """
 
@@ -58,7 +58,7 @@ class TestbedModel:
     field: float
     stiffness: float
     damping: float
-    resistance: tuple[float, float, float]
+    resistance: tuple[float, ...]
     supply_voltage: float
 
 
@@ -160,14 +160,13 @@ def model_of(config: TestbedConfig, section: Simulation) -> tuple[TestbedModel, 
     if release is None:
         raise ConfigError("simulation.release", "is missing: the world testbed needs it")
     plant, truth = config.plant, section.truth
-    x, y, z = truth.resistance or config.coils.resistance
     model = TestbedModel(
         inertia=truth.inertia or plant.inertia,
         dipole_per_ampere=plant.coil_turns * plant.coil_area,
         field=truth.field or plant.field,
         stiffness=section.thread.stiffness,
         damping=section.thread.damping,
-        resistance=(x, y, z),
+        resistance=truth.resistance or config.coils.resistance,
         supply_voltage=truth.supply_voltage or config.coils.supply_voltage,
     )
     return model, 2.0 * float(np.arcsin(release.q2)), release.rate

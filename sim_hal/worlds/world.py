@@ -15,10 +15,11 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from flight.link.telemetry.definitions import ORBIT_TRUTH, TRUE_DESCRIPTION, TRUTH
+from flight.link.telemetry.definitions import ORBIT_TRUTH, TRUE_COIL_CURRENTS, TRUE_DESCRIPTION, TRUTH
 from flight.link.telemetry.packets import Packer
 from flight.schema.document import ConfigError, imported
 from flight.schema.sections import Config
+from hal.interfaces.devices import MOST_COILS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from knightcube.astro.quaternion import about_axis_y
@@ -74,7 +75,7 @@ class WorldTruth:
     """Quantities of the truth log other than the motion: coil currents and energies.
 
     Attributes:
-        current: mean coil currents (3,) that acted on the body, A.
+        current: mean coil currents (n,) that acted on the body, A.
         energy: integral of R I^2 over time since the release, summed over the coils, J.
         supply_energy: integral of V |I| over time since the release, summed over the coils, J.
     """
@@ -269,11 +270,14 @@ class TruthRecorder:
             since_ns,
             quaternion=motion.quaternion.tolist(),
             rate=motion.rate.tolist(),
-            current=truth.current.tolist(),
+            current=truth.current[:3].tolist(),
             energy=truth.energy,
             supply_energy=truth.supply_energy,
         )
         self._log.write(packet)
+        if len(truth.current) > 3:
+            padded = [*truth.current.tolist(), *[math.nan] * (MOST_COILS - len(truth.current))]
+            self._log.write(self._packer.pack(TRUE_COIL_CURRENTS, since_ns, current=padded))
         if since_ns % ORBIT_PERIOD_NS != 0 or not isinstance(world, OrbitingWorld):
             return
         orbit = world.orbit_truth()

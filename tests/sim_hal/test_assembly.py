@@ -8,13 +8,14 @@ import pytest
 from flight.schema import reader
 from flight.schema import reader as configuration
 from flight.schema.devices import UnitCalibration
+from flight.schema.document import ConfigError
 from flight.schema.sections import Config
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal.clock import SimClock
 from sim_hal.emulators.vn100_sensors import Vn100Sample
 from sim_hal.rig import build_lockstep
-from sim_hal.settings import FreeBodySection, ImuNoise, TipOff, Vector
+from sim_hal.settings import FreeBodySection, ImuNoise, TipOff, Truth, Vector
 from sim_hal.worlds.world import BodyMotion
 from tests.support.flights import demo_config, demo_world
 
@@ -101,6 +102,18 @@ def gauss(coil_field: tuple[Vector, Vector, Vector], driven: bool) -> tuple[Floa
         lock.hardware.bus.write_i2c_block_data(0x40, 0x1A, [0, 0, 0, 4])
     lock.clock.sleep_until_ns(lock.clock.now_ns() + 100_000_000)
     return seen[-1], lock.hardware.circuit.currents()
+
+
+def test_a_coil_field_or_a_resistance_without_a_value_for_each_coil_is_refused() -> None:
+    rows = ((5e-4, 0.0, 0.0, 0.0), (0.0, 4e-4, 0.0, 0.0), (0.0, 0.0, 3e-4, 0.0))
+    four = configuration.replace(demo_world(), coil_field=rows)
+    with pytest.raises(
+        ConfigError, match="coil_field: has 4 values in a row: give one value for each of the 3"
+    ):
+        build_lockstep(demo_config(10.0, camera=False), four, None, SimClock())
+    two = configuration.replace(demo_world(), truth=Truth(resistance=(20.0, 20.0)))
+    with pytest.raises(ConfigError, match=r"resistance: has 2 values: give one value for each of the 3"):
+        build_lockstep(demo_config(10.0, camera=False), two, None, SimClock())
 
 
 def test_the_coils_add_their_matrix_times_their_currents() -> None:

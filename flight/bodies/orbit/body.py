@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +26,7 @@ from flight.bodies.orbit.guidance import (
     PointingTargets,
     Sensor,
 )
-from flight.bodies.orbit.learned_states import COIL_FACTORS, learned_of, start_from
+from flight.bodies.orbit.learned_states import BODY, COIL_FACTORS, learned_of, start_from
 from flight.bodies.streak_methods import corner_estimator
 from flight.link import events
 from flight.link.modes import Mode
@@ -43,7 +44,7 @@ from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.devices import GpsReading, StringReading
 from hal.interfaces.wires import SECOND_NS
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitState, TwoLineElements
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
@@ -187,6 +188,9 @@ class SatelliteEstimation(BodyEstimation):
         self.filter = self.orbit_filter
         self.feed = OrbitFeed(self.orbit_filter)
         self.coil_monitor = _coil_monitor(config)
+        self._coils, self._errors = config.coils.map(), description_errors(config)
+        self._used = self.coil_monitor.available
+        self._whole_body: Learned | None = None
         if COIL_FACTORS in learned:
             factors, spread = learned[COIL_FACTORS].arrays()
             if problem := self.coil_monitor.restore(factors, np.sqrt(spread.diagonal())):
@@ -211,11 +215,39 @@ class SatelliteEstimation(BodyEstimation):
         """Return the filter's slow states, with the time to which they refer, and the coils' factors."""
         coils = self.coil_monitor.correction
         factors = Learned.of(coils.factors, np.diag(coils.deviations**2))
-        return {**learned_of(self.orbit_filter.slow, _utc(self._services)), COIL_FACTORS: factors}
+        found = {**learned_of(self.orbit_filter.slow, _utc(self._services)), COIL_FACTORS: factors}
+        # With an isolated coil, the matrix of more than three coils does not hold for all coils.
+        if self._used.all() or not self._coils.is_redundant:
+            self._whole_body = found[BODY]
+        elif self._whole_body is not None:
+            found[BODY] = self._whole_body
+        else:
+            del found[BODY]
+        return found
 
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
         """Pass a correction of the coils to the filter, which resets the learned matrix of these coils."""
         self.orbit_filter.correct_coils(change, deviations)
+        self._renew_redundant_coils()
+
+    def coils_used(self, used: BoolArray) -> None:
+        """Accept which coils (n,) are in use. The matrix of more than three coils depends on them."""
+        self._used = used
+        self._renew_redundant_coils()
+
+    def _renew_redundant_coils(self) -> None:
+        """Reset the learned matrix of more than three coils after a change of coils or allocation.
+
+        Parallel coils have no matrix, so their matrix is kept.
+        """
+        if not self._coils.is_redundant:
+            return
+        with suppress(UsageError):
+            coils, errors, used = self._coils.working(self._used), self._errors, self._used
+            gains = np.full(len(coils.current_limits), errors.coil_gain)
+            corrected = self.coil_monitor.correction.deviations[used] / _UNIFORM
+            gains[: len(corrected)] = np.maximum(errors.coil_gain, corrected)
+            self.orbit_filter.renew_coils(coils.error_covariance(gains, errors.coil_axes))
 
     def knowledge(self) -> Knowledge:
         """Return how well the attitude is known."""
@@ -472,7 +504,7 @@ def _detumbler(
 
 
 def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
-    x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
+    full = tuple(config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     inertia = config.craft.inertia_matrix()
     settle_ns = round(config.detumble.settle * SECOND_NS)
     # The field is 16 times weaker than the testbed's, so a coil's torque takes longer to detect.
@@ -493,7 +525,7 @@ def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
     tumble = config.modes.tumble_rate
     interval_ns, limits = round(config.pointing.coil_test * SECOND_NS), np.array(config.coils.limits)
     settings = CoilMonitorSettings(
-        (x, y, z),
+        full,
         response=response,
         slow=slow,
         tumble_rate=tumble,

@@ -294,7 +294,7 @@ class StepReplay:
         return self.take_again(first)
 
     def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Multiply the assumed dipoles of the coils by `change` (3,), and process the steps again.
+        """Multiply the assumed dipoles of the coils by `change` (n,), and process the steps again.
 
         What was learned about these coils is reset. The steps in which a corrected coil was driven have
         unknown dipoles, because the coil may have changed during these steps.
@@ -306,12 +306,21 @@ class StepReplay:
                 step.doubt = self._settings.dipole_limit
             step.dipole = coils.dipole(change * currents)
             step.impulse = coils.dipole(change * coils.currents(step.impulse))
+        if coils.is_redundant:
+            self.take_again(0)
+            return
         memories = [step.before for step in self.steps if step.before is not None]
         inverse = coils.per_dipole(np.eye(len(change)))
         for coil in changed.tolist():
             direction = coils.dipoles[:, coil] / np.linalg.norm(coils.dipoles[:, coil])
             dual = inverse[coil] / float(inverse[coil] @ direction)
             self.free.renew_coil(direction, dual, float(deviations[coil]), memories)
+        self.take_again(0)
+
+    def renew_coils(self, covariance: FloatArray) -> None:
+        """Reset the learned matrix of the coils to a covariance (9, 9), and process the steps again."""
+        memories = [step.before for step in self.steps if step.before is not None]
+        self.free.renew_coils(covariance, memories)
         self.take_again(0)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
@@ -716,7 +725,7 @@ class OrbitFilter:
         return self._free.magnet_bias
 
     def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
-        """Record the coil currents (3,), A, that flow from `time_ns` on.
+        """Record the coil currents (n,), A, that flow from `time_ns` on.
 
         The flag `known` states whether the coils certainly carry these currents.
         """
@@ -728,14 +737,19 @@ class OrbitFilter:
         self._replay.doubt_since(since_ns)
 
     def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Reset the learned matrix of the coils whose assumed dipole was multiplied by `change` (3,).
+        """Reset the learned matrix of the coils whose assumed dipole was multiplied by `change` (n,).
 
-        The relative standard deviations of the corrected dipoles are `deviations` (3,). Without this reset,
+        The relative standard deviations of the corrected dipoles are `deviations` (n,). Without this reset,
         the filter would apply a correction twice, in the dipole and in the matrix that it learned before.
         """
         self._close()
         self._replay.correct_coils(change, deviations)
         self._dipoles.unknown_ns = max(self._dipoles.unknown_ns, self.measured_ns)
+
+    def renew_coils(self, covariance: FloatArray) -> None:
+        """Reset the learned matrix of the coils to a covariance (9, 9), because the allocation changed."""
+        self._close()
+        self._replay.renew_coils(covariance)
 
     def accept(self, reading: ImuReading) -> bool:
         """Accept a reading, and return whether there is an estimate that agrees with the gyro."""

@@ -309,7 +309,7 @@ def detumbling_law(config: TestbedConfig, plant: SingleAxisPlant) -> BdotLaw:
 
 def coil_monitor(config: TestbedConfig, plant: SingleAxisPlant) -> CoilMonitor:
     """Return the monitor of the coils and their circuit."""
-    x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
+    full = tuple(config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     response = ResponseSettings(
         np.eye(3) * plant.inertia,
         dipole_per_ampere(config),
@@ -317,7 +317,7 @@ def coil_monitor(config: TestbedConfig, plant: SingleAxisPlant) -> CoilMonitor:
         free=(False, True, False),
     )
     tumble = config.modes.tumble_rate
-    return CoilMonitor(CoilMonitorSettings((x, y, z), response=response, tumble_rate=tumble))
+    return CoilMonitor(CoilMonitorSettings(full, response=response, tumble_rate=tumble))
 
 
 def planning_settings(config: TestbedConfig) -> PlanningSettings:

@@ -18,6 +18,7 @@ from typing import Literal
 
 from flight.link.events import Severity
 from flight.link.modes import Mode
+from hal.interfaces.devices import COIL_NAMES, MOST_COILS
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 
 Range = tuple[float, float]
@@ -161,8 +162,8 @@ STREAMS: States = ((0, "not-fitted"), (1, "never"), (2, "stale"), (3, "invalid")
 """States of the quality of a stream of readings (`flight.loop.facts.StreamState`)."""
 KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
 """States of the quality of the attitude estimate (`flight.bodies.orbit.body`)."""
-COILS: States = ((0, "x"), (1, "y"), (2, "z"))
-"""Torque coils, numbered by body axis."""
+COILS: States = tuple(enumerate(COIL_NAMES))
+"""Torque coils in the order of the configuration."""
 STAGES: States = tuple(enumerate(("accepted", "refused", "started", "completed", "failed", "repeated"), 1))
 """Stages of a command (`flight.link.process.commanding.Stage`)."""
 
@@ -171,53 +172,21 @@ SEVERITY_ALARMS: Alarms = ((int(Severity.WARNING), "warning"), (int(Severity.FAU
 STREAM_ALARMS: Alarms = ((1, "fault"), (2, "fault"), (3, "fault"), (4, "warning"))
 LOST_ALARM: Alarms = ((0, "warning"),)
 
-_FACTS: tuple[tuple[str, Level], ...] = (
-    ("boot-waits", "warning"),
-    ("task-failing", "fault"),
-    ("no-progress", "fault"),
-    ("imu-silent", "fault"),
-    ("imu-unusable", "fault"),
-    ("imu-line-lost", "fault"),
-    ("control-lost", "fault"),
-    ("blind", "fault"),
-    ("tumbling", "warning"),
-    ("hold-impossible", "fault"),
-    ("slew-late", "warning"),
-    ("holding", "warning"),
-    ("coil-fault", "fault"),
-    ("coil-x-broken", "fault"),
-    ("coil-y-broken", "fault"),
-    ("coil-z-broken", "fault"),
-    ("coil-suspect", "warning"),
-    ("commands-doubted", "warning"),
-    ("power-doubted", "warning"),
-    ("power-fault", "warning"),
-    ("camera-lost", "warning"),
-    ("log-fault", "fault"),
-    ("cpu-high", "warning"),
-    ("memory-grows", "warning"),
-    ("memory-high", "fault"),
-    ("disk-low", "warning"),
-    ("hot", "warning"),
-    ("too-hot", "fault"),
-    ("imu-poor", "warning"),
-    ("field-poor", "warning"),
-    ("coils-poor", "warning"),
-    ("power-poor", "warning"),
-    ("camera-poor", "warning"),
-    ("service-failing", "fault"),
-    ("camera-late", "warning"),
-    ("vision-slow", "warning"),
-    ("gps-lost", "warning"),
-    ("gps-poor", "warning"),
-    ("strings-lost", "warning"),
-    ("sun-unclear", "warning"),
-    ("clock-off", "warning"),
-    ("field-refused", "warning"),
-    ("wide-lost", "warning"),
-    ("wide-false", "warning"),
+_NAMES = """
+    boot-waits task-failing! no-progress! imu-silent! imu-unusable! imu-line-lost! control-lost! blind!
+    tumbling hold-impossible! slew-late holding coil-fault! coil-x-broken! coil-y-broken! coil-z-broken!
+    coil-suspect commands-doubted power-doubted power-fault camera-lost log-fault! cpu-high memory-grows
+    memory-high! disk-low hot too-hot! imu-poor field-poor coils-poor power-poor camera-poor
+    service-failing! camera-late vision-slow gps-lost gps-poor strings-lost sun-unclear clock-off
+    field-refused wide-lost wide-false coil-4-broken! coil-5-broken! coil-6-broken!
+"""
+_FACTS: tuple[tuple[str, Level], ...] = tuple(
+    (name.rstrip("!"), "fault" if name.endswith("!") else "warning") for name in _NAMES.split()
 )
-"""Conditions that the monitors detect, in the order of `flight.loop.facts`, each with its severity."""
+"""Conditions that the monitors detect, in the order of `flight.loop.facts`, each with its severity.
+
+In `_NAMES`, an exclamation mark follows the name of a fault; the other conditions are warnings.
+"""
 FACTS: States = tuple((bit, name) for bit, (name, _) in enumerate(_FACTS))
 FACT_ALARMS: Alarms = tuple((bit, level) for bit, (_, level) in enumerate(_FACTS))
 
@@ -237,7 +206,7 @@ RUN = Packet(
         flag("realtime", "whether the run uses the machine's clock; no means lock-step simulation"),
         Field("control_period_ns", "u8", "ns", "period of the control rate group"),
         Field("duration", "f8", "s", "planned duration of the run; NaN for an unlimited run"),
-        Field("coil_resistance", "f8", "ohm", "resistance of each coil; NaN if not fitted", 3),
+        Field("coil_resistance", "f8", "ohm", "resistance of the first three coils; NaN if not fitted", 3),
         Field(
             "supply_voltage",
             "f8",
@@ -397,6 +366,19 @@ ATTITUDE = Packet(
     ),
 )
 
+_ABSENT = ", in the order of the configuration; NaN for coils that are not fitted"
+
+COIL_CURRENTS = Packet(
+    "coil_currents",
+    0x11A,
+    "10 Hz, only with more than three coils",
+    "Currents of up to six coils",
+    (
+        Field("command", "f4", "A", _WANTED + _ABSENT, MOST_COILS),
+        Field("written", "f4", "A", _WRITTEN + _ABSENT, MOST_COILS),
+    ),
+)
+
 TARGET = Packet(
     "target",
     0x112,
@@ -455,10 +437,18 @@ TRUTH = Packet(
     (
         Field("quaternion", "f8", "-", "rotation of reference frame into body, scalar last", 4),
         Field("rate", "f8", "rad/s", "body rate, body axes", 3),
-        Field("current", "f8", "A", "true mean currents of the coils", 3),
+        Field("current", "f8", "A", "true mean currents of the first three coils", 3),
         Field("energy", "f8", "J", "integral of R I^2 over all coils since mission time zero"),
         Field("supply_energy", "f8", "J", "integral of V |I| over all coils since mission time zero"),
     ),
+)
+
+TRUE_COIL_CURRENTS = Packet(
+    "true_coil_currents",
+    0x143,
+    "40 Hz, simulation only, only with more than three coils",
+    "True currents of up to six coils, which sim_hal writes",
+    (Field("current", "f4", "A", "true mean currents" + _ABSENT, MOST_COILS),),
 )
 
 
@@ -497,8 +487,8 @@ NAVIGATION = Packet(
 )
 
 _INERTIA = "inertia tensor xx yy zz yz zx xy, body axes"
-_COILS = "matrix from the dipole of current_command to the actual dipole, row by row"
-_TRUE_COILS = "matrix from the dipole of current_written to the actual dipole, row by row"
+_COILS = "matrix from the dipole of the commanded currents to the actual dipole, row by row"
+_TRUE_COILS = "matrix from the dipole of the written currents to the actual dipole, row by row"
 _GYRO = "matrix from the rate to the rate that the gyro measures, row by row"
 _FIELD = "matrix from the magnetic field to the field that the magnetometer measures, row by row"
 _CAMERA = "rotation vector of the star camera from its configured mounting, body axes"
@@ -890,6 +880,7 @@ PACKETS: tuple[Packet, ...] = (
     IMU,
     CONTROL,
     ATTITUDE,
+    COIL_CURRENTS,
     SPIN,
     NAVIGATION,
     DESCRIPTION,
@@ -912,6 +903,7 @@ PACKETS: tuple[Packet, ...] = (
     VERIFICATION,
     TRANSFER,
     TRUTH,
+    TRUE_COIL_CURRENTS,
     ORBIT_TRUTH,
     TRUE_DESCRIPTION,
     CYCLE_TIMING,

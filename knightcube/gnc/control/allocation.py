@@ -1,12 +1,12 @@
 """Allocation of a torque to the available coils, with the direction of the torque preserved.
 
 A dipole moment m causes the torque m x B, which has no component along the field B (Wertz 1978, section
-18.1). With three coils, the smallest dipole moment for a torque T normal to B is B x T / B^2. For any number
-lambda, the dipole moment m + lambda B causes the same torque as m. If one coil has failed, lambda is chosen
-so that the failed coil needs no current, which is possible unless the axis of the failed coil is normal to
-the field. A requested torque that the coils cannot produce is projected onto the space of torques that the
-coils can produce. If a current exceeds its limit, all currents are scaled by one factor, which preserves the
-direction of the torque (the idea of CMU's Argus flight software).
+18.1). With three equal coils, the smallest dipole moment for a torque T normal to B is B x T / B^2. For any
+number lambda, the dipole moment m + lambda B causes the same torque as m. If one coil has failed, lambda is
+chosen so that the failed coil needs no current, which is possible unless the axis of the failed coil is
+normal to the field. A requested torque that the coils cannot produce is projected onto the space of torques
+that the coils can produce. If a current exceeds its limit, all currents are scaled by one factor, which
+preserves the direction of the torque (the idea of CMU's Argus flight software).
 """
 
 from __future__ import annotations
@@ -47,13 +47,16 @@ def allocate(
     limits: FloatArray,
     available: FloatArray | None = None,
     free: FloatArray | None = None,
+    resistance: FloatArray | None = None,
 ) -> Allocation:
     """Return currents for a torque (3,) N m in a magnetic field (3,) T, body axes.
 
     Column k of `dipoles` (3, n) is the dipole moment of coil k per ampere, m^2. The current limits of the
     coils are `limits` (n,), A, and the mask `available` (n,) marks the coils that may be used. The mask
     `free` (3,) marks the axes about which the body can rotate; a suspension thread carries the torque about
-    the other axes. Raises FlightError for an input that is not finite.
+    the other axes. Of all currents that make the torque, those with the least heat in the resistances
+    `resistance` (n,), ohm, are chosen; equal resistances are the default. Raises FlightError for an input
+    that is not finite.
     """
     wanted = np.asarray(torque, dtype=np.float64)
     if not (np.isfinite(wanted).all() and np.isfinite(field).all()):
@@ -63,7 +66,9 @@ def allocate(
     # Column i of the matrix `effect` is the torque about the free axes that one ampere in coil i causes.
     effect = turns[:, None] * np.cross(dipoles.T, field).T * usable
     wanted = wanted * turns
-    currents = np.linalg.pinv(effect, rcond=WEAKEST) @ wanted * usable
+    # The square of a current times the root of its resistance is proportional to the heat.
+    weights = np.ones(len(usable)) if resistance is None else np.sqrt(resistance / resistance.max())
+    currents = np.linalg.pinv(effect / weights, rcond=WEAKEST) @ wanted / weights * usable
     excess = float(np.max(np.abs(currents) / limits))
     if excess > 1.0:
         currents = currents / excess

@@ -1,23 +1,51 @@
-"""The linear map between the dipole moment of a satellite and the currents of its coils.
+"""The map between the dipole moment of a satellite and the currents of its coils.
 
 Column k of the matrix D (3, n) is the dipole moment of coil k per ampere, so the currents i make the dipole
-moment D i. Of all currents that make a dipole moment m, the currents P m with the pseudo-inverse P of D have
-the smallest norm. Control laws and planners need only dipole moments in body axes and one limit per body
-axis. The limits span the largest box of dipole moments that the coils can make. The heat of a dipole moment m
-is m' H m with H = P' R P, where R is the diagonal matrix of the coils' resistances.
+moment D i. More than three coils can make a dipole moment by different currents. Of these, the currents with
+the least heat i' R i are used, where R is the diagonal matrix of the coils' resistances. Without a current
+limit, they are P m for a dipole moment m, with the weighted pseudo-inverse P of D. If P m exceeds the limit
+of a coil, the other coils carry the remainder. Control laws and planners need only dipole moments in body
+axes and one limit per body axis. The limits span the largest box of dipole moments that the coils can make.
+The heat of a dipole moment m is m' H m with H = P' R P.
 """
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.errors import UsageError
 
 LEAST_SPREAD = 0.05
 """Smallest singular value of the unit vectors along the coils. Below it, the coils lie nearly in a plane."""
 _STEPS = 200
 """Largest number of iterations for the box of dipole moments."""
+_PARALLEL = 1e-6
+"""Smallest sine of the angle between two coils that are not parallel."""
+_NEWTON_STEPS, _EXACT = 60, 1e-9
+"""Largest number of Newton steps for limited currents, and relative accuracy of their dipole moment."""
+_SATURATED = 1e-4
+"""Weight of a coil at its limit in the Newton matrix, relative to a coil below its limit."""
+
+
+def missing_direction(dipoles: FloatArray) -> FloatArray | None:
+    """Return the unit vector (3,) along which coils in a plane make no dipole, or None if they span space.
+
+    Column k of `dipoles` (3, n) is along coil k. Raises UsageError if all coils are parallel.
+    """
+    lengths = np.linalg.norm(dipoles, axis=0)
+    directions, sizes, _ = np.linalg.svd(dipoles / lengths)
+    if dipoles.shape[1] < 2 or sizes[1] < LEAST_SPREAD:
+        axis = ", ".join(f"{component:.2f}" for component in dipoles[:, 0] / lengths[0])
+        raise UsageError(
+            f"all coils lie along [{axis}]: give at least one of them another axis, because parallel coils "
+            "control the rotation about one axis only"
+        )
+    if len(sizes) == 3 and sizes[2] >= LEAST_SPREAD:
+        return None
+    return np.asarray(directions[:, 2])
 
 
 class CoilMap:
@@ -26,22 +54,25 @@ class CoilMap:
     Attributes:
         dipoles: dipole moment of each coil per ampere (3, n), m^2, body axes, one column per coil.
         current_limits: largest current of each coil (n,), A.
+        resistance: resistance of each coil (n,), ohm.
         limits: largest dipole moment along each body axis (3,), A m^2. All dipole moments within these three
             limits can be made.
-        heat: heating power per squared dipole moment (3, 3), W/(A m^2)^2, body axes.
+        heat: heating power per squared dipole moment (3, 3), W/(A m^2)^2, body axes, of currents below their
+            limits.
     """
 
     def __init__(self, dipoles: FloatArray, current_limits: FloatArray, resistance: FloatArray) -> None:
         """Raise UsageError if the coils cannot make a dipole moment in every direction."""
-        strength = np.linalg.norm(dipoles, axis=0)
-        spread = float(np.linalg.svd(dipoles / strength, compute_uv=False)[-1])
-        if dipoles.shape[1] < 3 or spread < LEAST_SPREAD:
-            raise UsageError("the axes of the coils lie in one plane: along its normal they make no dipole")
-        self.dipoles, self.current_limits = dipoles, current_limits
+        normal = missing_direction(dipoles)
+        if normal is not None:
+            axis = ", ".join(f"{component:.2f}" for component in normal)
+            raise UsageError(f"the coils lie in one plane and make no dipole along its normal [{axis}]")
+        self.dipoles, self.current_limits, self.resistance = dipoles, current_limits, resistance
         self._strength: FloatArray | None = None
         if np.count_nonzero(dipoles) == 3 and dipoles.shape == (3, 3) and np.diag(dipoles).all():
             self._strength = np.diag(dipoles).copy()
-        self._inverse: FloatArray = np.asarray(np.linalg.pinv(dipoles))
+        weights = np.sqrt(resistance / resistance.max())
+        self._inverse: FloatArray = np.asarray(np.linalg.pinv(dipoles / weights) / weights[:, None])
         self.limits = self._box()
         self.heat: FloatArray = self.per_dipole(self.per_dipole(np.diag(resistance)).T)
 
@@ -51,11 +82,77 @@ class CoilMap:
         limits, ohms = np.full(3, current_limit), np.full(3, resistance)
         return cls(dipole_per_ampere * np.eye(3), limits, ohms)
 
+    @property
+    def is_redundant(self) -> bool:
+        """Whether different currents can make the same dipole moment."""
+        return len(self.current_limits) > 3
+
+    def working(self, used: BoolArray) -> CoilMap:
+        """Return the map of the coils that work, with limits and heat of these coils.
+
+        If the coils that work lie in a plane, a coil along its normal is assumed, with half the dipole moment
+        of the weakest coil. Allocation makes a dipole moment along the normal by adding a dipole moment along
+        the magnetic field. Raises UsageError if all coils that work are parallel.
+
+        Args:
+            used: flags (n,) of the coils that work.
+        """
+        if used.all():
+            return self
+        if not used.any():
+            raise UsageError("no coil works")
+        dipoles, limits = self.dipoles[:, used], self.current_limits[used]
+        resistance = self.resistance[used]
+        normal = missing_direction(dipoles)
+        if normal is not None:
+            weakest = int(np.argmin(np.linalg.norm(dipoles, axis=0) * limits))
+            assumed = 0.5 * float(np.linalg.norm(dipoles[:, weakest])) * normal
+            dipoles = np.column_stack([dipoles, assumed])
+            limits = np.append(limits, limits[weakest])
+            resistance = np.append(resistance, resistance[weakest])
+        return CoilMap(dipoles, limits, resistance)
+
     def currents(self, dipole: FloatArray) -> FloatArray:
-        """Return the smallest currents (n,), A, that make a dipole moment (3,), A m^2."""
+        """Return the currents (n,), A, of least heat that make a dipole moment (3,), A m^2.
+
+        More than three coils stay within their limits if the dipole moment is within `limits`.
+        """
         if self._strength is not None:
             return np.asarray(dipole / self._strength)
-        return np.asarray(self._inverse @ dipole)
+        found = np.asarray(self._inverse @ dipole)
+        if self.is_redundant and (np.abs(found) > self.current_limits).any():
+            return self._limited_currents(dipole)
+        return found
+
+    def _limited_currents(self, dipole: FloatArray) -> FloatArray:
+        """Return the currents (n,), A, of least heat within the limits that make a dipole moment (3,).
+
+        By duality, the currents are those that a vector y (3,) of multipliers causes: R^-1 D' y, clipped to
+        the limits. The multipliers maximise a concave function, whose gradient is the missing dipole moment.
+        They are found by Newton's method with a line search.
+        """
+        limits, resistance = self.current_limits, self.resistance
+
+        def at(multipliers: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+            pull = multipliers @ self.dipoles
+            free = pull / resistance
+            held = np.clip(free, -limits, limits)
+            value = float(multipliers @ dipole - held @ pull + 0.5 * resistance @ held**2)
+            return value, held, np.where(np.abs(free) < limits, 1.0, _SATURATED) / resistance
+
+        multipliers = self.heat @ dipole
+        value, held, weights = at(multipliers)
+        for _ in range(_NEWTON_STEPS):
+            missing = dipole - self.dipoles @ held
+            if float(np.abs(missing).max()) <= _EXACT * float(np.abs(dipole).max()):
+                break
+            step = np.linalg.solve((self.dipoles * weights) @ self.dipoles.T, missing)
+            size, gain = 1.0, 0.1 * float(step @ missing)
+            while size > _EXACT and at(multipliers + size * step)[0] < value + size * gain:
+                size *= 0.5
+            multipliers = multipliers + size * step
+            value, held, weights = at(multipliers)
+        return held
 
     def dipole(self, currents: FloatArray) -> FloatArray:
         """Return the dipole moment (3,), A m^2, of currents (n,), A."""
@@ -74,27 +171,37 @@ class CoilMap:
         """Whether three coils lie along the body axes x, y and z, in this order."""
         return self._strength is not None
 
-    def error_covariance(self, gain: float, axes: float) -> FloatArray:
+    def error_covariance(self, gain: float | FloatArray, axes: float) -> FloatArray:
         """Return the covariance (9, 9) of the matrix from the commanded to the actual dipole, row by row.
 
         The errors of the coils are independent and uniform. The dipole of a coil has the largest relative
-        error `gain`, and its axis the largest misalignment `axes` (rad) in each of two directions.
+        error `gain`, equal for all coils or (n,), and its axis the largest misalignment `axes` (rad) in each
+        of two directions.
         """
         found: FloatArray = np.zeros((3, 3, 3, 3))
-        for dipole, current in zip(self.dipoles.T, self._inverse, strict=True):
+        gains = np.broadcast_to(gain, len(self.current_limits))
+        for dipole, current, error in zip(self.dipoles.T, self._inverse, gains, strict=True):
             along = np.outer(dipole, dipole)
             across = float(dipole @ dipole) * np.eye(3) - along
-            own = (gain**2 * along + axes**2 * across) / 3.0
+            own = (error**2 * along + axes**2 * across) / 3.0
             found += np.einsum("ik,j,l->ijkl", own, current, current)
         return found.reshape(9, 9)
 
     def _box(self) -> FloatArray:
-        """Return the half lengths (3,) of the box with the largest volume inside what the coils can make."""
+        """Return the half lengths (3,) of the box with the largest volume inside what the coils can make.
+
+        The set of dipole moments that the coils can make is a zonotope, whose faces are normal to the cross
+        products of two coils.
+        """
         if self._strength is not None:
             return np.abs(self._strength) * self.current_limits
-        # The largest current of coil k within the box b is |P_k| b. Each step shares the violation among the
-        # axes, as in iterative proportional fitting, and converges to the box of largest volume.
-        use = np.abs(self._inverse) / self.current_limits[:, None]
+        units = self.dipoles / np.linalg.norm(self.dipoles, axis=0)
+        normals = np.array([np.cross(one, other) for one, other in combinations(units.T, 2)])
+        normals = normals[np.linalg.norm(normals, axis=1) > _PARALLEL]
+        reached = np.abs(normals @ self.dipoles) @ self.current_limits
+        # A row times the box is the largest fraction of the distance to a face within the box.
+        # Each step shares the violation among the axes, as in iterative proportional fitting.
+        use = np.abs(normals) / reached[:, None]
         multipliers = np.full(len(use), 3.0 / len(use))
         for _ in range(_STEPS):
             box = 1.0 / (multipliers @ use)

@@ -518,6 +518,21 @@ class FreeFilter:
             covariance[:] = kept @ covariance @ kept.T
             covariance[COILS, COILS] += fresh
 
+    def renew_coils(self, covariance: FloatArray, memories: Sequence[FreeMemory] = ()) -> None:
+        """Reset the learned matrix of the coils to the identity with a covariance (9, 9), row by row.
+
+        The estimate and its copies `memories` are changed. This is necessary for more than three coils when
+        coils are isolated or corrected, because the matrix depends on the allocation of currents.
+        """
+        self.changes += 1
+        estimated = self.layout.prior[COILS, COILS].any()
+        for constants, whole in (
+            (self._constants, self.covariance),
+            *((memory.constants, memory.covariance) for memory in memories),
+        ):
+            constants[COILS] = whole[COILS] = whole[:, COILS] = 0.0
+            whole[COILS, COILS] = covariance if estimated else 0.0
+
     @property
     def gyro_bias(self) -> FloatArray:
         """Gyro bias (3,) rad/s."""

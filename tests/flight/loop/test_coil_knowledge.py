@@ -11,7 +11,7 @@ from hal.guardian import SILENCE_NS
 from hal.interfaces.devices import CoilState
 
 MS = 1_000_000
-OBEYS = CoilState(np.zeros(3), np.zeros(3), 0, False, 0, False, 0, "", (False, False, False))
+OBEYS = CoilState(np.zeros(3), np.zeros(3), 0, False, 0, False, 0, "")
 REFUSES = replace(OBEYS, error="pca9685 at 0x40: does not keep what is written to its outputs")
 
 

@@ -212,7 +212,7 @@ def test_an_axis_that_is_never_driven_is_not_judged() -> None:
 def test_a_leg_stuck_high_is_braked_and_its_coil_carries_nothing(fault: str) -> None:
     """With either leg, both ends of the coil are high. Only the broken coil carries a current."""
     seen = observe(hold(0.0), 10.0, [f"{fault} @ {FAULT_AT}"])
-    assert seen.watch.braked == (False, True, False)
+    assert seen.watch.braked == {1}
     time, carried = seen.times, np.abs(seen.carried)
     assert carried[time > FAULT_AT, 1].max() == pytest.approx(FULL, abs=4e-3)
     assert carried[time > FAULT_AT + 3.0, 1].max() == 0.0
@@ -228,24 +228,24 @@ def test_braking_that_does_not_help_is_ended() -> None:
     for _ in range(6):
         assert leg.look(at_rest) is None
         asked.append(leg.brake)
-    assert asked == [NO_AXES, (True, True, True), (True, True, True), NO_AXES, NO_AXES, NO_AXES]
+    assert asked == [NO_AXES, {0, 1, 2}, {0, 1, 2}, NO_AXES, NO_AXES, NO_AXES]
     for current in (0.0, 0.0, 0.148, 0.148):
         leg.look(replace(at_rest, current=current))
-    assert leg.brake == (True, True, True), "once all was normal it is looked for again"
+    assert leg.brake == {0, 1, 2}, "once all was normal it is looked for again"
 
 
 def test_a_verdict_of_a_stuck_leg_that_the_brake_does_not_bear_out_is_braked_no_more() -> None:
     watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
     watch._give(0, CoilFault.A_HIGH, 0, "a guess")
     watch._proof.add(0)
-    assert watch.braked == (True, False, False)
+    assert watch.braked == {0}
     for time in np.arange(0.0, 2.0, 0.025):
         watch.commanded(round(time * 1e9), np.zeros(3), watch.braked)
         if math.isclose(time / 0.2, round(time / 0.2), abs_tol=1e-6):
             watch.measured(reading(time, FULL))
-            if not watch.braked[0]:
+            if not watch.braked:
                 break
-    assert not watch.braked[0]
+    assert not watch.braked
     assert not watch.available[0]
 
 
@@ -283,7 +283,7 @@ def test_a_leg_stuck_high_that_drives_in_the_pauses_of_the_command_is_found() ->
     """The current in the pauses equals that between them: no conversion can distinguish the two."""
     seen = observe(windows, FAULT_AT + 7.0, [f"bridge-x: b-high @ {FAULT_AT}"])
     assert [(axis, name) for _, axis, name in seen.found] == [("x", "HIGH")]
-    assert seen.watch.braked == (True, False, False)
+    assert seen.watch.braked == {0}
 
 
 def test_a_check_at_rest_does_not_raise_suspicion() -> None:

@@ -329,7 +329,7 @@ def test_a_correction_of_an_earlier_boot_is_restored_and_reported() -> None:
 @pytest.mark.parametrize("factors", [[1.0, 1.0], [1.0, 0.0, 1.0], [1.0, -1.2, 1.0], [math.nan, 1.0, 1.0]])
 def test_an_impossible_correction_of_an_earlier_boot_is_rejected(factors: list[float]) -> None:
     watch = CoilMonitor(CoilMonitorSettings((0.148, 0.148, 0.148)))
-    assert "not three factors" in watch.restore(np.array(factors), np.zeros(3))
+    assert "not 3 factors" in watch.restore(np.array(factors), np.zeros(3))
     assert watch.correction.factors.tolist() == [1.0, 1.0, 1.0]
     assert watch.news() == []
 

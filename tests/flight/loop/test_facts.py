@@ -53,6 +53,7 @@ PERSISTENCE = {
     "coil-x-broken": (1, None, ""),
     "coil-y-broken": (1, None, ""),
     "coil-z-broken": (1, None, ""),
+    **{f"coil-{number}-broken": (1, None, "") for number in (4, 5, 6)},
     "cpu-high": (3, 3, ""),
     "memory-grows": (3, 3, ""),
     "memory-high": (3, 1, ""),
@@ -86,7 +87,7 @@ EVENTS_OF = {
     "field-refused": ("field-refused", "field-trusted"),
     "wide-lost": ("wide-lost", "wide-recovered"),
     "wide-false": ("wide-false", "wide-trusted"),
-    **{f"coil-{axis}-broken": ("coil-broken", None) for axis in "xyz"},
+    **{f"coil-{axis}-broken": ("coil-broken", None) for axis in "xyz456"},
     **{name: (name, "resource-normal") for name in ("cpu-high", "memory-grows", "disk-low", "hot")},
     **{
         f"{stream}-poor": ("stream-poor", "stream-good")

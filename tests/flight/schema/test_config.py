@@ -104,7 +104,11 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
         ("{at: 0.0,", "{att: 0.0,", "did you mean `at`"),
         ("at: 200.0", "at: 50", "must be in order of time"),
         ("duration: 700.0", "duration: 600.0", "must be later than the last target, at 600.0 s"),
-        ("channels: [0, 1]", "channels: [0, 2]", "a channel of the PWM chip twice"),
+        (
+            "channels: [0, 1]",
+            "channels: [0, 2]",
+            "use channel 2 of the PWM chip twice: give one of the two coils",
+        ),
         ("address: 0x45", "address: 0x40", "the address of the PWM chip"),
         ("exposure: 1.0", "exposure: 6.0", "must be shorter than `camera.period`"),
         ("replan_period: 5.0", "replan_period: 12.0", "must be shorter than `guidance.horizon`"),
@@ -272,8 +276,8 @@ COIL = "{axis: [0.0, 0.0, 1.0], dipole_per_ampere: 0.648, resistance: 23.0, chan
 @pytest.mark.parametrize(
     ("wrong", "complaint"),
     [
-        (COIL.replace("1.0]", "0.0]"), r"windings\[2\].axis` is zero"),
-        (COIL.replace("[0.0, 0.0, 1.0]", "[1.0, 1.0, 0.0]"), "the coils lie in one plane"),
+        (COIL.replace("1.0]", "0.0]"), r"windings\[2\].axis` is \[0.0, 0.0, 0.0\]: give the direction"),
+        (COIL.replace("dipole_per_ampere: 0.648", "turns: 80, area: 0.0"), r"area` is 0.0"),
         (
             COIL.replace("dipole_per_ampere: 0.648, ", ""),
             r"windings\[2\].dipole_per_ampere` is missing",
@@ -285,7 +289,19 @@ COIL = "{axis: [0.0, 0.0, 1.0], dipole_per_ampere: 0.648, resistance: 23.0, chan
             COIL.replace("23.0", "23.0, current_limit: 0.2"),
             r"\[2\].current_limit` is 0.2: the supply",
         ),
-        (f"{COIL}\n    - {COIL}".replace("[4, 5]", "[6, 7]", 1), "has 4 entries: two or three coils"),
+        (
+            "\n    - ".join(COIL.replace("[4, 5]", f"[{4 + 2 * k}, {5 + 2 * k}]") for k in range(5)),
+            "has 7 entries: 2 to 6 coils can be flown",
+        ),
+        (
+            "\n    - ".join(
+                COIL.replace("[4, 5]", f"[{4 + 2 * k}, {5 + 2 * k}]").replace(
+                    "[0.0, 0.0, 1.0]", "[1.0, 2.0, 0]"
+                )
+                for k in range(4)
+            ),
+            r"lie in one plane: tilt one coil towards its normal \[-?0.00, -?0.00, -?1.00\]",
+        ),
     ],
 )
 def test_a_mistake_in_the_coils_gets_one_line(wrong: str, complaint: str) -> None:
@@ -355,7 +371,7 @@ def test_two_coils_leave_the_third_axis_without_a_coil() -> None:
     assert (coils.absent, coils.channels) == (frozenset({2}), ((0, 1), (2, 3), (4, 5)))
     np.testing.assert_allclose(coils.map().dipoles, np.diag([0.648, 0.648, 0.324]))
     parallel = text.replace("axis: [0.0, 1.0, 0.0], dip", "axis: [2.0, 0.0, 0.0], dip", 1)
-    with pytest.raises(ConfigError, match="are two parallel coils"):
+    with pytest.raises(ConfigError, match=r"all coils lie along \[1.00, 0.00, 0.00\]: give at least one"):
         reader.parse(parallel)
     with pytest.raises(ConfigError, match="has 2 entries: the testbed has three coils"):
         reader.parse(re.sub(r"\n    - \{axis: \[0.0, 0.0, 1.0\].*", "", DEMO, count=1))

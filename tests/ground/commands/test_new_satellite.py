@@ -74,6 +74,15 @@ def test_the_elements_fit_the_orbit_and_the_flight_check_accepts_the_file(tmp_pa
     assert "verdict:       ready" in done.stdout
 
 
+def test_the_flight_check_accepts_a_file_with_four_coils(tmp_path: Path) -> None:
+    config = written(tmp_path, *GIVEN, *FOURTH, "--star-camera", "none", "--horizon-cameras", "no")
+    assert config.coils.channels == ((0, 1), (2, 3), (4, 5), (6, 7))
+    assert config.coils.absent == frozenset()
+    done = command("check", tmp_path / "mine.yaml")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "verdict:       ready" in done.stdout
+
+
 def test_a_satellite_without_cameras_is_accepted(tmp_path: Path) -> None:
     config = written(tmp_path, *GIVEN, "--star-camera", "none", "--horizon-cameras", "no")
     assert config.camera is None
@@ -170,8 +179,16 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
         (("--coil", "axis=x,dipole=1,current=1,resistance=5"), "these coils control one axis only"),
         (("--coil", "axis=x,turns=9,current=1,resistance=5"), "give either `dipole`"),
         (
-            ("--mass", "4", "--size", "3u", "--coil", "axis=xyz,dipole=1,current=0.1,resistance=5", *FOURTH),
-            "nothing was written: `coils.windings` has 4 entries",
+            (
+                "--mass",
+                "4",
+                "--size",
+                "3u",
+                "--coil",
+                "axis=xyz,dipole=1,current=0.1,resistance=5",
+                *4 * FOURTH,
+            ),
+            "nothing was written: `coils.windings` has 7 entries: 2 to 6 coils can be flown",
         ),
         (("--star-camera", "90"), "--star-camera 90: give a number from 6 to 40 deg, or none"),
         (("--name", "my satellite"), "--name my satellite: give letters, digits and underscores"),

@@ -6,13 +6,14 @@ import pytest
 
 from hal.drivers.coils import brake
 from hal.drivers.pca9685 import FULL_ON
+from hal.interfaces.devices import NO_AXES
 from hal.interfaces.errors import Refused
 from sim_hal.emulators.coil_circuit import CoilCondition
 from tests.hal.coils.rig import PCA, Rig
 
 MS = 1_000_000
 FULL = 3.4 / 23.0
-Y = (False, True, False)
+Y = frozenset({1})
 
 
 def stuck(condition: CoilCondition = CoilCondition.A_HIGH) -> Rig:
@@ -43,7 +44,7 @@ def test_a_sound_bridge_that_is_braked_carries_nothing_whatever_is_commanded(rig
     rig.command(0.1, 0.1, -0.05)
     assert rig.currents() == pytest.approx([0.1, 0.0, -0.05], abs=1e-4)
     assert rig.coils.state().current.tolist() == pytest.approx([0.1, 0.0, -0.05], abs=1e-4)
-    rig.coils.brake((False, False, False))
+    rig.coils.brake(NO_AXES)
     rig.command(0.1, 0.1, -0.05)
     assert rig.currents() == pytest.approx([0.1, 0.1, -0.05], abs=1e-4)
 
@@ -99,7 +100,7 @@ def test_a_brake_that_the_chip_did_not_take_is_made_up_for() -> None:
     rig = stuck()
     rig.wire.bus.nack(PCA, times=None)
     rig.coils.brake(Y)
-    assert rig.coils.state().braked == (False, False, False)
+    assert rig.coils.state().braked == NO_AXES
     assert rig.coils.state().error
     rig.wire.bus.clear_faults()
     rig.clock.advance(100 * MS)
@@ -112,7 +113,7 @@ def test_a_start_begins_without_brakes() -> None:
     rig.coils.brake(Y)
     rig.coils.close()
     rig.coils.start()
-    assert rig.coils.state().braked == (False, False, False)
+    assert rig.coils.state().braked == NO_AXES
     assert rig.duties == [0.0] * 16
 
 
@@ -121,7 +122,7 @@ def test_a_braked_bridge_is_reported_without_current_on_each_axis(axis: int) -> 
     rig = Rig()
     rig.coils.start()
     rig.command(0.1, 0.1, 0.1)
-    rig.coils.brake((axis == 0, axis == 1, axis == 2))
+    rig.coils.brake(frozenset({axis}))
     expected = [0.0 if number == axis else 0.1 for number in range(3)]
     state = rig.coils.state()
     assert state.current[axis] == 0.0

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from hal.drivers.coils import CoilWiring, current_step
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
+from sim_hal.emulators.coil_circuit import CoilCondition
 from tests.hal.coils.rig import PCA, THESIS, UNEQUAL, Rig, limited_to
 
 MS = 1_000_000
@@ -48,6 +49,29 @@ def test_the_world_feels_what_was_commanded_within_half_a_count(
     assert state.saturated or not any_limited
     assert state.command.tolist() == list(command)
     assert rig.wire.chip.violations == set()
+
+
+def test_six_coils_carry_their_own_currents_through_the_chip_and_brake_alone() -> None:
+    """The fifth coil is wired backwards and the sixth uses channels of its own."""
+    coils = [CoilWiring(2 * k, 2 * k + 1, 20.0 + k, sign=-1 if k == 4 else 1) for k in range(5)]
+    rig = Rig(replace(THESIS, coils=(*coils, CoilWiring(15, 12, 30.0))))
+    rig.coils.start()
+    wanted = [0.1, -0.02, 0.03, -0.04, 0.05, -0.06]
+    rig.command(*wanted)
+    assert rig.currents() == pytest.approx(wanted, abs=3.4 / 20.0 / 4096)
+    assert rig.coils.state().current.tolist() == pytest.approx(rig.currents(), abs=1e-15)
+    rig.coils.brake(frozenset({3, 5}))
+    rig.command(*wanted)
+    assert rig.currents() == pytest.approx([0.1, -0.02, 0.03, 0.0, 0.05, 0.0], abs=5e-5)
+    rig.wire.circuit.become(4, CoilCondition.OPEN)
+    rig.command(*wanted)
+    assert rig.currents()[4] == 0.0
+    rig.coils.off()
+    assert rig.currents() == [0.0] * 6
+    with pytest.raises(OutOfRange, match="number of currents"):
+        rig.command(*wanted[:5])
+    with pytest.raises(OutOfRange, match="number of coils"):
+        replace(THESIS, coils=tuple(CoilWiring(2 * k, 2 * k + 1, 20.0) for k in range(7)))
 
 
 def test_saturation_is_reported_and_only_when_it_happens(rig: Rig) -> None:

@@ -9,6 +9,7 @@ import pytest
 from sim_hal.faults.bench import Where
 from sim_hal.faults.catalogue import CATALOGUE
 
+AXES = "xyz456"
 CHANCE, TURNS = "chance 0.5 1e-06..1", "period 0.5 0.05..3600 s; share 0.5 0.01..0.99"
 PARAMETERS = {
     "imu: wrong": "angle 0.2 -3.14159..3.14159 rad; rate 0.05 -10..10 rad/s",
@@ -33,7 +34,7 @@ PARAMETERS = {
     "monitor: upset": "register drawn 0..5; bit drawn 0..15 whole",
     "bus: nack": CHANCE,
     "bus: intermittent": TURNS,
-    **{f"coil-{axis}: shorted": "ohm 5 0.1..1000 ohm" for axis in "xyz"},
+    **{f"coil-{axis}: shorted": "ohm 5 0.1..1000 ohm" for axis in AXES},
     "camera: slow": "n 3 2..1000 whole",
     "camera: delayed": "delay 3 0.001..60 s",
     "camera: intermittent": "period 6 0.05..3600 s; share 0.5 0.01..0.99",
@@ -80,8 +81,8 @@ TOGETHER = {
 
 
 def test_the_faults_are_those_of_the_table() -> None:
-    coils = {f"coil-{axis}: {kind}" for axis in "xyz" for kind in ("open", "shorted", "reversed")}
-    bridges = {f"bridge-{axis}: {leg}-{level}" for axis in "xyz" for leg in "ab" for level in ("high", "low")}
+    coils = {f"coil-{axis}: {kind}" for axis in AXES for kind in ("open", "shorted", "reversed")}
+    bridges = {f"bridge-{axis}: {leg}-{level}" for axis in AXES for leg in "ab" for level in ("high", "low")}
     plain = {" ".join(name.split()) for name in PLAIN.split(",")}
     assert set(CATALOGUE) == plain | set(PARAMETERS) | coils | bridges
 

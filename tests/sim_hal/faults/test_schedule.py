@@ -84,7 +84,7 @@ def test_a_bad_fault_is_refused_with_the_cure(text: str, complaint: str) -> None
 
 def test_every_device_has_faults_and_every_fault_is_listed() -> None:
     devices = {kind.device for kind in CATALOGUE.values()}
-    assert devices == DEVICES | {f"{part}-{axis}" for part in ("coil", "bridge") for axis in "xyz"}
+    assert devices == DEVICES | {f"{part}-{axis}" for part in ("coil", "bridge") for axis in "xyz456"}
     lines = listing().splitlines()
     assert len(lines) == len(CATALOGUE)
     assert all(line.strip().startswith(name) for line, name in zip(lines, CATALOGUE, strict=True))
@@ -256,3 +256,10 @@ def test_the_closing_text_names_the_faults(tmp_path: Path, capsys: pytest.Captur
     assert "\ninjected: imu: silent @ 0.2 for 0.1\n" in capsys.readouterr().out
     assert main([*words, "imu: silent @ 3", "--out", str(tmp_path / "two")]) == 2
     assert "over after 0.5 s" in capsys.readouterr().err
+
+
+def test_a_coil_that_is_not_fitted_has_no_faults() -> None:
+    with pytest.raises(UsageError, match="this flight has no coil-4: the configuration has 3 coils"):
+        checked("coil-4: open @ 2")
+    with pytest.raises(UsageError, match="this flight has no bridge-6: the configuration has 3 coils"):
+        checked("bridge-6: a-high @ 2")

@@ -25,6 +25,7 @@ from ground.telemetry import Run
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.flights import demo_config, demo_world, fly
@@ -40,7 +41,9 @@ LONGEST_REFUSAL = 0.5
 
 def faults() -> list[str]:
     """Return the faults of coils and bridges, by name."""
-    return [kind.name for kind in CATALOGUE.values() if kind.device.startswith(("coil", "bridge"))]
+    config = demo_config(DURATION)
+    kinds = [kind for kind in CATALOGUE.values() if kind.device.startswith(("coil", "bridge"))]
+    return [kind.name for kind in kinds if fitted(kind.device, config)]
 
 
 def cases(runs: int, seed: int) -> list[Case]:

@@ -80,3 +80,18 @@ def test_a_torque_or_a_field_that_is_not_finite_is_refused(wrong: float) -> None
         allocate(np.array([wrong, 0.0, 0.0]), FIELD, COILS, AMPLE)
     with pytest.raises(FlightError, match="not finite"):
         allocate(np.zeros(3), np.array([0.0, wrong, 0.0]), COILS, AMPLE)
+
+
+def test_redundant_coils_make_a_torque_with_the_least_heat() -> None:
+    """Two parallel coils share a current in inverse proportion to their resistances."""
+    dipoles = np.column_stack([0.6 * np.eye(3), [0.0, 0.0, 0.6]])
+    ohms = np.array([20.0, 20.0, 20.0, 60.0])
+    torque = np.cross([0.01, 0.02, 0.03], FIELD)
+    found = allocate(torque, FIELD, dipoles, np.full(4, 1e3), resistance=ohms)
+    assert found.torque == pytest.approx(torque, rel=1e-9)
+    assert found.currents[2] == pytest.approx(3.0 * found.currents[3])
+    rng = np.random.default_rng(2)
+    effect = np.cross(dipoles.T, FIELD).T
+    idle = np.eye(4) - np.linalg.pinv(effect) @ effect  # currents without torque
+    for change in rng.normal(scale=1e-3, size=(20, 4)) @ idle:
+        assert ohms @ (found.currents + change) ** 2 > ohms @ found.currents**2

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import linprog, minimize
 
 from knightcube.errors import UsageError
 from knightcube.gnc.control.coil_map import CoilMap, limited
@@ -35,7 +36,7 @@ def test_equal_coils_along_the_body_axes_are_scaled_exactly() -> None:
     np.testing.assert_allclose(coils.heat, 23.0 / 0.648**2 * np.eye(3))
 
 
-@given(st.integers(0, 10_000), st.integers(3, 6))
+@given(st.integers(0, 10_000), st.just(3))
 def test_every_dipole_within_the_limits_can_be_made_and_no_limit_is_small_for_nothing(
     seed: int, count: int
 ) -> None:
@@ -56,9 +57,88 @@ def test_every_dipole_within_the_limits_can_be_made_and_no_limit_is_small_for_no
         assert other > 0.999
 
 
+@pytest.mark.parametrize(("seed", "count"), [(1, 4), (2, 4), (3, 5), (4, 6), (5, 6)])
+def test_redundant_coils_share_a_dipole_with_the_least_heat_within_their_limits(
+    seed: int, count: int
+) -> None:
+    """Linear programming says which dipoles can be made, and a general optimiser what they heat."""
+    generator = np.random.default_rng(seed)
+    dipoles = generator.standard_normal((3, count))
+    limits, ohms = generator.uniform(0.05, 1.0, count), generator.uniform(5.0, 60.0, count)
+    coils = CoilMap(dipoles, limits, ohms)
+    bounds = [(-limit, limit) for limit in limits]
+    reached = []
+    for signs in itertools.product([-1.0, 1.0], repeat=3):
+        corner = np.array(signs) * coils.limits
+        wanted = 0.98 * corner
+        currents = coils.currents(wanted)
+        np.testing.assert_allclose(dipoles @ currents, wanted, atol=1e-6)
+        assert (np.abs(currents) <= limits * (1.0 + 1e-9)).all()
+        best = minimize(
+            lambda i: ohms @ i**2,
+            0.9 * currents,
+            jac=lambda i: 2.0 * ohms * i,
+            bounds=bounds,
+            constraints={"type": "eq", "fun": lambda i, m=wanted: dipoles @ i - m, "jac": lambda _: dipoles},
+            method="SLSQP",
+            options={"ftol": 1e-12, "maxiter": 300},
+        )
+        assert best.success
+        assert ohms @ currents**2 <= best.fun * (1.0 + 1e-5)
+        # The largest multiple of the corner that the coils can make; the last unknown is the multiple.
+        matrix = np.column_stack([dipoles, -corner])
+        found = linprog([0.0] * count + [-1.0], A_eq=matrix, b_eq=np.zeros(3), bounds=[*bounds, (0.0, None)])
+        reached.append(-found.fun)
+    assert min(reached) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_weak_limit_is_relieved_by_a_parallel_coil() -> None:
+    dipoles = np.column_stack([np.eye(3), [0.0, 0.0, 1.0]])
+    coils = CoilMap(dipoles, np.array([0.1, 0.1, 0.02, 0.1]), np.full(4, 20.0))
+    np.testing.assert_allclose(coils.limits, [0.1, 0.1, 0.12], rtol=1e-9)
+    np.testing.assert_allclose(
+        coils.currents(np.array([0.0, 0.0, 0.03])), [0.0, 0.0, 0.015, 0.015], atol=1e-12
+    )
+    np.testing.assert_allclose(coils.currents(np.array([0.0, 0.0, 0.1])), [0.0, 0.0, 0.02, 0.08], atol=1e-9)
+    assert coils.heat[2, 2] == pytest.approx(10.0)
+
+
+def test_the_coils_that_work_have_their_own_limits_and_heat() -> None:
+    pyramid = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
+    coils = CoilMap(pyramid, np.full(4, 0.1), np.full(4, 30.0))
+    assert coils.working(np.ones(4, dtype=bool)) is coils
+    left = coils.working(np.array([True, True, False, True]))
+    expected = CoilMap(pyramid[:, [0, 1, 3]], np.full(3, 0.1), np.full(3, 30.0))
+    np.testing.assert_allclose(left.heat, expected.heat)
+    np.testing.assert_allclose(left.limits, expected.limits)
+    assert np.linalg.eigvalsh(left.heat - coils.heat).min() > -1e-12, "the same dipoles heat more"
+    # Two coils: the dipole across both is assumed to be half as strong.
+    pair = CoilMap.equal(0.6, 0.1, 20.0).working(np.array([True, False, True]))
+    np.testing.assert_allclose(pair.limits, [0.06, 0.03, 0.06])
+    np.testing.assert_allclose(np.diag(pair.heat), 20.0 / np.array([0.6, 0.3, 0.6]) ** 2)
+    with pytest.raises(UsageError, match=r"all coils lie along \[0.00, 1.00, 0.00\]"):
+        CoilMap.equal(0.6, 0.1).working(np.array([False, True, False]))
+    with pytest.raises(UsageError, match="no coil works"):
+        CoilMap.equal(0.6, 0.1).working(np.zeros(3, dtype=bool))
+
+
+def test_the_covariance_of_redundant_coils_is_that_of_drawn_errors() -> None:
+    pyramid = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [0.7, 0.7, 0.7, 0.7]])
+    coils = CoilMap(pyramid, np.full(4, 0.1), np.array([10.0, 20.0, 30.0, 40.0]))
+    generator = np.random.default_rng(8)
+    drawn = []
+    for _ in range(4000):
+        gains = np.array([0.1, 0.1, 0.1, 0.3]) * generator.uniform(-1.0, 1.0, 4)
+        drawn.append((coils.per_dipole(pyramid * (1.0 + gains)) - np.eye(3)).ravel())
+    spread = coils.error_covariance(np.array([0.1, 0.1, 0.1, 0.3]), 0.0)
+    np.testing.assert_allclose(np.cov(np.array(drawn).T), spread, atol=0.06 * np.abs(spread).max())
+
+
 def test_coils_in_a_plane_are_refused() -> None:
     flat = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
-    with pytest.raises(UsageError, match="lie in one plane"):
+    with pytest.raises(
+        UsageError, match=r"lie in one plane and make no dipole along its normal \[-?0.00, -?0.00, -?1.00\]"
+    ):
         CoilMap(flat, LIMITS, OHMS)
 
 
