@@ -370,7 +370,7 @@ _ABSENT = ", in the order of the configuration; NaN for coils that are not fitte
 
 COIL_CURRENTS = Packet(
     "coil_currents",
-    0x11A,
+    0x11B,
     "10 Hz, only with more than three coils",
     "Currents of up to six coils",
     (
@@ -876,37 +876,8 @@ JOB_TIMING = Packet(
 
 
 PACKETS: tuple[Packet, ...] = (
-    RUN,
-    IMU,
-    CONTROL,
-    ATTITUDE,
-    COIL_CURRENTS,
-    SPIN,
-    NAVIGATION,
-    DESCRIPTION,
-    FIX,
-    GPS_LINK,
-    DIRECTIONS,
-    TARGET,
-    MODE,
-    PLAN,
-    STREAK,
-    STARS,
-    SIGHTINGS,
-    TRACK,
-    EVENT,
-    HOUSEKEEPING,
-    HEALTH,
-    COMMAND,
-    PARAMETERS,
-    LINK,
-    VERIFICATION,
-    TRANSFER,
-    TRUTH,
-    TRUE_COIL_CURRENTS,
-    ORBIT_TRUTH,
-    TRUE_DESCRIPTION,
-    CYCLE_TIMING,
-    RATE_GROUP,
-    JOB_TIMING,
-)
+    RUN, IMU, CONTROL, ATTITUDE, COIL_CURRENTS, SPIN, NAVIGATION, DESCRIPTION, FIX, GPS_LINK, DIRECTIONS,
+    TARGET, MODE, PLAN, STREAK, STARS, SIGHTINGS, TRACK, EVENT, HOUSEKEEPING, HEALTH, COMMAND, PARAMETERS,
+    LINK, VERIFICATION, TRANSFER, TRUTH, TRUE_COIL_CURRENTS, ORBIT_TRUTH, TRUE_DESCRIPTION, CYCLE_TIMING,
+    RATE_GROUP, JOB_TIMING,
+)  # fmt: skip
