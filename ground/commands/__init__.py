@@ -23,6 +23,7 @@ COMMANDS = {
     ),
     "report": ("fly", "report the performance of a run", "runs:configure_report"),
     "export": ("fly", "write a run's packets as CSV, Parquet or SQLite", "runs:configure_export"),
+    "campaign": ("fly", "fly a configuration many times with drawn values", "campaign:configure"),
     "orbit": ("sky", "determine first orbits of the objects that a flight tracked", "runs:configure_orbit"),
     "new-satellite": (
         "make",

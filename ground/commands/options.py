@@ -85,6 +85,13 @@ def positive(text: str) -> float:
     return value
 
 
+def count(text: str) -> int:
+    """Return the positive whole number in an argument. Raises ArgumentTypeError for other texts."""
+    if not re.fullmatch(r"0*[1-9][0-9]{0,8}", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
+    return int(text)
+
+
 def finite(text: str) -> float:
     """Return a finite number from an argument's text.
 

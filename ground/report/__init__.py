@@ -27,6 +27,7 @@ __all__ = [
     "draw_fit",
     "draw_path",
     "draw_slew",
+    "drawing",
     "format_report",
     "summarise",
 ]
@@ -37,7 +38,7 @@ def draw(run: Run, folder: Path) -> list[Path]:
 
     Raises UsageError if matplotlib is not installed or the folder cannot be written.
     """
-    with _drawing(folder):
+    with drawing(folder):
         from ground.report.figures import draw_figures  # noqa: PLC0415
 
         folder.mkdir(parents=True, exist_ok=True)
@@ -46,7 +47,7 @@ def draw(run: Run, folder: Path) -> list[Path]:
 
 def draw_both(first: Run, second: Run, folder: Path) -> Path:
     """Draw two runs into one picture in `folder` and return the file. Raises UsageError."""
-    with _drawing(folder):
+    with drawing(folder):
         from ground.report.figures import draw_comparison  # noqa: PLC0415
 
         folder.mkdir(parents=True, exist_ok=True)
@@ -55,7 +56,7 @@ def draw_both(first: Run, second: Run, folder: Path) -> Path:
 
 def draw_path(plan: StepPlan, plant: SingleAxisPlant, file: Path) -> None:
     """Draw one planned path as a PNG. Raises UsageError."""
-    with _drawing(file):
+    with drawing(file):
         from ground.report.figures import path_figure, save  # noqa: PLC0415
 
         save(path_figure(plan, plant), file)
@@ -65,7 +66,7 @@ def draw_day(
     prediction: OrbitPrediction, stations: Sequence[Station], targets: Sequence[tuple[float, str]], file: Path
 ) -> None:
     """Draw passes and eclipses of a span as a PNG, with the targets (start in s, name). Raises UsageError."""
-    with _drawing(file):
+    with drawing(file):
         from ground.report.figures import save  # noqa: PLC0415
         from ground.report.orbit_figures import day_figure  # noqa: PLC0415
 
@@ -74,7 +75,7 @@ def draw_day(
 
 def draw_slew(made: OrderedSlew, order: SlewOrder, file: Path) -> None:
     """Draw one planned slew in orbit as a PNG. Raises UsageError."""
-    with _drawing(file):
+    with drawing(file):
         from ground.report.figures import save  # noqa: PLC0415
         from ground.report.orbit_figures import slew_figure  # noqa: PLC0415
 
@@ -83,14 +84,14 @@ def draw_slew(made: OrderedSlew, order: SlewOrder, file: Path) -> None:
 
 def draw_fit(record: Record, found: PlantFit, file: Path) -> None:
     """Draw the measured and predicted motion of an identification as a PNG. Raises UsageError."""
-    with _drawing(file):
+    with drawing(file):
         from ground.report.figures import fit_figure, save  # noqa: PLC0415
 
         save(fit_figure(record, found), file)
 
 
 @contextmanager
-def _drawing(place: Path) -> Iterator[None]:
+def drawing(place: Path) -> Iterator[None]:
     """Raise UsageError with one line if matplotlib is missing or a file cannot be written."""
     try:
         yield

@@ -67,7 +67,7 @@ def test_a_part_of_the_cases_gives_what_these_give_in_the_whole(tmp_path: Path) 
     assert found.facts == {"total": pytest.approx(total), "runs": 3}
     with pytest.raises(UsageError, match="give another folder"):
         fly(TOY, 12, 3, tmp_path, workers=1)
-    with pytest.raises(UsageError, match="has no such case"):
+    with pytest.raises(UsageError, match="no case of toy contains"):
         fly(TOY, 12, 3, tmp_path / "none", only="coil")
 
 

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns import cluster as cluster_code
 from knightcube.errors import UsageError
-from tests.studies.campaigns import cluster as cluster_code
 from tests.studies.campaigns.campaign import Campaign, CampaignError, Case, Result, Summary, fly, fly_here
 
 distributed = pytest.importorskip("distributed", reason="Dask is an optional extra and not installed")
@@ -134,7 +134,7 @@ def test_a_cluster_without_the_checkout_survives_a_workers_death_and_a_lost_sche
 
 
 def test_no_scheduler_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tests.studies.campaigns.cluster.CONNECT_S", 0.3)
+    monkeypatch.setattr("ground.campaigns.cluster.CONNECT_S", 0.3)
     with pytest.raises(UsageError, match=r"--dask tcp://127.0.0.1:9: no scheduler answers there"):
         fly(TOY, 1, 3, tmp_path, dask="tcp://127.0.0.1:9")
 

@@ -1,8 +1,8 @@
-"""Campaigns on a Dask cluster whose machines have the packages, but not this checkout.
+"""Campaigns on a Dask cluster whose machines have the dependencies, but not the packages of this project.
 
-A plugin sends the checkout's packages to every worker, also to those that join later; a case then travels as
-the name of its function and as data. This module itself is pickled by value, so scheduler and workers import
-nothing of ours to read it: nothing at its top level may import ours or Dask.
+A plugin sends the project's packages to every worker, also to workers that join later. A case is sent as the
+name of its function and as data. This module itself is pickled by value, so that scheduler and workers can
+read it without the packages. Its top level must therefore import neither the packages nor Dask.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from typing import Any
 
 PACKAGES = ("knightcube", "flight", "ground", "hal", "sim_hal", "tests")
 FOLDERS = (*PACKAGES, "config")
-_ROOT = Path(__file__).parents[3]
+_ROOT = Path(__file__).parents[2]
 _PLUGIN = "knightcube-code"
 _SENT = (".py", ".npz", ".npy", ".yaml", ".yml", ".json", ".csv", ".txt", ".c", ".png")
 CONNECT_S = 15.0
-"""How long the scheduler may take to answer, and the first worker to be there."""
+"""Longest time (s) until the scheduler answers, and until the first worker is connected."""
 
 _one_case = threading.Lock()
 
 
 class ShippedCode:
-    """A worker plugin that unpacks the checkout's packages into the worker's own folder and imports those."""
+    """Plugin that unpacks the packages into a worker's own folder, and makes the worker import them."""
 
     name = _PLUGIN
     idempotent = False
@@ -42,7 +42,7 @@ class ShippedCode:
         self.version = hashlib.sha256(archive).hexdigest()[:16]
 
     def setup(self, worker: Any) -> None:
-        """Unpack, and forget the modules of other code that came before."""
+        """Unpack the packages, and unload modules of other packages that were sent before."""
         folder = Path(worker.local_directory) / f"{_PLUGIN}-{self.version}"
         if not folder.is_dir():
             beside = folder.with_name(f"{folder.name}-{os.getpid()}")
@@ -59,30 +59,30 @@ class ShippedCode:
         os.environ["KNIGHTCUBE_CODE"] = self.version
 
     def teardown(self, worker: Any) -> None:
-        """Leave the files: the worker removes its folder."""
+        """Keep the files, because the worker removes its own folder."""
 
 
 def carry_out(version: str, module: str, function: str, case: dict[str, Any]) -> Any:
-    """Run one case on a worker, with the code that was sent; None when that has made way for other code."""
+    """Run a case on a worker with the packages that were sent; return None if others have replaced them."""
     if os.environ.get("KNIGHTCUBE_CODE") != version:
         return None
-    sent = importlib.import_module("tests.studies.campaigns.cluster")
+    sent = importlib.import_module("ground.campaigns.cluster")
     return sent.run_alone(module, function, case)
 
 
 def run_alone(module: str, function: str, case: dict[str, Any]) -> Any:
-    """Run a case while no other runs in this process: the code under test need not bear threads."""
-    campaign = importlib.import_module("tests.studies.campaigns.campaign")
+    """Run a case while no other case runs in this process, because flights do not support threads."""
+    campaign = importlib.import_module("ground.campaigns.runner")
     with _one_case:
         return getattr(importlib.import_module(module), function)(campaign.Case(**case))
 
 
 def archive_of(root: Path) -> bytes:
-    """Return the packages of a checkout as a zip file, the same bytes for the same files."""
+    """Return the packages below a folder as a zip file, which is identical for identical files."""
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
         for top in FOLDERS:
-            # flight.schema carries config/ by a link.
+            # The folder flight/schema contains config/ as a link.
             for folder, below, files in os.walk(root / top, followlinks=True):
                 below[:] = sorted(name for name in below if name != "__pycache__")
                 for name in sorted(files):
@@ -96,16 +96,21 @@ def archive_of(root: Path) -> bytes:
 def finished(
     address: str, run: Callable[[Any], Any], cases: Sequence[Any], report: Callable[[str], None]
 ) -> Iterator[tuple[str, Any]]:
-    """Run cases on the cluster of the scheduler at `address`; yield (key, result) as they come.
+    """Run cases on the cluster of the scheduler at `address`, and yield key and result of each case.
 
-    `report` takes lines about the cluster. Cases of a worker that dies are run by the others. Raises
-    UsageError when there is no cluster to begin with, CampaignError when the scheduler is lost or a case ends
-    its workers.
+    If a worker dies, other workers run its cases. Raises UsageError if no cluster is found at the start, and
+    CampaignError if the scheduler is lost or a case ends its workers.
+
+    Args:
+        address: address of the scheduler.
+        run: function that runs a case.
+        cases: cases to run.
+        report: function that shows a line about the cluster to the user.
     """
     distributed, cloudpickle = map(importlib.import_module, ("distributed", "cloudpickle"))
 
     def carried(*words: Any) -> Any:
-        """Run `carry_out`: a function within a function is pickled by value, with those it calls."""
+        """Call `carry_out`; an inner function is pickled by value together with the functions it calls."""
         return carry_out(*words)
 
     here = sys.modules[__name__]
@@ -134,8 +139,8 @@ def finished(
 
 
 def _client(address: str) -> Any:
-    """Connect to a scheduler that has a worker. Raises UsageError."""
-    from knightcube.errors import UsageError  # noqa: PLC0415 - see the module's text
+    """Return a client of a scheduler that has a worker. Raises UsageError."""
+    from knightcube.errors import UsageError  # noqa: PLC0415 - see the docstring of the module
 
     try:
         client = importlib.import_module("distributed").Client(address, timeout=CONNECT_S)
@@ -153,8 +158,8 @@ def _client(address: str) -> Any:
 
 
 def _result(future: Any, key: str, address: str) -> Any:
-    """Return a case's result. Raises CampaignError, or what the case raised."""
-    from tests.studies.campaigns.campaign import CampaignError  # noqa: PLC0415
+    """Return the result of a case. Raises CampaignError, or the exception that the case raised."""
+    from ground.campaigns import CampaignError  # noqa: PLC0415
 
     distributed = importlib.import_module("distributed")
     try:
@@ -163,8 +168,10 @@ def _result(future: Any, key: str, address: str) -> Any:
         raise CampaignError(f"the scheduler at {address} is lost") from error
     except distributed.KilledWorker as error:
         raise CampaignError(
-            f"case {key} has ended every worker that tried it: {error.last_worker}"
+            f"case {key} ended every worker that ran it, such as {error.last_worker}"
         ) from error
     if result is None:
-        raise CampaignError(f"a campaign of another checkout has begun on the cluster at {address}")
+        raise CampaignError(
+            f"other packages were sent to the cluster at {address}: one checkout at a time can use it"
+        )
     return result

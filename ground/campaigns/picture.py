@@ -1,0 +1,63 @@
+"""Picture of a campaign: each figure of its flights over each drawn value."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from textwrap import fill
+
+import numpy as np
+
+from ground.campaigns.runner import Result
+from ground.campaigns.varied import figures_of, numbers_drawn
+from ground.report import drawing
+
+_LABEL = 22
+"""Number of characters in a line of a label."""
+_MOST = 6
+"""Maximum number of rows and of columns in the picture."""
+
+
+def draw_campaign(results: Sequence[Result], file: Path) -> bool:
+    """Draw the figures of all flights over the drawn numbers as a PNG, and return whether there were any.
+
+    The first six figures are drawn over the first six drawn numbers. A flight beyond the limit is a cross,
+    and a flight whose figure is infinite is a cross at the upper edge. Raises UsageError if matplotlib is not
+    installed or the file cannot be written.
+    """
+    drawn = list(numbers_drawn(results).items())[:_MOST]
+    figures = [one for one in figures_of(results).items() if np.any(np.isfinite(one[1][2]))][:_MOST]
+    if not (drawn and figures):
+        return False
+    with drawing(file):
+        from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
+        from matplotlib.ticker import MaxNLocator  # noqa: PLC0415
+
+        from ground.report import panels  # noqa: PLC0415
+        from ground.report.figures import save  # noqa: PLC0415
+
+        size = (2.0 + 3.2 * len(drawn), 0.8 + 2.4 * len(figures))
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(len(figures), len(drawn), squeeze=False, sharex="col", sharey="row")
+        for row, (name, (limit, unit, listed)) in enumerate(figures):
+            values = np.array(listed)
+            for axes, (key, numbers) in zip(grid[row], drawn, strict=True):
+                chosen = np.array(numbers)
+                good = values <= limit
+                beyond = np.isfinite(values) & ~good
+                axes.plot(chosen[good], values[good], ".", color=panels.BLUE, markersize=5)
+                axes.plot(chosen[beyond], values[beyond], "x", color=panels.VERMILLION, markersize=6)
+                infinite = chosen[np.isinf(values)]
+                if len(infinite):
+                    edge = axes.get_xaxis_transform()
+                    axes.plot(infinite, np.ones_like(infinite), "x", color=panels.VERMILLION, transform=edge)
+                axes.axhline(limit, color=panels.GREY, linestyle=panels.DASHED, linewidth=1.0)
+                label = fill(f"{name}, {unit}", _LABEL) if axes is grid[row][0] else ""
+                panels.style(axes, label, "", key if row == len(figures) - 1 else "")
+                axes.margins(0.06)
+                axes.xaxis.set_major_locator(MaxNLocator(4))
+            known = values[np.isfinite(values)]
+            if known.min() > 0.0 and known.max() > 30.0 * known.min():
+                grid[row][0].set_yscale("log")
+        save(figure, file)
+    return True

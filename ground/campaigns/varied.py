@@ -1,0 +1,344 @@
+"""Campaign of flights of one configuration whose values are drawn from stated distributions."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import math
+import re
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.app.flight import fly
+from flight.app.run import RunRequest
+from flight.schema import reader as configuration
+from flight.schema.document import read_document, read_text, to_yaml
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.report import summarise
+from ground.telemetry import read_run
+from hal.interfaces.errors import DeviceError
+from knightcube.errors import FlightError, UsageError
+from sim_hal.settings import Simulation
+
+_DRAWS = 100
+"""Number of draws of a case until its configuration is accepted: some draws have an impossible inertia."""
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_FORMS = (
+    "KEY=10% (uniform, relative), KEY=+-0.5 (uniform), KEY=normal 10% or KEY=normal 0.5 (standard "
+    "deviation), KEY=1..5 (uniform), KEY=log 1..100 (uniform in the logarithm) or KEY=a|b|c (one of these)"
+)
+_MOST_LISTED = 20
+"""Maximum number of failed flights in the table; `summary.json` has all."""
+
+Draw = Callable[[np.random.Generator, float], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """Configuration value that is drawn for each flight.
+
+    Attributes:
+        key: dotted key of the configuration, such as `craft.inertia` or `targets[0].at`.
+        text: distribution as given by the user.
+        draw: function that returns the drawn value, given a random generator and the configured number.
+        relative: whether the distribution refers to the configured number.
+    """
+
+    key: str
+    text: str
+    draw: Draw
+    relative: bool
+
+
+def variation_of(text: str) -> Variation:
+    """Return the variation in a text such as `craft.inertia=10%`. Raises UsageError for another form."""
+    key, equals, spread = (part.strip() for part in text.partition("="))
+    if not equals or not re.fullmatch(r"\w+(\.\w+|\[\d+\])*", key):
+        raise UsageError(f"--vary {text!r}: give {_FORMS}")
+    found = _distribution(spread)
+    if found is None:
+        raise UsageError(f"--vary {text!r}: the distribution {spread!r} is not known: give {_FORMS}")
+    return Variation(key, spread, *found)
+
+
+def _distribution(spread: str) -> tuple[Draw, bool] | None:
+    """Return the draw of a distribution and whether it refers to the configured number, or None."""
+    if "|" in spread:
+        values = [configuration_value(one.strip()) for one in spread.split("|")]
+        return (lambda chance, _: values[int(chance.integers(len(values)))]), False
+    if found := re.fullmatch(rf"(log )?({_NUMBER})\.\.({_NUMBER})", spread):
+        low, high = float(found[2]), float(found[3])
+        return None if not low < high or (found[1] and low <= 0.0) else _between(low, high, bool(found[1]))
+    found = re.fullmatch(rf"(normal |\+-)?({_NUMBER})(%)?", spread)
+    if not found or not (found[1] or found[3]):
+        return None
+    size, relative = abs(float(found[2])) * (0.01 if found[3] else 1.0), bool(found[3])
+
+    def around(chance: np.random.Generator, value: float) -> float:
+        step = float(chance.standard_normal() if found[1] == "normal " else chance.uniform(-1.0, 1.0))
+        return value + size * step * (abs(value) if relative else 1.0)
+
+    return around, True
+
+
+def _between(low: float, high: float, logarithmic: bool) -> tuple[Draw, bool]:
+    """Return the uniform distribution between two numbers, or of their logarithm."""
+    if logarithmic:
+        ends = math.log(low), math.log(high)
+        return (lambda chance, _: math.exp(chance.uniform(*ends))), False
+    return (lambda chance, _: float(chance.uniform(low, high))), False
+
+
+def configuration_value(text: str) -> Any:
+    """Return the value of a YAML scalar."""
+    return read_document(f"value: {text}\n", "value").values["value"]
+
+
+def varied_campaign(path: Path, variations: Sequence[Variation], duration: float | None) -> Campaign:
+    """Return the campaign that flies a simulated configuration with drawn values.
+
+    The result of a flight contains the drawn values, and the figures that the report judges: the section
+    `requirements` of a satellite, or the limits of the thesis for a testbed. The first cases are the same for
+    every number of runs. Raises UsageError for a key or a distribution that the configuration does not allow.
+
+    Args:
+        path: file of the configuration.
+        variations: values to draw.
+        duration: duration of each flight, s, or None for that of the configuration.
+    """
+    text = read_text(path)
+    base = read_document(text, str(path)).values
+    if "simulation" not in base:
+        raise UsageError(f"{path}: has no section `simulation`: a campaign flies simulated devices")
+    for one in variations:
+        _numbers_at(base, one)
+
+    def cases(runs: int, seed: int) -> list[Case]:
+        return [_case(base, variations, duration, (seed, number)) for number in range(runs)]
+
+    words = ", ".join(f"{one.key}={one.text}" for one in variations)
+    crc = zlib.crc32(to_yaml(base).encode())
+    length = "" if duration is None else f", {duration:g} s"
+    name = f"{path.stem} with {words}{length} (CRC {crc:08x})"
+    return Campaign(name, "flights with drawn values", cases, fly_case, _summarise, 100)
+
+
+def _case(
+    base: dict[str, Any], variations: Sequence[Variation], duration: float | None, seed: tuple[int, int]
+) -> Case:
+    """Return the case of a seed: its whole configuration as text, and the drawn values by key."""
+    chance = np.random.default_rng(seed)
+    refusal = ""
+    for _ in range(_DRAWS):
+        values = copy.deepcopy(base)
+        drawn: dict[str, Any] = {}
+        for one in variations:
+            drawn |= _drawn(values, one, chance)
+        text = to_yaml(values)
+        try:
+            configuration.parse(text, "drawn values")
+            configuration.simulation_section(text, "drawn values", Simulation)
+        except FlightError as error:
+            refusal = str(error)
+            continue
+        parameters = {
+            "config": text,
+            "drawn": drawn,
+            "duration": duration,
+            "seed": int(chance.integers(2**31)),
+        }
+        return Case(f"flight-{seed[1]:05d}", seed, parameters)
+    raise UsageError(f"{_DRAWS} draws in a row were refused, the last one because {refusal}: vary less")
+
+
+def _numbers_at(values: dict[str, Any], one: Variation) -> list[tuple[Any, Any, str]]:
+    """Return container, index and full key of each number to be drawn. Raises UsageError."""
+    steps = [int(step) if step.isdigit() else step for step in re.findall(r"\w+", one.key)]
+    holder: Any = values
+    for depth, step in enumerate(steps[:-1]):
+        holder = _below(holder, step, one, steps[: depth + 1])
+    last = steps[-1]
+    if isinstance(holder, dict) and last not in holder and not one.relative:
+        return [(holder, last, one.key)]  # the configuration's default is replaced
+    found = _below(holder, last, one, steps)
+    if not one.relative and not isinstance(found, list):
+        return [(holder, last, one.key)]
+    numbers = list(_leaves(holder, last, one.key))
+    if not numbers or (one.relative and not all(_is_number(holder[at]) for holder, at, _ in numbers)):
+        raise UsageError(f"--vary {one.key}={one.text}: the configured value {found!r} is not a number")
+    return numbers
+
+
+def _below(holder: Any, step: Any, one: Variation, path: Sequence[Any]) -> Any:
+    """Return the value one step below a container. Raises UsageError, with keys of a similar name."""
+    if isinstance(holder, dict) and step in holder:
+        return holder[step]
+    if isinstance(holder, list) and isinstance(step, int) and step < len(holder):
+        return holder[step]
+    names = [str(name) for name in holder] if isinstance(holder, dict) else []
+    near = difflib.get_close_matches(str(step), names, 3) or names
+    cure = f"one of {', '.join(near)}" if near else "a range such as 1..5 instead, if the key exists"
+    place = ".".join(map(str, path))
+    raise UsageError(f"--vary {one.key}={one.text}: the configuration has no value {place}: give {cure}")
+
+
+def _leaves(holder: Any, at: Any, key: str) -> Iterator[tuple[Any, Any, str]]:
+    """Yield container, index and full key of each value in nested lists."""
+    if isinstance(holder[at], list):
+        for number in range(len(holder[at])):
+            yield from _leaves(holder[at], number, f"{key}[{number}]")
+    else:
+        yield holder, at, key
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _drawn(values: dict[str, Any], one: Variation, chance: np.random.Generator) -> dict[str, Any]:
+    """Replace the numbers of a variation by drawn ones, and return them by full key."""
+    drawn = {}
+    for holder, at, key in _numbers_at(values, one):
+        held = holder[at] if isinstance(holder, list) or at in holder else math.nan
+        holder[at] = drawn[key] = one.draw(chance, float(held) if _is_number(held) else math.nan)
+    return drawn
+
+
+def fly_case(case: Case) -> Result:
+    """Fly a case in lock-step, and return its drawn values and the judged figures of its report."""
+    given = case.parameters
+    found: Result = {
+        "key": case.key,
+        "drawn": given["drawn"],
+        "judged": [],
+        "error": "",
+        "seed": given["seed"],
+        "duration": given["duration"],
+    }
+    with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
+        config = Path(place) / f"{case.key}.yaml"
+        config.write_text(given["config"], encoding="utf-8")
+        request = RunRequest(config, Path(place) / "run", duration=given["duration"], seed=given["seed"])
+        try:
+            flown = fly(request)
+            report = summarise(read_run(request.out))
+        except (FlightError, DeviceError) as error:
+            return found | {"error": str(error), "config": given["config"]}
+    if flown.interrupted:  # by Ctrl-C, which also reaches the workers
+        raise KeyboardInterrupt
+    found["mode"] = flown.ending.mode
+    found["faults"] = dict(flown.ending.faults)
+    found["judged"] = [
+        {"quantity": re.sub(r"pointing to .*, rms", "pointing, rms", row["quantity"]), **rest}
+        for row in (*report["requirements"], *report["thesis"])
+        for rest in [{key: row[key] for key in ("worst", "limit", "unit", "verdict")}]
+    ]
+    return found if _within(found) else found | {"config": given["config"]}
+
+
+def _within(result: Result) -> bool:
+    """Return whether a flight ended without an error and met every judged limit."""
+    return not result["error"] and all(row["verdict"] != "miss" for row in result["judged"])
+
+
+def figures_of(results: Sequence[Result]) -> dict[str, tuple[float, str, list[float]]]:
+    """Return limit, unit and the worst value of each flight by quantity; NaN where a flight has no value."""
+    found: dict[str, tuple[float, str, list[float]]] = {}
+    for number, result in enumerate(results):
+        for row in result["judged"]:
+            _, _, values = found.setdefault(
+                row["quantity"], (row["limit"], row["unit"], [math.nan] * len(results))
+            )
+            worst = math.nan if row["worst"] is None else float(row["worst"])
+            values[number] = worst if math.isnan(values[number]) else max(worst, values[number])
+    return found
+
+
+def numbers_drawn(results: Sequence[Result]) -> dict[str, list[float]]:
+    """Return the drawn numbers of all flights by key; drawn texts are omitted."""
+    keys = [key for key, value in results[0]["drawn"].items() if _is_number(value)]
+    return {key: [float(result["drawn"][key]) for result in results] for key in keys}
+
+
+def _summarise(results: Sequence[Result], out: Path) -> Summary:
+    """Return the table of a campaign, and write the configurations of failed flights and the picture."""
+    failed = [result for result in results if not _within(result)]
+    folder = out / "failed"
+    for result in failed:
+        folder.mkdir(exist_ok=True)
+        (folder / f"{result['key']}.yaml").write_text(result["config"], encoding="utf-8")
+    drawn, figures = numbers_drawn(results), figures_of(results)
+    facts: dict[str, Any] = {
+        "flights": len(results),
+        "within all limits": len(results) - len(failed),
+        "figures": [
+            {
+                "figure": name,
+                "unit": unit,
+                "limit": limit,
+                "n": int(np.isfinite(values).sum()),
+                "within": int(np.sum(np.array(values) <= limit)),
+                **_quantiles(values),
+                "strongest influence": _influence(drawn, values),
+            }
+            for name, (limit, unit, values) in figures.items()
+        ],
+        "failed flights": [
+            {"flight": result["key"], "why": _why(result), "fly it again": _again(result, folder)}
+            for result in failed
+        ],
+    }
+    short = facts | {"failed flights": facts["failed flights"][:_MOST_LISTED]}
+    if len(failed) > _MOST_LISTED:
+        short["further failed flights, in summary.json"] = len(failed) - _MOST_LISTED
+    if not failed:
+        del short["failed flights"]
+    return Summary(summary(short).text, facts)
+
+
+def _quantiles(values: Sequence[float]) -> dict[str, float | None]:
+    """Return median, 95 % quantile and maximum of the known values, or None without one."""
+    known = [value for value in values if math.isfinite(value)]
+    if not known:
+        return dict.fromkeys(("median", "95 %", "maximum"))
+    return {
+        "median": float(np.median(known)),
+        "95 %": float(np.quantile(known, 0.95)),
+        "maximum": float(np.max(known)),
+    }
+
+
+def _influence(drawn: dict[str, list[float]], values: Sequence[float]) -> str:
+    """Return the drawn key with the largest rank correlation with a figure, and the correlation."""
+    known = np.isfinite(values)
+    ranks = np.argsort(np.argsort(np.array(values)[known]))
+    best = ("", 0.0)
+    for key, numbers in drawn.items():
+        own = np.argsort(np.argsort(np.array(numbers)[known]))
+        if len(ranks) > 2 and np.ptp(ranks) and np.ptp(own):
+            correlation = float(np.corrcoef(ranks, own)[0, 1])
+            best = max(best, (key, correlation), key=lambda pair: abs(pair[1]))
+    return f"{best[0]} {best[1]:+.2f}" if best[0] else "-"
+
+
+def _why(result: Result) -> str:
+    if result["error"]:
+        return str(result["error"])
+    missed = [row for row in result["judged"] if row["verdict"] == "miss"]
+    return "; ".join(
+        f"{row['quantity']} "
+        + ("none" if row["worst"] is None else f"{row['worst']:.3g} {row['unit']}")
+        + f" (limit {row['limit']:g})"
+        for row in missed
+    )
+
+
+def _again(result: Result, folder: Path) -> str:
+    length = "" if result["duration"] is None else f" --duration {result['duration']:g}"
+    return f"knightcube run {folder / result['key']}.yaml --seed {result['seed']}{length}"

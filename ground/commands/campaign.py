@@ -1,0 +1,88 @@
+"""Command `knightcube campaign`: many flights of a configuration with drawn values."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from flight.app.cli import PROGRAM
+from flight.schema.document import config_path
+from ground.commands.options import count, positive
+from knightcube.errors import UsageError
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `knightcube campaign` to the parser."""
+    parser.description = (
+        "Fly a simulated configuration many times, each time with values that are drawn from stated "
+        "distributions, and with noise of its own. Prints a table of the figures that the report judges, "
+        "with the drawn value of the strongest influence, and lists failed flights with the command that "
+        "flies each again. Draws the figures over the drawn values (extra `plots`). All cores fly, or a Dask "
+        "cluster (extra `dask`). An interrupted campaign continues with the same command. Exit status 0 if "
+        "every flight is within its limits, otherwise 1."
+    )
+    parser.epilog = (
+        f"example: {PROGRAM} campaign orbit_3u --vary craft.inertia=10% --vary detumble.act=0.5..2 --runs 50"
+    )
+    parser.add_argument("config", type=config_path, metavar="CONFIG", help="file or installed name")
+    parser.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        required=True,
+        metavar="KEY=SPREAD",
+        help="value to draw, may be repeated: 10%% (uniform, relative), +-0.5 (uniform), 'normal 10%%' or "
+        "'normal 0.5' (standard deviation), 1..5 (uniform), 'log 1..100' (uniform in the logarithm), 'a|b|c' "
+        "(one of these). Each number of a list is drawn on its own",
+    )
+    parser.add_argument(
+        "--runs", type=count, default=100, metavar="N", help="number of flights (default 100)"
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all draws (default 1)")
+    parser.add_argument("--duration", type=positive, metavar="S", help="duration of each flight")
+    parser.add_argument("--only", default="", metavar="TEXT", help="only flights whose name contains it")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")
+    parser.add_argument("--workers", type=count, metavar="N", help="processes (default: the cores)")
+    parser.add_argument(
+        "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster, instead of this machine"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fly the campaign, and print its summary."""
+    from ground.campaigns.picture import draw_campaign  # noqa: PLC0415
+    from ground.campaigns.runner import fly  # noqa: PLC0415 - no other command needs devices
+    from ground.campaigns.varied import variation_of, varied_campaign  # noqa: PLC0415
+
+    campaign = varied_campaign(
+        options.config, [variation_of(text) for text in options.vary], options.duration
+    )
+    out = options.out or Path("runs") / "campaigns" / options.config.stem
+    try:
+        found = fly(
+            campaign,
+            options.runs,
+            options.seed,
+            out,
+            options.workers,
+            options.dask,
+            progress=True,
+            only=options.only,
+        )
+    except KeyboardInterrupt:
+        sys.stderr.write(f"\ninterrupted; the same command continues in {out}\n")
+        return 130
+    sys.stdout.write(json.dumps(found.facts) + "\n" if options.json else found.text)
+    lines = (out / "results.jsonl").read_text(encoding="utf-8").splitlines()
+    try:
+        drawn = draw_campaign([json.loads(line)["result"] for line in lines], out / "campaign.png")
+    except UsageError as error:
+        sys.stderr.write(f"{PROGRAM}: not drawn: {error}\n")
+    else:
+        if drawn and not options.json:
+            sys.stdout.write(f"\npicture: {out / 'campaign.png'}\n")
+    return 0 if found.facts["within all limits"] == found.facts["flights"] else 1
