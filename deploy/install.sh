@@ -26,7 +26,7 @@ Folders:
   /opt/knightcube/spare  second copy of bin
   /opt/knightcube/venv   link to the current    /var/lib/knightcube      flight logs, state
   /etc/systemd/system    the units              /etc/udev/rules.d        device names
-  /etc/modules-load.d    i2c-dev
+  /etc/modules-load.d    i2c-dev                /etc/systemd/system.conf.d  hardware watchdog
 DESTDIR=FOLDER in the environment installs into an image mounted there; make its user yourself.
 TEXT
 }
@@ -43,6 +43,7 @@ units=$root/etc/systemd/system
 rules=$root/etc/udev/rules.d/99-knightcube.rules
 shipped=$prefix/share/99-knightcube.rules
 modules=$root/etc/modules-load.d/knightcube.conf
+watchdog=$root/etc/systemd/system.conf.d/knightcube.conf
 logs=/var/lib/knightcube
 cache=$root/var/cache/knightcube
 user=knightcube
@@ -266,9 +267,10 @@ install_rules() {
     place 644 "$deploy/99-knightcube.rules" "$shipped"
 }
 
-# The module behind /dev/i2c-*, which nothing else loads: at each boot, and now.
+# The board's hardware watchdog, and the module behind /dev/i2c-*, which nothing else loads: at each boot, and now.
 install_modules() {
     place 644 "$deploy/modules.conf" "$modules"
+    place 644 "$deploy/watchdog.conf" "$watchdog"
     if systemd_runs && [ ! -d /sys/class/i2c-dev ]; then
         run modprobe i2c-dev ||
             echo "install: i2c-dev cannot be loaded: without it there is no /dev/i2c-* to reach the coils" >&2
@@ -344,7 +346,8 @@ uninstall_all() {
     fi
     run rm -rf "$units/knightcube.service" "$units/knightcube-safe.service" \
         "$units/knightcube-renewal.service" "$units/knightcube-renewal.timer" "$root$logs-renewal" \
-        "$units/knightcube.service.d" "$units/knightcube-safe.service.d" "$rules" "$modules" "$prefix" "$cache"
+        "$units/knightcube.service.d" "$units/knightcube-safe.service.d" "$rules" "$modules" "$watchdog" \
+        "$prefix" "$cache"
     if [ -n "$purge" ]; then
         run rm -rf "$settings" "$root$logs" "$root$logs-link"
         if [ -z "$root" ] && getent passwd "$user" >/dev/null; then

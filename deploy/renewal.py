@@ -48,6 +48,12 @@ KINDS = ("configuration", "elements", "catalogue", "release")
 STEPS = ("release", "configuration", "ground")
 """Steps of the command-loss timer."""
 FLIGHT, LINK, SAFE = "knightcube.service", "knightcube-link.service", "knightcube-safe.service"
+RESTARTS = {
+    "flight": (["reset-failed", FLIGHT], ["--no-block", "restart", FLIGHT]),
+    "link": (["reset-failed", LINK], ["--no-block", "restart", LINK]),
+    "board": (["--no-block", "reboot"],),
+}
+"""Arguments of systemctl for each part that can be restarted by command."""
 CONFIGURATION = "flight.yaml"
 GROUND = "ground"
 """Name of the kept configuration that install.sh accepted."""
@@ -456,9 +462,11 @@ class Renewal:
         self._state.handled = [*self._state.handled, name][-KEPT_REQUESTS:]
         word, kind = str(request.get("do", "")), str(request.get("kind", ""))
         try:
-            if kind not in KINDS:
+            if word == "restart":
+                self._restart(name, str(request["part"]))
+            elif kind not in KINDS:
                 raise Refused("the request is damaged")
-            if word == "activate":
+            elif word == "activate":
                 self._activate(name, kind, request)
             elif word == "confirm":
                 self._confirm(name, kind)
@@ -468,6 +476,17 @@ class Renewal:
                 raise Refused("the request is damaged")
         except (Refused, OSError, *_DAMAGED) as error:
             self._report(name, "failed", word or "request", str(error) or type(error).__name__)
+
+    def _restart(self, name: str, part: str) -> None:
+        """Restart flight, link or board. The request is stored as executed first, so it is never repeated."""
+        if part not in RESTARTS:
+            raise Refused("the request is damaged")
+        self._report(name, "completed", "restart", f"{part} is restarted")
+        self._save()
+        for words in RESTARTS[part]:
+            done = self._board.run(["systemctl", *words], 60.0)
+        if done.returncode != 0:
+            raise Refused(f"{part}: {done.stderr.strip()[:80]}")
 
     def _activate(self, name: str, kind: str, request: dict[str, Any]) -> None:
         """Check a bundle and begin its trial. Raises Refused and OSError."""

@@ -41,6 +41,7 @@ from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import (
     KINDS,
+    PARTS,
     CancelFile,
     DeleteFile,
     Deletion,
@@ -48,6 +49,7 @@ from flight.link.process.directives import (
     ListFiles,
     Listing,
     Play,
+    Restart,
     ResumeFile,
     Scheduled,
     SendFile,
@@ -91,7 +93,7 @@ from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTar
 
 Object = dict[str, Any]
 _Words: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
-_DIRECTIVES = ("play", "stop-playback", "new-key", "schedule", "unschedule", "list-schedule")
+_DIRECTIVES = ("play", "stop-playback", "new-key", "schedule", "unschedule", "list-schedule", "restart")
 _ORIGINS = {field.name: dict(field.states) for field in PARAMETERS.fields if field.name == "table"}
 _OF_TRANSFERS: dict[str, type[CancelFile | SuspendFile | ResumeFile]] = {
     "cancel": CancelFile,
@@ -159,6 +161,8 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
     deleted = words.add_parser("unschedule", help="with --link: delete a scheduled command")
     deleted.add_argument("number", type=int, metavar="N", help="number in list-schedule; 0 deletes all")
     words.add_parser("list-schedule", help="with --link: show the scheduled commands")
+    restarted = words.add_parser("restart", help="with --link: restart flight, link or board")
+    restarted.add_argument("part", choices=PARTS, metavar="PART", help=" or ".join(PARTS))
     key = words.add_parser("new-key", help="with --link: change a key at both ends")
     key.add_argument("changed", type=int, choices=(*COMMAND_SPIS, *TELEMETRY_SPIS), metavar="SPI")
     _allow_behind(words)
@@ -273,17 +277,20 @@ def packet_of(options: argparse.Namespace) -> bytes:
     try:
         match options.what:
             case "play":
-                return directives.pack(Play(options.run, options.begin, options.end), utc_ns())
+                directive: Directive = Play(options.run, options.begin, options.end)
             case "stop-playback":
-                return directives.pack(Stop(), utc_ns())
+                directive = Stop()
             case "schedule":
-                return directives.pack(Scheduled(options.at, options.words), utc_ns())
+                directive = Scheduled(options.at, options.words)
             case "unschedule":
-                return directives.pack(Deletion(options.number), utc_ns())
+                directive = Deletion(options.number)
+            case "restart":
+                directive = Restart(PARTS.index(options.part))
             case "list-schedule":
-                return directives.pack(Listing(), utc_ns())
+                directive = Listing()
             case _:
                 return CommandPacker().pack(_command_of(options), utc_ns())
+        return directives.pack(directive, utc_ns())
     except CommandError as error:
         raise UsageError(str(error)) from error
 

@@ -78,6 +78,7 @@ def image(installed: Image, tmp_path: Path) -> Image:
 
 def test_everything_is_put_in_its_place_once(image: Image) -> None:
     assert image.text("etc/modules-load.d/knightcube.conf").splitlines()[-1] == "i2c-dev"
+    assert "\nRuntimeWatchdogSec=10\n" in image.text("etc/systemd/system.conf.d/knightcube.conf")
     assert image.config.read_bytes() == TESTBED.read_bytes()
     assert "DeviceAllow=/dev/i2c-1 rw\n" in image.text(
         "etc/systemd/system/knightcube-safe.service.d/board.conf"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from flight.link.process.renewal import decoded, encoded
 from ground.commands.renewal import replace_signing_key
 from tests.deploy.renewed_board import RenewedBoard
 from tests.deploy.scripts import script
@@ -85,6 +86,31 @@ def test_the_safe_state_ends_the_trial_at_once(board: RenewedBoard) -> None:
     board.set_active("knightcube-safe.service", True)
     board.step()
     assert board.flown() == before
+
+
+@pytest.mark.parametrize(
+    ("part", "call"),
+    [
+        ("flight", "--no-block restart knightcube.service"),
+        ("link", "--no-block restart knightcube-link.service"),
+        ("board", "--no-block reboot"),
+    ],
+)
+def test_a_part_is_restarted_once_by_command(board: RenewedBoard, part: str, call: str) -> None:
+    name = board.request("restart", part=part)
+    for _ in range(3):
+        board.step()
+    assert (board.place / "calls").read_text(encoding="ascii").splitlines().count(call) == 1
+    reports = decoded((board.own / "status").read_bytes())["reports"]
+    assert [report[1:4] for report in reports] == [[name, "completed", "restart"]]
+
+
+@pytest.mark.parametrize("part", ["", "knightcube.service", "--root=/", "Board"])
+def test_an_unknown_part_is_not_restarted(board: RenewedBoard, part: str) -> None:
+    board.request("restart", part=part)
+    assert "renewal: restart failed: the request is damaged" in board.step()
+    calls = board.place / "calls"
+    assert not calls.exists() or "restart" not in calls.read_text(encoding="ascii")
 
 
 def test_a_board_in_its_safe_state_can_be_renewed(board: RenewedBoard) -> None:
@@ -320,7 +346,6 @@ def test_a_damaged_copy_of_the_state_costs_nothing(board: RenewedBoard, copies: 
 
 
 def test_records_have_the_same_form_at_both_ends() -> None:
-    from flight.link.process.renewal import decoded, encoded  # noqa: PLC0415
 
     values = {"a": [1, "b", None]}
     assert renewal.encoded(values) == encoded(values)

@@ -82,6 +82,14 @@ WITHDRAW = telecommand(
     _KIND,
     hazard="restarts flight and link with another configuration or release",
 )
+PARTS = ("flight", "link", "board")
+RESTART = telecommand(
+    "restart",
+    0x2B3,
+    "Restart the flight, the link or the whole board within 10 s",
+    Field("part", "u1", "-", "part to restart", states=tuple(enumerate(PARTS))),
+    hazard="ends the running flight or the link; after a restart of the board both begin again",
+)
 PLAY = telecommand(
     "play",
     0x2A0,
@@ -209,6 +217,16 @@ class Withdraw(_OnRenewal):
 
 
 @dataclass(frozen=True, slots=True)
+class Restart:
+    """Directive to restart a part of the satellite. The attribute `part` is an index of `PARTS`."""
+
+    part: int
+
+    def __str__(self) -> str:
+        return f"restart {PARTS[self.part]}"
+
+
+@dataclass(frozen=True, slots=True)
 class DeleteFile:
     """Directive to delete a received file."""
 
@@ -287,9 +305,9 @@ class Listing:
 
 
 FileDirective = ListFiles | SendFile | CancelFile | SuspendFile | ResumeFile | UseFile | DeleteFile
-Directive = (
-    Play | Stop | NewKey | Scheduled | Deletion | Listing | Activate | Confirm | Withdraw | FileDirective
-)
+Privileged = Activate | Confirm | Withdraw | Restart
+"""Directives that the privileged part of the renewal executes."""
+Directive = Play | Stop | NewKey | Scheduled | Deletion | Listing | Privileged | FileDirective
 
 _PACKETS: dict[type[Any], Packet] = {
     Play: PLAY,
@@ -308,6 +326,7 @@ _PACKETS: dict[type[Any], Packet] = {
     Activate: ACTIVATE,
     Confirm: CONFIRM,
     Withdraw: WITHDRAW,
+    Restart: RESTART,
 }
 """Packet definition of each directive class. Packet fields and class attributes have the same names."""
 _KINDS = {packet.name: kind for kind, packet in _PACKETS.items()}
@@ -359,6 +378,8 @@ def unpack(data: bytes) -> Directive | None:
     directive: Directive = _KINDS[layout.packet.name](**values)
     if isinstance(directive, Play) and not directive.begin <= directive.end:  # NaN compares false
         raise CommandError(f"from {directive.begin:g} to {directive.end:g} s is not an interval of time")
+    if values.get("part", 0) >= len(PARTS):
+        raise CommandError(f"part {values['part']} is unknown")
     if values.get("kind", 0) >= len(KINDS):
         raise CommandError(f"kind {values['kind']} is unknown")
     if values.get("entity", GROUND) not in dict(_ENTITY.states):

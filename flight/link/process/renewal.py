@@ -16,7 +16,7 @@ from typing import Any
 
 from flight.link.modes import Mode
 from flight.link.process.commanding import Report, Request, Stage
-from flight.link.process.directives import KINDS, Activate, Confirm, Withdraw
+from flight.link.process.directives import KINDS, PARTS, Activate, Privileged, Restart
 from flight.link.regular_files import overwrite, read_regular
 from flight.link.telemetry.definitions import MODE
 from flight.link.telemetry.packets import LAYOUTS, to_text
@@ -63,7 +63,7 @@ class Renewal:
         self._modified_ns = 0
         self._reported = self._stored_number()
 
-    def request(self, directive: Activate | Confirm | Withdraw, done: Report) -> str:
+    def request(self, directive: Privileged, done: Report) -> str:
         """Store a request for the privileged part. Return the problem, or an empty text."""
         if not self._status.exists():
             return "this board has no renewal: deploy/install.sh installs it"
@@ -73,6 +73,8 @@ class Renewal:
             kind, _, own = directive.name.removeprefix("received/").partition("/")
             values |= {"kind": kind, "name": own, "sum": directive.sum.hex(), "hours": directive.hours}
             values["despite_faults"] = bool(directive.despite_faults)
+        elif isinstance(directive, Restart):
+            values["part"] = PARTS[directive.part]
         else:
             values["kind"] = KINDS[directive.kind]
         return "" if self._write(name, encoded(values)) else "the request could not be stored"

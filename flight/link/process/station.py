@@ -51,6 +51,8 @@ from flight.link.process.directives import (
     Listing,
     NewKey,
     Play,
+    Privileged,
+    Restart,
     Scheduled,
     Stop,
     UseFile,
@@ -681,14 +683,14 @@ class Station:
             case NewKey():
                 problem = _change_key(directive, self._vault, self._gate, self._sealers)
                 return [replace(done, stage=Stage.FAILED, text=problem) if problem else done]
-            case Activate() | Confirm() | Withdraw():
+            case Activate() | Confirm() | Withdraw() | Restart():
                 return self._renew(directive, done)
             case Scheduled() | Deletion() | Listing():
                 return self._scheduling.obey(directive, done, self._clock.utc_ns())
             case _:
                 return self._filing.obey(directive, done, self._clock.utc_ns(), self._clock.now_ns())
 
-    def _renew(self, directive: Activate | Confirm | Withdraw, done: Report) -> list[Report]:
+    def _renew(self, directive: Privileged, done: Report) -> list[Report]:
         """Hand a directive over to the privileged part, which reports its completion."""
         request = partial(self._renewal.request, directive, done)
         handed_over = replace(done, stage=Stage.STARTED, text=f"{directive}: handed over")

@@ -116,6 +116,7 @@ DIRECTIVES: tuple[tuple[str, int, str, bool], ...] = (
     ("activate", 0x2B0, f"{_NAME} sum:32u1 hours:f4 despite_faults:u1", True),
     ("confirm", 0x2B1, f"kind:u1{_KINDS}", False),
     ("withdraw", 0x2B2, f"kind:u1{_KINDS}", True),
+    ("restart", 0x2B3, "part:u1{0=flight,1=link,2=board}", True),
     ("play", 0x2A0, "run:u4 begin:f8 end:f8", False),
     ("stop-playback", 0x2A1, "", False),
     ("new-key", 0x2A2, "spi:u2 generation:u4 key:32u1", False),

@@ -26,6 +26,7 @@ from flight.link.process.directives import (
     ListFiles,
     Listing,
     Play,
+    Restart,
     ResumeFile,
     Scheduled,
     Stop,
@@ -137,6 +138,7 @@ def words(*arguments: str) -> Any:
         (("play", "1.5", "9", "--run", "3"), Play(3, 1.5, 9.0)),
         (("stop-playback",), Stop()),
         (("unschedule", "7"), Deletion(7)),
+        (("restart", "link"), Restart(1)),
         (("list-schedule",), Listing()),
     ],
 )
