@@ -137,8 +137,9 @@ def _number(name: str, field: Field, given: Any) -> float | int:
         raise UsageError(f"{name}: {field.name} is missing: {field.meaning}")
     try:
         return float(given) if real else int(given)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{name}: {field.name} = {given!r} is not a number: {field.meaning}") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        shown = f"{given!r:.40}"
+        raise UsageError(f"{name}: {field.name} = {shown} is not a number: {field.meaning}") from error
 
 
 class LinkFeed:

@@ -27,6 +27,8 @@ LISTED = ("event", "command", "verification", "streak", "stars", "sightings")
 """Packet types that the page lists one by one; of other types the page shows only the newest packet."""
 MAX_SPEED = 1000.0
 """Highest speed of a replay, as multiple of real time."""
+MAX_TIME = 1e9
+"""Latest mission time (s) that a reader can ask for, 30 years."""
 _MAX_LISTED = 500
 _FIRST_CAPACITY = 1024
 
@@ -159,9 +161,9 @@ class PageCursor:
                 self.live, self.speed = True, 1.0
                 return jumped
             at, speed = float(message["at"]), float(message["speed"])
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             return False
-        if not (math.isfinite(at) and 0.0 <= speed <= MAX_SPEED):
+        if not (abs(at) <= MAX_TIME and 0.0 <= speed <= MAX_SPEED):
             return False
         self.live, self.speed, self._time, self._since = False, speed, at, now
         return True

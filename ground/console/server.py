@@ -27,7 +27,7 @@ from aiohttp import WSMsgType, web
 from flight.link.telemetry.definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
 from ground.console.commanding import CommandForms
-from ground.console.history import History, PageCursor, PageState
+from ground.console.history import MAX_TIME, History, PageCursor, PageState
 from ground.console.surroundings import FlightSurroundings, FrameFolder
 from ground.documentation import command_table, database
 from knightcube.errors import FlightError, UsageError
@@ -38,6 +38,8 @@ NO_ACCESS = "open the newest address that `flight console` printed: the page nee
 _READ_S = 0.1
 """Time (s) between two reads of new packets."""
 _MAX_POINTS = 4000
+_MAX_DIGITS = 18
+_MAX_PATH = 200
 _RANDOM_BYTES = 32
 _OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?")
 _OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name})
@@ -228,6 +230,8 @@ async def _add_headers(_: web.Request, response: web.StreamResponse) -> None:
 
 @web.middleware
 async def _errors_as_json(request: web.Request, handler: _Handler) -> web.StreamResponse:
+    if len(request.path) > _MAX_PATH:
+        raise web.HTTPNotFound(text="there is no such page")
     try:
         return await handler(request)
     except (FlightError, TelemetryError) as error:
@@ -360,7 +364,7 @@ async def _command_of(request: web.Request) -> tuple[str, dict[str, Any]]:
     try:
         body = await request.json()
         name, given = body["command"], body.get("values", {})
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise UsageError('a command is {"command": NAME, "values": {...}}') from error
     if not isinstance(name, str) or not isinstance(given, dict):
         raise UsageError('a command is {"command": NAME, "values": {...}}')
@@ -373,13 +377,13 @@ def _real(request: web.Request, name: str) -> float:
         value = float(text)
     except ValueError:
         value = float("nan")
-    if not abs(value) < 1e9:  # rejects NaN and mission times beyond 30 years
-        raise UsageError(f"{name} = {text!r}: give the mission time in seconds")
+    if not abs(value) < MAX_TIME:  # also for NaN
+        raise UsageError(f"{name} = {text!r:.40}: give the mission time in seconds")
     return value
 
 
 def _whole(request: web.Request, name: str, default: int) -> int:
     text = request.query.get(name, str(default))
-    if not text.isdigit():
-        raise UsageError(f"{name} = {text!r}: give a whole number")
+    if not (text.isascii() and text.isdigit() and len(text) <= _MAX_DIGITS):
+        raise UsageError(f"{name} = {text!r:.40}: give a whole number of at most {_MAX_DIGITS} digits")
     return int(text)
