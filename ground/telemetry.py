@@ -15,10 +15,16 @@ from flight.link.telemetry.packets import (
     Layout,
     PacketArray,
     TelemetryError,
+    to_text,
     truncated_bytes,
     walk,
 )
-from knightcube.errors import UsageError
+from knightcube.errors import UsageError, shown
+
+
+def text_of(value: bytes) -> str:
+    """Return the text of a string field, in which control characters cannot control a terminal."""
+    return shown(to_text(value))
 
 
 @dataclass(frozen=True)

@@ -27,3 +27,9 @@ class InputError(UsageError):
 
 class PlanningError(FlightError):
     """Error raised if no path was found. The message says why."""
+
+
+def shown(text: str) -> str:
+    """Return a text with its unprintable characters replaced by escape sequences."""
+    escaped = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(escaped)

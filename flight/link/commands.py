@@ -39,7 +39,7 @@ from flight.link.telemetry.packets import (
     crc16,
     to_text,
 )
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import FlightError, UsageError, shown
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
 
@@ -274,12 +274,6 @@ class DumpParameters(_Plain):
 
 
 Command = Ping | ChangeMode | Slew | Clear | Point | LoadParameters | DumpParameters
-
-
-def shown(text: str) -> str:
-    """Return a text with its unprintable characters replaced by escape sequences."""
-    escaped = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
-    return "".join(escaped)
 
 
 def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:

@@ -247,7 +247,12 @@ class Config(Section, frozen=True, kw_only=True):
     The value `body` names the body; a body outside this repository is named as `module:object`.
     """
 
-    name: Annotated[str, Meta(min_length=1, max_length=64)]
+    name: Annotated[
+        str,
+        Meta(
+            pattern=r"^[^\x00-\x1f\x7f-\x9f]+$", max_length=64, description="a name of printable characters"
+        ),
+    ]
     body: Annotated[str, Meta(min_length=1, max_length=200)] = "testbed"
     inertial_unit: InertialUnitSection
     coils: Coils

@@ -31,7 +31,6 @@ from flight.link.commands import (
     Ping,
     Point,
     command_of,
-    shown,
     words_of,
 )
 from flight.link.files.store import Store, files_folder
@@ -71,7 +70,7 @@ from flight.link.telemetry.definitions import (
     problem_of,
 )
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY_LAYOUTS
-from flight.link.telemetry.packets import TelemetryError, to_text
+from flight.link.telemetry.packets import TelemetryError
 from flight.schema.document import read_document, read_text, to_yaml
 from ground.documentation import meaning_of
 from ground.link.commanding import (
@@ -87,8 +86,8 @@ from ground.link.commanding import (
 )
 from ground.link.commanding import command as send
 from ground.link.terminal import Terminal, report_of
-from ground.telemetry import decode
-from knightcube.errors import FlightError, UsageError
+from ground.telemetry import decode, text_of
+from knightcube.errors import FlightError, UsageError, shown
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 Object = dict[str, Any]
@@ -238,7 +237,7 @@ def run_command(options: argparse.Namespace) -> int:
         mode = Mode(int(row["mode"]))
     except (TelemetryError, ValueError) as error:
         raise FlightError(f"{options.to}: its answer of {len(raw)} bytes is invalid") from error
-    done, text = bool(row["obeyed"]), shown(to_text(row["text"]))
+    done, text = bool(row["obeyed"]), text_of(row["text"])
     if options.json:
         facts = {"obeyed": done, "mode": mode.label, "text": text, "count": int(row["count"])}
         sys.stdout.write(json.dumps(facts) + "\n")
@@ -389,7 +388,7 @@ def _ask(options: argparse.Namespace, command: Command) -> tuple[ParameterTable 
     answers, tables = found[COMMAND.name], found[PARAMETERS.name]
     if not len(answers):
         raise FlightError(f"{options.to}: its answer has no report on the command")
-    refused = "" if answers[-1]["obeyed"] else shown(to_text(answers[-1]["text"]))
+    refused = "" if answers[-1]["obeyed"] else text_of(answers[-1]["text"])
     return (ParameterTable.of(tables[-1]) if len(tables) else None), refused
 
 
@@ -544,7 +543,7 @@ def run_files(options: argparse.Namespace) -> int:
         sys.stdout.write(json.dumps(facts) + "\n")
     else:
         for one in facts.get("files", ()):
-            sys.stdout.write(f"{one['bytes']:>12} {one['name']}\n")
+            sys.stdout.write(f"{one['bytes']:>12} {shown(one['name'])}\n")
         if "text" in facts:
             sys.stdout.write(f"{facts['text']}\n")
     return 0

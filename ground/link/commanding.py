@@ -33,7 +33,7 @@ from flight.link.process.directives import Directive, NewKey, SendFile
 from flight.link.process.filing import LISTING
 from flight.link.security import COMMAND_SPIS, NEXT, Association, Sealer, Vault, new_key
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
-from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text
+from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET
 from flight.schema.reader import load
 from ground.link.terminal import (
     ADDRESSES,
@@ -44,6 +44,7 @@ from ground.link.terminal import (
     open_terminal,
     report_of,
 )
+from ground.telemetry import text_of
 from knightcube.errors import FlightError, UsageError
 
 Show = Callable[[Report], object]
@@ -272,7 +273,7 @@ class FileSession:
                     self._reports.append(report)
             elif packet[:2] == _TRANSFER.identifier.to_bytes(2, "big"):
                 (row,) = _TRANSFER.array(packet)
-                self._texts[int(row["source"]), int(row["number"])] = to_text(row["text"])
+                self._texts[int(row["source"]), int(row["number"])] = text_of(row["text"])
 
     def transmit(self, now_ns: int) -> None:
         """Send the commands and PDUs that are due, within the rate limit. Raises FlightError."""

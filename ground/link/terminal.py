@@ -41,8 +41,9 @@ from flight.link.security import (
     new_key,
 )
 from flight.link.telemetry.definitions import LINK, VERIFICATION
-from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
+from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS
 from flight.schema.sections import Link, LinkCoding
+from ground.telemetry import text_of
 from knightcube.errors import FlightError, UsageError
 
 DEFAULTS = Link(keys="-")
@@ -273,7 +274,7 @@ def report_of(packet: bytes) -> Report:
     """Return the report in a verification packet."""
     (row,) = LAYOUTS[VERIFICATION.name].array(packet)
     stage = Stage(int(row["stage"]))
-    name, text = to_text(row["name"]), to_text(row["text"])
+    name, text = text_of(row["name"]), text_of(row["text"])
     request = Request(int(row["packet"]), int(row["sequence"]))
     return Report(int(row["spi"]), int(row["counter"]), stage, name, text, request)
 

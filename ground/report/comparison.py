@@ -9,10 +9,9 @@ from typing import Any
 
 from flight.link import events
 from flight.link.telemetry.log import find_runs
-from flight.link.telemetry.packets import to_text
 from flight.schema.document import read_document, read_text
 from ground.report.text import ARCSECONDS, number, provenance, table
-from ground.telemetry import Run, read_run
+from ground.telemetry import Run, read_run, text_of
 from knightcube.errors import UsageError
 
 Object = dict[str, Any]
@@ -189,7 +188,7 @@ def _archived(folder: Path) -> Object:
     log = run.flight
     if len(run["run"]):
         first = run["run"][0]
-        row |= {"config_name": to_text(first["config_name"]), "utc": _label(int(first["utc_ns"]))}
+        row |= {"config_name": text_of(first["config_name"]), "utc": _label(int(first["utc_ns"]))}
     if len(run["control"]):
         row["duration_s"] = float(run["control"]["time_ns"][-1]) * 1e-9
     return {
@@ -205,7 +204,7 @@ def _end(run: Run) -> str:
     """Return the reason for the end of a run, as recorded by the control loop."""
     recorded = run["event"]
     stops = recorded["text"][recorded["code"] == events.STOPPED.code]
-    return to_text(stops[-1]) if len(stops) else "unclean: the log has no stop event"
+    return text_of(stops[-1]) if len(stops) else "unclean: the log has no stop event"
 
 
 def _label(utc_ns: int) -> str | None:

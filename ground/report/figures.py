@@ -13,11 +13,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flight.link.telemetry.packets import to_text
 from ground.report import orbit_figures, panels
 from ground.report.panels import RunSignals
 from ground.report.signals import seconds
-from ground.telemetry import Run
+from ground.telemetry import Run, text_of
 
 if TYPE_CHECKING:  # imported for types only, because these modules import the optimiser
     from ground.identification.fit import PlantFit
@@ -135,7 +134,7 @@ def _cycle_times(signals: RunSignals) -> Figure | None:
     period = float(identity["control_period_ns"][0]) * 1e-9 if len(identity) else None
     panels.exceedance(axes[0], cycle, "Control cycles", period)
     if len(jobs):
-        names = np.array([to_text(name) for name in jobs["name"]], dtype=object)
+        names = np.array([text_of(name) for name in jobs["name"]], dtype=object)
         work = {str(name): jobs["execution"][names == name].astype(float) for name in sorted(set(names))}
         panels.exceedance(axes[1], work, "Jobs of the workers")
     return figure

@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from flight.link import events
 from flight.link.modes import POINTING, Mode
-from flight.link.telemetry.packets import PacketArray, to_text
+from flight.link.telemetry.packets import PacketArray
 from flight.schema.orbit import OrbitConfig
 from ground.report.signals import PowerHistory, seconds, true_rows
 from ground.report.steps import judge
-from ground.telemetry import Run
+from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 
@@ -283,7 +283,7 @@ def pointing(run: Run, axis: npt.ArrayLike, power: PowerHistory | None) -> Objec
     slew_ends = seconds(happened[happened["code"] == events.SLEW_ENDED.code])
     announced = happened[happened["code"] == events.TARGET.code]
     starts = [*map(float, seconds(announced))] or [-math.inf]
-    names = [to_text(row["text"]) for row in announced] or ["-"]
+    names = [text_of(row["text"]) for row in announced] or ["-"]
     rows = []
     for name, start, stop in zip(names, starts, [*starts[1:], math.inf], strict=True):
         inside = (found.times >= start) & (found.times < stop)

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 
 from flight.link import events
 from flight.link.modes import Mode
-from flight.link.telemetry.packets import PacketArray, to_text
+from flight.link.telemetry.packets import PacketArray
 from ground.passes import OrbitPrediction, Station
 from ground.report import panels
 from ground.report.orbit import (
@@ -29,7 +29,7 @@ from ground.report.orbit import (
 )
 from ground.report.panels import RunSignals
 from ground.report.signals import seconds, true_rows
-from ground.telemetry import Run
+from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
 from knightcube.astro.quaternion import attitude_matrix
@@ -208,7 +208,7 @@ def _modes(ax: Axes, run: Run, end: float) -> None:
         at, colour = float(row["time_ns"]) * 1e-9, panels.PURPLE
         ax.axvline(at, color=colour, linewidth=0.9)
         place = (at, 1.0), (3, -2), ("data", "axes fraction"), "offset points"
-        ax.annotate(to_text(row["text"]), *place, va="top", fontsize=8, color=colour)
+        ax.annotate(text_of(row["text"]), *place, va="top", fontsize=8, color=colour)
     panels.style(ax, "mode", "Modes and commanded targets")
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.packets import PacketArray, to_text
-from ground.telemetry import Run
+from flight.link.telemetry.packets import PacketArray
+from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.quaternion import (
     attitude_matrix,
@@ -234,13 +234,13 @@ def failed_frames(run: Run) -> list[Object]:
     """Return number, time and reasons of each frame that gave neither a rate nor an attitude."""
     stars = run["stars"]
     solved = set(stars["sequence"][np.all(np.isfinite(stars["quaternion"]), axis=1)].tolist())
-    reasons = {int(row["sequence"]): to_text(row["status"]) for row in stars}
+    reasons = {int(row["sequence"]): text_of(row["status"]) for row in stars}
     rated = np.all(np.isfinite(run["streak"]["rate"]), axis=1)
     return [
         {
             "sequence": int(row["sequence"]),
             "exposed_s": float(row["exposure_start_ns"]) / 1e9,
-            "streaks": to_text(row["status"]),
+            "streaks": text_of(row["status"]),
             "stars": reasons.get(int(row["sequence"])),
         }
         for row in run["streak"][~rated]
@@ -278,7 +278,7 @@ def _misalignment(run: Run) -> FloatArray:
 
 
 def _counts(texts: PacketArray) -> dict[str, int]:
-    return dict(Counter(to_text(text) for text in texts))
+    return dict(Counter(text_of(text) for text in texts))
 
 
 def _rms(values: FloatArray) -> float:

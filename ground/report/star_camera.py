@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.packets import PacketArray, to_text
+from flight.link.telemetry.packets import PacketArray
 from flight.schema.devices import Camera
 from flight.schema.orbit import OrbitConfig
 from ground.report.signals import seconds
-from ground.telemetry import Run
+from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.quaternion import attitude_matrix
@@ -102,7 +102,7 @@ def _rows(packets: PacketArray, instants: FloatArray) -> IntArray:
 def _measured_at(run: Run) -> FloatArray:
     """Return the sorted times (m,), s, of the exposures that gave an attitude or a rate."""
     streaks, stars = run["streak"], run["stars"]
-    rates = np.array([to_text(status) == StreakStatus.RATE.value for status in streaks["status"]], dtype=bool)
+    rates = np.array([text_of(status) == StreakStatus.RATE.value for status in streaks["status"]], dtype=bool)
     starts = streaks["exposure_start_ns"] * 1e-9
     fixed = set(stars["sequence"][np.isfinite(stars["quaternion"][:, 0])].tolist())
     attitudes = np.array([sequence in fixed for sequence in streaks["sequence"].tolist()], dtype=bool)

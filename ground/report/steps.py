@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from flight.link.modes import STEERING
-from flight.link.telemetry.packets import PacketArray, to_text
+from flight.link.telemetry.packets import PacketArray
 from ground.report.signals import ThreadMotion, seconds
-from ground.telemetry import Run
+from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
@@ -224,7 +224,7 @@ def judged_steps(
 
 def _step_ends(packets: PacketArray) -> FloatArray:
     """Return the times, s, at which a commanded mode or a mode without steering ended any step."""
-    by_command = np.array([to_text(row["trigger"]).startswith("commanded") for row in packets], dtype=bool)
+    by_command = np.array([text_of(row["trigger"]).startswith("commanded") for row in packets], dtype=bool)
     steering = np.isin(packets["mode"], [int(mode) for mode in STEERING])
     return seconds(packets)[by_command | ~steering]
 

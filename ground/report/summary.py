@@ -13,7 +13,7 @@ import numpy as np
 
 from flight.link import events
 from flight.link.modes import Mode
-from flight.link.telemetry.packets import PacketArray, to_text
+from flight.link.telemetry.packets import PacketArray
 from flight.loop.facts import FACTS, StreamState
 from flight.schema import reader
 from flight.schema.document import ConfigError
@@ -34,7 +34,7 @@ from ground.report.signals import (
 )
 from ground.report.star_camera import star_camera
 from ground.report.steps import against_thesis, judged_steps, step_row
-from ground.telemetry import Run
+from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
@@ -127,9 +127,9 @@ def _identity(run: Run, attitude: ThreadMotion, notes: list[str]) -> Object:
         **identity,
         "cut_short": cut_short,
         "duration_planned_s": planned,
-        "config_name": to_text(first["config_name"]),
+        "config_name": text_of(first["config_name"]),
         "config_crc": int(first["config_crc"]),
-        "software": to_text(first["software"]),
+        "software": text_of(first["software"]),
         "seed": int(first["seed"]),
         "utc_ns": int(first["utc_ns"]),
         "simulated": bool(first["simulated"]),
@@ -160,7 +160,7 @@ def _power(run: Run, power: PowerHistory | None, notes: list[str]) -> Object:
 
 def _rate_groups(packets: PacketArray) -> list[Object]:
     """Return the final counters of each rate group, fastest first."""
-    last = {to_text(row["name"]): row for row in packets}
+    last = {text_of(row["name"]): row for row in packets}
     groups: list[Object] = [
         {
             "name": name,
@@ -198,11 +198,11 @@ def _percentiles(values: FloatArray) -> Object | None:
 
 def _jobs(packets: PacketArray) -> list[Object]:
     """Return number, outcomes and execution times of the jobs of each worker."""
-    names = np.array([to_text(name) for name in packets["name"]], dtype=object)
+    names = np.array([text_of(name) for name in packets["name"]], dtype=object)
     found = []
     for name in sorted(set(names)):
         own = packets[names == name]
-        outcomes = Counter(to_text(outcome) for outcome in own["outcome"])
+        outcomes = Counter(text_of(outcome) for outcome in own["outcome"])
         times = _percentiles(own["execution"].astype(float))
         found.append({"name": name, "count": len(own), "outcomes": dict(outcomes), "execution_s": times})
     return found
@@ -211,7 +211,7 @@ def _jobs(packets: PacketArray) -> list[Object]:
 def _planner(packets: PacketArray) -> Object:
     """Return the numbers of accepted, stretched and refused plans, and the reasons of the refusals."""
     accepted = packets["accepted"] == 1
-    status = np.array([to_text(value) for value in packets["status"]], dtype=object)
+    status = np.array([text_of(value) for value in packets["status"]], dtype=object)
     flown = packets[accepted]
     return {
         "plans": len(packets),
@@ -230,8 +230,8 @@ def _modes(packets: PacketArray) -> list[Object]:
         {
             "mode": Mode(int(row["mode"])).label,
             "at_s": float(time),
-            "trigger": to_text(row["trigger"]),
-            "reason": to_text(row["reason"]),
+            "trigger": text_of(row["trigger"]),
+            "reason": text_of(row["reason"]),
         }
         for row, time in zip(packets, seconds(packets), strict=True)
     ]
@@ -272,7 +272,7 @@ def _events(packets: PacketArray) -> list[Object]:
     """
     found: dict[str, Object] = {}
     for row, time in zip(packets, seconds(packets), strict=True):
-        name, text = to_text(row["name"]), to_text(row["text"])
+        name, text = text_of(row["name"]), text_of(row["text"])
         first = {"name": name, "count": 0, "severity": int(row["severity"]), "first_s": float(time)}
         found.setdefault(name, {**first, "text": text})["count"] += 1 + int(row["suppressed"])
     return list(found.values())
@@ -284,7 +284,7 @@ _OF_COILS = {events.COIL_BROKEN.name, events.COIL_CORRECTED.name, events.COIL_TR
 def _coils(packets: PacketArray) -> list[Object]:
     """Return time, name and text of the events by which a coil is isolated, corrected or used again."""
     rows = ((float(time), row) for row, time in zip(packets, seconds(packets), strict=True))
-    named = ((time, to_text(row["name"]), to_text(row["text"])) for time, row in rows)
+    named = ((time, text_of(row["name"]), text_of(row["text"])) for time, row in rows)
     return [{"time_s": time, "name": name, "text": text} for time, name, text in named if name in _OF_COILS]
 
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from flight import __version__
 from hal.interfaces.errors import DeviceError
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import FlightError, UsageError, shown
 
 _READER_GONE = frozenset({errno.EPIPE, errno.EIO, errno.EBADF})
 
@@ -200,5 +200,7 @@ def _available(words: Sequence[str]) -> dict[str, tuple[str, str, str]]:
 
 
 def _complain(message: str, status: int) -> int:
-    sys.stderr.write(f"flight: {message}\n")
+    """Print an error message, in which control characters cannot control a terminal."""
+    lines = map(shown, message.split("\n"))
+    sys.stderr.write("flight: " + "\n".join(lines) + "\n")
     return status
