@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray
-from ground.telemetry import Run, text_of
+from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text
+from ground.telemetry import Run
 from knightcube.errors import UsageError
 
 
@@ -45,7 +45,7 @@ def _columns(layout: Layout, packets: PacketArray) -> Iterator[PacketColumn]:
     for field in layout.packet.fields:
         values = packets[field.name]
         if field.kind.startswith("S"):
-            yield PacketColumn(field.name, field.unit, field.meaning, [text_of(value) for value in values])
+            yield PacketColumn(field.name, field.unit, field.meaning, [to_text(value) for value in values])
             continue
         native = values.astype(values.dtype.newbyteorder("="))
         spread = {field.name: native}

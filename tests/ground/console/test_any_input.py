@@ -16,9 +16,9 @@ from aiohttp.test_utils import TestClient
 from flight.link import commands
 from flight.link.commands import COMMANDS
 from ground.console.history import PageCursor
-from tests.ground.console.test_server import asked, folder
+from tests.ground.console.served import asked
+from tests.ground.report.synthetic import Recipe, make_run
 
-__all__ = ["folder"]  # a fixture
 SEED = 35
 HUGE = "9" * 400
 NESTED = "[" * 100_000 + "]" * 100_000
@@ -94,6 +94,11 @@ NUMBERS = [
     ),
 ]
 """Numbers in a query."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
 
 
 def bodies(draw: np.random.Generator) -> Iterator[tuple[bytes, str]]:

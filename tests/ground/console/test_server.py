@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import shutil
 from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime
@@ -11,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from aiohttp import CookieJar, WSServerHandshakeError
-from aiohttp.test_utils import TestClient, TestServer
+from aiohttp import WSServerHandshakeError
+from aiohttp.test_utils import TestClient
 
 from flight.link import commands
 from flight.link.commands import COMMANDS, Command
@@ -21,9 +20,9 @@ from flight.link.telemetry.definitions import PARAMETER_FIELDS, crc_of
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
 from ground.console.commanding import CommandForms
 from ground.console.history import History
-from ground.console.server import Access, Console, application
+from ground.console.server import Access, Console
 from ground.console.surroundings import UNKNOWN, FlightSurroundings
-from ground.watch import LogTail
+from tests.ground.console.served import asked
 from tests.ground.report.synthetic import Recipe, make_run
 
 Answer = tuple[int, Any]
@@ -33,30 +32,6 @@ Ask = Callable[..., Awaitable[Answer]]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
-
-
-def asked(
-    folder: Path,
-    ask: Callable[[TestClient[Any, Any]], Awaitable[Any]],
-    send: Any = None,
-    access: Access | None = None,
-) -> Any:
-    """Serve a run, and return what a client gets that has opened the address, or with `access` has not."""
-
-    async def talk(history: History) -> Any:
-        place = FlightSurroundings.of(folder / "config.yaml")
-        console = Console(folder.name, LogTail(folder), history, place, CommandForms(send))
-        console.read()
-        door = access or Access(lambda token: None)
-        server = TestServer(application(console, door), host="127.0.0.1")
-        async with TestClient(server, cookie_jar=CookieJar(unsafe=True)) as client:  # also of numeric hosts
-            if access is None:
-                async with client.get("/", params={"token": door.token}) as answer:
-                    assert answer.status == 200
-            return await ask(client)
-
-    with History() as history:
-        return asyncio.run(talk(history))
 
 
 def get(folder: Path, path: str, headers: dict[str, str] | None = None) -> tuple[int, Any]:

@@ -1,0 +1,41 @@
+"""A console that a test serves, and what a client gets from it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from aiohttp import CookieJar
+from aiohttp.test_utils import TestClient, TestServer
+
+from ground.console.commanding import CommandForms
+from ground.console.history import History
+from ground.console.server import Access, Console, application
+from ground.console.surroundings import FlightSurroundings
+from ground.watch import LogTail
+
+
+def asked(
+    folder: Path,
+    ask: Callable[[TestClient[Any, Any]], Awaitable[Any]],
+    send: Any = None,
+    access: Access | None = None,
+) -> Any:
+    """Serve a run, and return what a client gets that has opened the address, or with `access` has not."""
+
+    async def talk(history: History) -> Any:
+        place = FlightSurroundings.of(folder / "config.yaml")
+        console = Console(folder.name, LogTail(folder), history, place, CommandForms(send))
+        console.read()
+        door = access or Access(lambda token: None)
+        server = TestServer(application(console, door), host="127.0.0.1")
+        async with TestClient(server, cookie_jar=CookieJar(unsafe=True)) as client:  # also of numeric hosts
+            if access is None:
+                async with client.get("/", params={"token": door.token}) as answer:
+                    assert answer.status == 200
+            return await ask(client)
+
+    with History() as history:
+        return asyncio.run(talk(history))
