@@ -108,7 +108,7 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
     horizon: Positive = 1500.0
     replan: Annotated[float, Meta(ge=1.0)] = 5.0
     gentle: Positive = 0.052
-    spin_up: Annotated[float, Meta(ge=1.0)] = 2.0
+    spin_up: Annotated[float, Meta(ge=1.0)] = 3.0
 
 
 BlockName = Literal[

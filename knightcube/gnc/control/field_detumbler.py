@@ -55,9 +55,9 @@ from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
 
 ITERATIONS = 12
-LIMIT_GAIN = 1.4
-"""Assumed mean dipole moment of the coils in a rotating body, relative to the mean limit of the body
-axes. With all coils saturated, the ratio would be 1.5."""
+LIMIT_GAIN = 1.5
+"""Mean dipole moment of three saturated coils along a direction, averaged over all directions and relative to
+the mean limit of the body axes."""
 STEEP = 12.0
 """Gain of the dipole moment: a coil reaches the dipole limit where |B x y| (field B, costate y) exceeds its
 mean divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would then
@@ -264,7 +264,7 @@ class FieldDetumblerSettings:
     horizon: float = 1500.0
     replan: float = 5.0
     gentle: float = 0.052
-    spin_up: float = 2.0
+    spin_up: float = 3.0
     slow: float = 8.7e-3
 
     def __post_init__(self) -> None:

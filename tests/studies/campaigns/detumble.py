@@ -3,10 +3,10 @@
 Two craft, each in a Sun-synchronous, an ISS-like and an equatorial orbit. The law `magnetometer` has only a
 magnetometer. The law `attitude` also has a gyro with a bias, a coarse attitude and the orbit. The law
 `inertia` has the same sensors, but the body's moments and principal axes differ from the described ones by up
-to the default accuracies. The coils are off for a tenth of each two seconds, as the magnetometer needs, and
-before the rate is known. Coils are commanded each quarter of a second, and as often as the body rotates by
-0.3 rad. Each time is compared with a rigorous lower bound (`least_time`), which no control of these coils can
-beat. The bound assumes that the coils are never off and that a dipole of the largest strength has any
+to the default accuracies. The coils are off for a twentieth of each four seconds, as the magnetometer needs,
+and before the rate is known. Coils are commanded each quarter of a second, and as often as the body rotates
+by 0.3 rad. Each time is compared with a rigorous lower bound (`least_time`), which no control of these coils
+can beat. The bound assumes that the coils are never off and that a dipole of the largest strength has any
 direction.
 """
 
@@ -111,7 +111,7 @@ def _crossed(removed: FloatArray, wanted: FloatArray) -> FloatArray:
 
 
 SPEED, SLOW = math.radians(10.0), math.radians(0.5)
-SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
+SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 3_800_000_000)
 SAMPLES_NS = range(SCHEDULE.settle_ns, SCHEDULE.settle_ns + SCHEDULE.measure_ns, 25_000_000)
 LAWS = ("magnetometer", "attitude", "inertia")
 CELLS = tuple((orbit, law) for orbit in ("sso", "iss", "equator") for law in LAWS)
@@ -120,8 +120,8 @@ LONGEST = 6000.0
 WALK, LIGHTEST = 4.0, 1.04
 """Largest random walk of the residual dipole, in standard deviations of an axis, and strongest sunlight, as a
 multiple of that at one astronomical unit."""
-LEAST_CYCLES = 8
-"""Commands in a window; the flight gives 72."""
+LEAST_CYCLES = 16
+"""Commands in a window; the flight gives 152."""
 HORIZON = {"knightcube": 1500.0, "cubesat_3u": 3000.0}
 """s that a plan looks ahead."""
 ATTITUDE_SIGMA = np.radians(1.0)

@@ -19,16 +19,18 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 from sim_hal.emulators.solar_cells import SolarCellsModel
 from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds.orbit import sun_position
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
-from tests.studies.campaigns.detumble import SAMPLES_NS, SCHEDULE, hash_of
+from tests.studies.campaigns.detumble import SAMPLES_NS, hash_of
 from tests.studies.campaigns.free_flight import CRAFT, GYRO_NOISE, ORBITS, SECOND, FreeFlight
 
 AXIS = np.array([0.0, 0.0, 1.0])
+SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
 SPEED = math.radians(0.5)
 SECONDS, SETTLED = 11_600.0, 1_800.0
 NEAR = 20.0

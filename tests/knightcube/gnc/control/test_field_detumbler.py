@@ -131,7 +131,7 @@ THREE_UNITS = np.diag([0.0066, 0.0333, 0.0333])
 
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize(("described", "limit"), [(INERTIA, LIMIT), (THREE_UNITS, 0.2)], ids=["1U", "3U"])
-@pytest.mark.parametrize(("speed", "multiple"), [(0.03, 1.0), (0.1, 2.0)], ids=["gentle", "fast"])
+@pytest.mark.parametrize(("speed", "multiple"), [(0.03, 1.0), (0.1, 3.0)], ids=["gentle", "fast"])
 def test_the_coils_never_spin_up_a_body_of_another_inertia_beyond_the_multiple(
     seed: int, described: FloatArray, limit: float, speed: float, multiple: float
 ) -> None:
@@ -156,9 +156,9 @@ def test_with_a_gyro_a_slow_spin_along_the_field_is_never_made_faster() -> None:
     assert speeds[-1] < math.radians(0.5)
 
 
-def test_with_a_gyro_a_fast_spin_along_the_field_is_stopped_soon_at_twice_its_rate() -> None:
-    speeds = fly(np.array([0.0, 0.0, 0.1]), 380.0, gyro=lambda rate: rate + BIAS)
-    assert 1.5 * speeds[0] < speeds.max() < 2.1 * speeds[0]
+def test_with_a_gyro_a_fast_spin_along_the_field_is_stopped_soon_at_thrice_its_rate() -> None:
+    speeds = fly(np.array([0.0, 0.0, 0.1]), 360.0, gyro=lambda rate: rate + BIAS)
+    assert 2.0 * speeds[0] < speeds.max() < 3.1 * speeds[0]
     assert speeds[-1] < math.radians(0.5)
 
 
