@@ -349,7 +349,7 @@ uninstall_all() {
         "$units/knightcube.service.d" "$units/knightcube-safe.service.d" "$rules" "$modules" "$watchdog" \
         "$prefix" "$cache"
     if [ -n "$purge" ]; then
-        run rm -rf "$settings" "$root$logs" "$root$logs-link"
+        run rm -rf "$settings" "$root$logs" "$root$logs-link" "$root$logs-link-witness"
         if [ -z "$root" ] && getent passwd "$user" >/dev/null; then
             run userdel "$user"
         fi

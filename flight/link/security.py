@@ -13,6 +13,14 @@ update and a crash damages at most one copy. If the two copies differ, the copy 
 higher counter is used. One folder holds the security associations of one end of the link, and only the
 folder's owner may read them.
 
+A folder of keys that was restored from a backup contains old counters, with which old commands would be
+obeyed again. The satellite therefore keeps a witness: a second folder that no backup may contain, with the
+newest association of each SPI and the digests of all replaced keys. An association is outdated if the witness
+has the same key with a higher counter, or if its key was replaced. A new key that the witness does not know
+is accepted from any folder. If the association of the primary command SPI is outdated, its commands are
+refused until a command of the reserve SPI sets a new key. The other SPIs continue with the key and counter in
+the witness.
+
 A gate checks the CRC, spacecraft, SPI, MAC and counter of a frame in this order. A refused frame has no
 effect except on the count of refusals by cause. The counter of an accepted frame is stored durably before the
 frame's data are used, so that the same frame cannot be accepted again after a crash.
@@ -21,6 +29,7 @@ frame's data are used, so that the same frame cannot be accepted again after a c
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
 import secrets
 import stat
@@ -28,7 +37,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -152,14 +161,30 @@ def decode(data: bytes) -> Association | None:
 class Vault:
     """Folder of stored security associations, which several processes of the same user may share."""
 
-    def __init__(self, folder: Path) -> None:
-        """Open a folder. Raises UsageError if it does not exist or if other users may read its files."""
+    def __init__(self, folder: Path, witness: Path | None = None) -> None:
+        """Open a folder. Raises UsageError if it does not exist or if other users may read its files.
+
+        A satellite gives the folder of its `witness`, which is created if possible.
+        """
         self._folder = folder
+        self._witness = None if witness is None else _Witness(witness)
         if not folder.is_dir():
             raise UsageError(f"{folder}: no such folder; `python -m ground keys` makes keys")
         for path in folder.glob("spi-*"):
             if stat.S_IMODE(path.stat().st_mode) & 0o077:
                 raise UsageError(f"{path}: others may read this key: chmod 600, or make new keys")
+        self.restored = False
+        """Whether the primary command SPI is refused because its association is outdated."""
+        if self._witness is not None:
+            for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS):
+                stored = max(self._copies(spi), default=None)
+                if stored is None:
+                    continue
+                if not self._witness.outdates(stored):
+                    self._witness.write(stored)
+                elif spi != COMMAND_SPIS[0]:
+                    self.write(self._witness.known[spi])
+            self.restored = self.copies(COMMAND_SPIS[0]) > 0 and self.read(COMMAND_SPIS[0]) is None
 
     @property
     def folder(self) -> Path:
@@ -191,8 +216,15 @@ class Vault:
             yield
 
     def read(self, name: int | str) -> Association | None:
-        """Return the newest valid copy of an association, None if both copies are missing or damaged."""
-        return max(self._copies(name), default=None)
+        """Return the newest valid copy of an association, None if both copies are missing or damaged.
+
+        For an outdated association, the association in the witness is returned, but None for the primary
+        command SPI.
+        """
+        newest = max(self._copies(name), default=None)
+        if newest is None or self._witness is None or not self._witness.outdates(newest):
+            return newest
+        return None if newest.spi == COMMAND_SPIS[0] else self._witness.known[newest.spi]
 
     def copies(self, name: int | str) -> int:
         """Return the number of valid copies that equal the newest copy."""
@@ -203,7 +235,10 @@ class Vault:
         """Write both copies of an association and return how many writes succeeded. Never raises."""
         data = encode(association)
         spi = association.spi if name is None else name
-        return sum(overwrite(self._path(spi, copy), data) for copy in COPIES)
+        written = sum(overwrite(self._path(spi, copy), data) for copy in COPIES)
+        if written and self._witness is not None:
+            self._witness.write(association)
+        return written
 
     def advance(self, association: Association) -> int:
         """Write both copies of an association unless another process has stored a newer association.
@@ -238,6 +273,68 @@ class Vault:
             if association is not None and str(association.spi) == str(name).partition("-")[0]:
                 found.append(association)
         return found
+
+
+_ID_BYTES = 8
+_MOST_IDS_BYTES = 1 << 16
+
+
+class _Witness:
+    """Folder with the newest association of each SPI and the digests of replaced keys.
+
+    Errors of the disk are ignored, because a link without a witness is better than no link.
+
+    Attributes:
+        known: newest association of each SPI.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        with suppress(OSError):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.known: dict[int, Association] = {}
+        self._replaced: dict[int, set[bytes]] = {}
+        self._writes = 0
+        for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS):
+            found = [self._read(f"spi-{spi}.{copy}", _RECORD.size + _CRC_BYTES) for copy in COPIES]
+            good = [one for one in map(decode, found) if one is not None and one.spi == spi]
+            if good:
+                self.known[spi] = max(good)
+            ids = self._read(f"replaced-{spi}", _MOST_IDS_BYTES)
+            self._replaced[spi] = {ids[at : at + _ID_BYTES] for at in range(0, len(ids), _ID_BYTES)}
+
+    def outdates(self, stored: Association) -> bool:
+        """Return whether a stored association has been replaced, or has an old counter."""
+        known = self.known.get(stored.spi)
+        if known is None:
+            return False
+        if known.key == stored.key:
+            return stored.unused < known.unused
+        return _id_of(stored.key) in self._replaced[stored.spi]
+
+    def write(self, association: Association) -> None:
+        """Record a new association, and the digest of the key that it replaces."""
+        spi, known = association.spi, self.known.get(association.spi)
+        if association == known and association.key == known.key:
+            return
+        new = known is None or known.key != association.key
+        if known is not None and new:
+            self._replaced[spi].add(_id_of(known.key))
+            overwrite(self._folder / f"replaced-{spi}", b"".join(sorted(self._replaced[spi])))
+        self.known[spi] = association
+        # One copy of a counter is written each time, so that a crash damages at most the newest copy.
+        self._writes += 1
+        for copy in COPIES if new else (COPIES[self._writes % 2],):
+            overwrite(self._folder / f"spi-{spi}.{copy}", encode(association))
+
+    def _read(self, name: str, most: int) -> bytes:
+        with suppress(OSError):
+            return read_regular(self._folder / name, most) or b""
+        return b""
+
+
+def _id_of(key: bytes) -> bytes:
+    return hashlib.sha256(b"knightcube " + key).digest()[:_ID_BYTES]
 
 
 WINDOW = 65_536

@@ -36,6 +36,7 @@ from flight.link.process.commanding import ControlLine, Sent
 from flight.link.process.directives import Listing
 from flight.link.process.downlink import LogFollower
 from flight.link.process.station import (
+    RESTORED,
     Line,
     SerialLine,
     Station,
@@ -169,7 +170,9 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
         _say(judged.problem)
     section, clock = judged.link, SystemClock()
     inhibit.check(Path(section.keys).absolute().parent, judged.inhibit)
-    vault = Vault(Path(section.keys))
+    vault = Vault(Path(section.keys), _witness(Path(section.keys)))
+    if vault.restored:
+        _say(f"{section.keys}: {RESTORED}")
     if all(vault.read(spi) is None for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)):
         raise UsageError(f"{section.keys}: no key can be read: mount or copy the satellite's keys there")
     stack.enter_context(vault.owned())
@@ -193,6 +196,12 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
     )
     station = Station(settings, vault, lines, control, LogFollower(log), clock)
     return _OpenedLink(station, ", ".join(line.name for line in lines))
+
+
+def _witness(keys: Path) -> Path:
+    """Return the folder of the witness: the second state folder of a service, else a sibling of the keys."""
+    folders = os.environ.get("STATE_DIRECTORY", "").split(":")
+    return Path(folders[1]) if len(folders) > 1 else keys.absolute().parent / "witness"
 
 
 def _open_lines(section: Link, codes: LinkCodes, clock: SystemClock, stack: ExitStack) -> list[Line]:

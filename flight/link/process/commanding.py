@@ -296,13 +296,21 @@ class _Read:
 class Timetable:
     """Schedule of time-tagged commands, stored in a folder that only one process may use."""
 
-    def __init__(self, folder: Path) -> None:
-        """Read the newest valid copy of the schedule. Set `lost` if copies exist but none is valid."""
+    def __init__(self, folder: Path, restored: bool = False) -> None:
+        """Read the newest valid copy of the schedule. Set `lost` if copies exist but none is valid.
+
+        If the folder was `restored` from a backup, its schedule is outdated: all entries are deleted.
+        """
         self._folder = folder
         read = [self._read(copy) for copy in COPIES]
         good = [one.copy for one in read if one.copy is not None]
         self.lost = not good and any(one.present for one in read)
         self._now = max(good, key=lambda copy: copy.version, default=_Copy())
+        if restored and self._now.entries:
+            self.lost, last = True, self._now.last
+            self._now = msgspec.structs.replace(self._now, entries=())
+            with suppress(TimetableError):
+                self._store((), last)
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -379,7 +387,7 @@ class Scheduling:
 
     def beginning(self) -> list[Report]:
         """Return the reports to be sent at the start of the link process."""
-        text = "both copies of the schedule are lost, so the schedule is empty"
+        text = "both copies of the schedule are lost or outdated, so the schedule is empty"
         return [Report(0, 0, Stage.FAILED, SCHEDULE.name, text)] if self._timetable.lost else []
 
     def followed(self, packet: bytes) -> None:

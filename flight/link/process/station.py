@@ -445,6 +445,7 @@ def _change_key(change: NewKey, vault: Vault, gate: Gate, sealers: Mapping[int, 
     return "" if done else "the key could not be stored"
 
 
+RESTORED = "the keys were restored from a backup: set a new key of SPI 1 by a command of SPI 2"
 TURN_NS = SECOND_NS // 50
 _BUSY_NS = SECOND_NS // 250
 """Period (ns) of the loop while frames arrive.
@@ -529,8 +530,10 @@ class Station:
         self._alive: Callable[[], object] | None = None
         self._alive_ns = clock.now_ns()
         self._playback = Playback(self._downlink, log)
-        self._scheduling = Scheduling(Timetable(vault.folder))
+        self._scheduling = Scheduling(Timetable(vault.folder, vault.restored))
         self._report(*self._scheduling.beginning())
+        if vault.restored:
+            self.report_problem("keys", RESTORED)
         self._status()
 
     @property

@@ -30,6 +30,7 @@ from tests.studies.campaigns.planner_edge import PLANNER_EDGE
 from tests.studies.campaigns.process_kill import PROCESS_KILL
 from tests.studies.campaigns.rate_change import RATE_CHANGE
 from tests.studies.campaigns.resting import RESTING
+from tests.studies.campaigns.restored_keys import RESTORED_KEYS
 from tests.studies.campaigns.robust_controllers import ROBUST_CONTROLLERS
 from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
@@ -68,6 +69,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         FAULTS,
         FAULTS_KILL,
         INSTALLER_KILL,
+        RESTORED_KEYS,
         PROCESS_KILL,
         COIL_FAULTS,
         UNKNOWN_BODY,

@@ -165,7 +165,10 @@ def test_a_lost_schedule_is_reported_and_a_full_disk_refuses(
         path.write_bytes(b"x")
     link.restart()
     link.turn()
-    assert link.reports()[-1].text == "both copies of the schedule are lost, so the schedule is empty"
+    assert (
+        link.reports()[-1].text
+        == "both copies of the schedule are lost or outdated, so the schedule is empty"
+    )
     monkeypatch.setattr(commanding, "overwrite", lambda *_: False)
     with pytest.raises(TimetableError, match="could not be stored"):
         Timetable(link.sky.folder).add(5, 1, 9, "ping 1")

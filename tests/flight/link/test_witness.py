@@ -1,0 +1,125 @@
+"""A restored folder of keys is recognised by the witness, and obeys no old command."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from flight.link.frames import TELEMETRY_MASK
+from flight.link.process.commanding import Timetable
+from flight.link.security import Association, Refusal, RefusedError, Sealer, Vault, new_key
+from tests.flight.link.vaults import Ground, gate, vault
+
+KEYS = {spi: bytes([spi]) * 32 for spi in (1, 2, 3, 4)}
+
+
+@pytest.fixture
+def ground(tmp_path: Path) -> Vault:
+    return vault(tmp_path / "ground", KEYS)
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> Path:
+    """Return the satellite's folder of keys."""
+    return vault(tmp_path / "keys", KEYS).folder
+
+
+def opened(keys: Path) -> Vault:
+    """Return the satellite's associations, as the link opens them."""
+    return Vault(keys, keys.parent / "witness")
+
+
+def refusal(at: Vault, frame: bytes) -> Refusal | None:
+    """Return why a frame is refused."""
+    try:
+        gate(at).admit(frame)
+    except RefusedError as error:
+        return error.cause
+    return None
+
+
+def restore(keys: Path) -> None:
+    shutil.rmtree(keys)
+    shutil.copytree(keys.parent / "backup", keys)
+
+
+def test_a_restored_folder_refuses_all_commands_until_the_reserve_sets_a_key(
+    keys: Path, ground: Vault
+) -> None:
+    shutil.copytree(keys, keys.parent / "backup")
+    old = [Ground(ground, spi).frame(b"old") for spi in (1, 1, 2, 2)]
+    assert [refusal(opened(keys), frame) for frame in old] == [None] * 4
+    restore(keys)
+    for _ in range(2):  # also after another start
+        at = opened(keys)
+        assert at.restored
+        assert [refusal(at, frame) for frame in old] == [Refusal.LOST] * 2 + [Refusal.REPEATED] * 2
+        assert refusal(at, Ground(ground, 1).frame(b"new")) is Refusal.LOST
+    receiver = gate(at)
+    receiver.admit(Ground(ground, 2).frame(b"new key"))
+    changed = Association(1, 2, 0, new_key())
+    assert receiver.replace_key(1, changed.generation, changed.key)
+    ground.write(changed)
+    assert not opened(keys).restored
+    assert refusal(opened(keys), Ground(ground, 1).frame(b"new")) is None
+    assert [refusal(opened(keys), frame) for frame in old] == [Refusal.MAC] * 2 + [Refusal.REPEATED] * 2
+
+
+def test_a_replaced_key_stays_refused_and_a_new_one_is_accepted(keys: Path, ground: Vault) -> None:
+    shutil.copytree(keys, keys.parent / "backup")
+    at = opened(keys)
+    for spi in (1, 2, 3):
+        assert at.write(Association(spi, 2, 0, bytes([spi + 10]) * 32)) == 2
+    restore(keys)
+    at = opened(keys)
+    assert (at.restored, at.read(1)) == (True, None)
+    for spi in (2, 3):
+        found = at.read(spi)
+        assert found is not None
+        assert found.key == bytes([spi + 10]) * 32
+    # Keys that were made on the ground start again with generation 1.
+    shutil.rmtree(keys)
+    vault(keys, {spi: bytes([spi + 20]) * 32 for spi in KEYS})
+    for _ in range(2):
+        at = opened(keys)
+        found = at.read(1)
+        assert found is not None
+        assert (at.restored, found.generation, found.key[0]) == (False, 1, 21)
+
+
+def test_telemetry_continues_above_all_used_counters(keys: Path) -> None:
+    shutil.copytree(keys, keys.parent / "backup")
+    sealer = Sealer(opened(keys), 3, TELEMETRY_MASK, 8)
+    used = [sealer.seal(bytes(6), b"live")[1] for _ in range(20)]
+    restore(keys)
+    restored = Sealer(opened(keys), 3, TELEMETRY_MASK, 8)
+    assert restored.seal(bytes(6), b"live")[1] > max(used)
+
+
+@pytest.mark.parametrize("damage", ["missing", "a", "b", "replaced", "a file"])
+def test_a_damaged_witness_prevents_no_command(keys: Path, ground: Vault, damage: str) -> None:
+    witness = keys.parent / "witness"
+    for _ in range(3):
+        assert refusal(opened(keys), Ground(ground, 1).frame(b"command")) is None
+    if damage == "missing":
+        shutil.rmtree(witness)
+    elif damage == "a file":
+        shutil.rmtree(witness)
+        witness.write_bytes(b"")
+    else:
+        for path in witness.glob("replaced-*" if damage == "replaced" else f"spi-*.{damage}"):
+            path.write_bytes(b"damaged")
+    for _ in range(3):
+        at = opened(keys)
+        assert not at.restored
+        assert refusal(at, Ground(ground, 1).frame(b"command")) is None
+
+
+def test_a_restored_schedule_is_deleted_for_good(tmp_path: Path) -> None:
+    Timetable(tmp_path).add(10, 1, 1, "ping 1")
+    restored = Timetable(tmp_path, restored=True)
+    assert (restored.entries, restored.lost) == ((), True)
+    assert Timetable(tmp_path).entries == ()
+    assert Timetable(tmp_path).add(20, 1, 2, "ping 2").number == 2
