@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from flight.schema.reader import load
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.astro.earth.geomagnetism import GeomagneticError, field
+from knightcube.astro.earth.geomagnetism import field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic, terrestrial_time
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_from_sun, sunlit_share
@@ -68,10 +68,6 @@ class FlightSurroundings:
         latitude, longitude, height = _below(state)
         to_ground = celestial_to_terrestrial(state.julian_date)
         sun_ground = to_ground @ (sun_position / np.linalg.norm(sun_position))
-        try:
-            magnetic = field(state.julian_date, state.position).tolist()
-        except GeomagneticError:
-            magnetic = None
         return {
             "latitude": latitude,
             "longitude": longitude,
@@ -82,7 +78,7 @@ class FlightSurroundings:
             "sun": _direction(sun_position - state.position),
             "nadir": _direction(-state.position),
             "velocity": _direction(state.velocity),
-            "field_t": magnetic,
+            "field_t": field(state.julian_date, state.position).tolist(),
         }
 
     def track(self, utc_ns: int) -> list[list[float]]:

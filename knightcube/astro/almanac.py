@@ -34,7 +34,9 @@ def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
     Raises:
         GeomagneticError: outside the years of the model.
     """
-    return geomagnetism.field(julian_date(time), np.asarray(position, dtype=float))
+    date = julian_date(time)
+    geomagnetism.check_year(float(julian_epoch(date)))
+    return geomagnetism.field(date, np.asarray(position, dtype=float))
 
 
 def magnetic_field_on_ground(
@@ -52,6 +54,7 @@ def magnetic_field_on_ground(
         GeomagneticError: outside the years of the model, or for an invalid position.
     """
     year = float(julian_epoch(julian_date(time)))
+    geomagnetism.check_year(year)
     return geomagnetism.field_on_ground_axes(year, latitude, longitude, height)
 
 

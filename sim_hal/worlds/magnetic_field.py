@@ -1,7 +1,8 @@
 """The Earth's true magnetic field: the International Geomagnetic Reference Field, 14th generation (IGRF-14).
 
 The field is an expansion in spherical harmonics of degree 13 (Alken et al. 2021, Earth Planets Space 73:49,
-eq. 1), whose coefficients (2024, doi 10.5281/zenodo.14012302) are interpolated linearly between epochs. The
+eq. 1), whose coefficients (2024, doi 10.5281/zenodo.14012302) are interpolated linearly between epochs. After
+the last epoch, 2030, the coefficients continue with the variation and acceleration of the last epochs. The
 flight software uses another model (`knightcube.astro.earth.geomagnetism`), so that the simulation includes a
 realistic model error. `ring_current` gives the field of the ring current. Currents in the ionosphere are not
 modelled.
@@ -30,6 +31,8 @@ REFERENCE_RADIUS = 6_371_200.0
 """Reference radius (m) of the spherical-harmonic expansion."""
 UNIT = 1e-11
 """Unit (T) of the integer coefficients in the table `igrf.npz`."""
+EXTRAPOLATION = 15.0
+"""Time (years) after the last epoch for which the field is extrapolated."""
 DEVICE = "geomagnetic field"
 _NEAR_POLE = 0.5 * np.pi - 1e-8
 """Largest latitude (rad) that is used, 7 cm from the pole, because the direction east is undefined at the
@@ -83,14 +86,21 @@ def _table() -> tuple[FloatArray, FloatArray]:
 
 
 def _coefficients(year: FloatArray) -> FloatArray:
-    """Return the coefficients (n, 195), T, interpolated linearly to years (n,)."""
+    """Return the coefficients (n, 195), T, interpolated or extrapolated to years (n,)."""
     epochs, values = _table()
-    if year.size and not (epochs[0] <= np.min(year) and np.max(year) <= epochs[-1]):
+    last = float(epochs[-1]) + EXTRAPOLATION
+    if year.size and not (epochs[0] <= np.min(year) and np.max(year) <= last):
         worst = float(np.min(year) if np.min(year) < epochs[0] else np.max(year))
-        raise OutOfRange(DEVICE, "year", worst, float(epochs[0]), float(epochs[-1]), "")
+        raise OutOfRange(DEVICE, "year", worst, float(epochs[0]), last, "")
     after = np.clip(np.searchsorted(epochs, year, side="right"), 1, len(epochs) - 1)
     share = (year - epochs[after - 1]) / (epochs[after] - epochs[after - 1])
-    return np.asarray(values[after - 1] + share[:, None] * (values[after] - values[after - 1]))
+    found = np.asarray(values[after - 1] + share[:, None] * (values[after] - values[after - 1]))
+    late = np.maximum(year - epochs[-1], 0.0)
+    if np.any(late > 0.0):
+        steps = np.diff(epochs[-3:])
+        variation = np.diff(values[-3:], axis=0) / steps[:, None]
+        found += 0.5 * (late**2)[:, None] * (variation[1] - variation[0]) / float(np.mean(steps))
+    return found
 
 
 def _expansion(

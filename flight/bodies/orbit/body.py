@@ -123,6 +123,11 @@ class OrbitView:
             self._record_description(now_ns)
         if output.cycle.slot % NAVIGATION_EVERY:
             return
+        sigma = self._environment.field_sigma(now_ns) if self._environment.known else None
+        text = (
+            f"the magnetic field is extrapolated and has an additional error of {1e9 * (sigma or 0.0):.0f} nT"
+        )
+        self._facts.update(facts.FIELD_EXTRAPOLATED, None if sigma is None else sigma > 0.0, now_ns, text)
         doubt = found.field_doubt
         self._facts.update(
             facts.FIELD_REFUSED, bool(doubt), now_ns, doubt or "the magnetometer agrees with the estimate"

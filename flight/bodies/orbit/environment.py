@@ -8,7 +8,6 @@ whole revolution belong in a worker, because they take 0.3 ms for each 10 s.
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import Pressures, pressures
 from knightcube.astro.earth.ephemeris import STEP, Ephemeris, predict
-from knightcube.astro.earth.geomagnetism import GeomagneticError
+from knightcube.astro.earth.geomagnetism import extrapolation_sigma
 from knightcube.astro.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
 from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_velocity
@@ -107,7 +106,12 @@ class EstimatedEnvironment:
             near.position_at(times)[0],
             Pressures(shape.air, shape.light),
             float(near.sunlit_at(times)[0]),
+            self.field_sigma(now_ns),
         )
+
+    def field_sigma(self, now_ns: int) -> float:
+        """Return the standard deviation (T per axis) that a field model past its validity adds, usually 0."""
+        return extrapolation_sigma(self.julian_date(now_ns))
 
     def sun(self, now_ns: int) -> FloatArray | None:
         """Return the Sun direction (3,), ICRS, without aberration (21"), or None for an unknown orbit."""
@@ -141,10 +145,7 @@ class EstimatedEnvironment:
         seconds = math.inf if near is None else self._seconds_into(near, now_ns)
         if near is None or not 0.0 <= seconds <= float(near.times[-1]) - _SHORTEST:
             state = self._state(self.julian_date(now_ns) - BEHIND / DAY)
-            near = None
-            if state is not None:
-                with suppress(GeomagneticError):
-                    near = predict(state, BEHIND + AHEAD)
+            near = None if state is None else predict(state, BEHIND + AHEAD)
             self._near = near
             seconds = BEHIND if near is None else self._seconds_into(near, now_ns)
         return near, np.array([seconds])

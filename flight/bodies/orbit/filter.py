@@ -373,6 +373,7 @@ class StepReplay:
         if step is None or step.field is None:
             return None
         spread = self._settings.field_noise**2 + (2.0 * self._settings.free.magnet[0]) ** 2
+        spread += step.around.field_sigma**2
         field = FieldMeasurement(step.field_ns, step.field, step.around.field, spread * _EYE)
         return field, step.gyro
 

@@ -41,7 +41,7 @@ from flight.schema.testbed import Cage, Control, Identification, TestbedConfig
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
-from knightcube.astro.earth.geomagnetism import GeomagneticError, field
+from knightcube.astro.earth.geomagnetism import field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
@@ -619,7 +619,7 @@ class CageField:
             try:
                 state = self._elements.at(date)
                 there = local_frame(state.position, state.velocity) @ field(date, state.position)
-            except (OrbitError, GeomagneticError) as error:
+            except OrbitError as error:
                 raise ConfigError("cage.elements", f"give no field at {date:.4f} (UTC): {error}") from error
             least = min(least, self._scale * math.hypot(there[0], there[2]))
         return least

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.geomagnetism import GeomagneticError, field
+from knightcube.astro.earth.geomagnetism import field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, propagated
 from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial, terrestrial_time
 from knightcube.astro.earth.sun import DAY, earth_from_sun, sunlit_share
@@ -108,7 +108,7 @@ def predict(state: OrbitState, duration: float, step: float = STEP) -> Ephemeris
     """Return the ephemeris for a time interval after an orbit state, including the oblateness term J2.
 
     The neglected drag and higher gravity terms shift a satellite by one kilometre in two revolutions, which
-    changes the field by 15 nT. Raises GeomagneticError outside the years of the field model.
+    changes the field by 15 nT. The field is extrapolated outside the years of its model.
 
     Args:
         state: orbit state at the start.
@@ -196,8 +196,6 @@ class FieldAhead:
     def along(self, state: OrbitState, times: FloatArray) -> FloatArray:
         """Return the geomagnetic field (n, 3) in ICRS axes, T, along the orbit.
 
-        Raises GeomagneticError if the state itself is outside the years of the model.
-
         Args:
             state: current orbit state.
             times: (n,) increasing times after the current state, s.
@@ -205,8 +203,9 @@ class FieldAhead:
         since = self._restart(state)
         last = since + float(times[-1])
         for _ in range(NODES_PER_CALL):
-            if self._span < last and not self._extend():
+            if self._span >= last:
                 break
+            self._extend()
         at = since + times
         inside = at <= self._span
         found = np.empty((len(times), 3))
@@ -247,13 +246,9 @@ class FieldAhead:
             since -= NODE_STEP
         return since
 
-    def _extend(self) -> bool:
-        """Add one node. Return False if the new node is outside the years of the field model."""
+    def _extend(self) -> None:
+        """Add one node."""
         after = propagated(self._states[-1], NODE_STEP)
-        try:
-            there = field(self._begin + (self._span + NODE_STEP) / DAY, after[:3])
-        except GeomagneticError:
-            return False
+        there = field(self._begin + (self._span + NODE_STEP) / DAY, after[:3])
         self._states.append(after)
         self._fields.append(there)
-        return True

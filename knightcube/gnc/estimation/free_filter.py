@@ -110,13 +110,15 @@ class FilterEnvironment:
     """The environment of the satellite at one time, ICRS.
 
     The environment consists of the magnetic field `field` (3,) T, the `position` (3,) m, the `pressures` of
-    air and sunlight, and the visible fraction `sunlit` of the Sun.
+    air and sunlight, and the visible fraction `sunlit` of the Sun. The error of the field has a standard
+    deviation of at least `field_sigma` (T per axis).
     """
 
     field: FloatArray
     position: FloatArray
     pressures: Pressures
     sunlit: float
+    field_sigma: float = 0.0
 
 
 class FreeMotion:
@@ -724,13 +726,17 @@ class FreeFilter:
         self.covariance[FIELD] = self.covariance[:, FIELD] = 0.0
         self.covariance[FIELD, FIELD] = self.field_error**2 * _EYE
 
-    def _propagate_field_error(self, dt: float) -> None:
-        """Let the field model's error decay, and learn its standard deviation while the attitude is fine."""
+    def _propagate_field_error(self, dt: float, least: float) -> None:
+        """Let the field model's error decay, and learn its standard deviation while the attitude is fine.
+
+        The standard deviation is at least `least` (T per axis).
+        """
         covariance, error = self.covariance, self._constants[FIELD]
         if self.worst_sigma <= self._settings.fine:
             square = (float(error @ error) + float(covariance[FIELD, FIELD].trace())) / 3.0
             variance = self.field_error**2 + dt / FIELD_LEARNED * (square - self.field_error**2)
             self.field_error = max(math.sqrt(variance), MINIMUM_FIELD_ERROR)
+        self.field_error = max(self.field_error, least)
         kept = math.exp(-dt / self._settings.field_memory)
         error *= kept
         covariance[FIELD] *= kept
@@ -778,7 +784,7 @@ class FreeFilter:
         noise = self.rate_noise(driven, around, doubt)
         self.covariance = propagated(self.covariance, flow, dt, noise, self.layout.walks)
         self.covariance[TORQUES, TORQUES] += dt * density_walk(self._constants[TORQUES])
-        self._propagate_field_error(dt)
+        self._propagate_field_error(dt, around.field_sigma)
         self._propagate_horizon(dt)
 
     def rate_noise(self, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0) -> FloatArray:

@@ -59,6 +59,23 @@ def test_elements_place_the_satellite_and_its_field(elements: TwoLineElements) -
         assert 2.0e4 < np.linalg.norm(velocity) < 4.0e4
 
 
+@pytest.mark.parametrize("years", [0, 4, 5, 10, 15])
+def test_the_place_the_sun_and_the_shadow_are_known_after_the_field_model_has_ended(
+    elements: TwoLineElements, years: int
+) -> None:
+    known = EstimatedEnvironment(None, SimClock(UTC_NS))
+    first = reading(elements, 0)
+    assert known.fix(replace(first, utc_ns=UTC_NS + round(years * 365.25) * 86_400 * SECOND_NS))
+    around, sun, velocity = known.at(SECOND_NS), known.sun(SECOND_NS), known.velocity(SECOND_NS)
+    assert around is not None
+    assert sun is not None
+    assert velocity is not None
+    assert 2e-5 < np.linalg.norm(around.field) < 6e-5
+    assert around.field_sigma == pytest.approx(2.5e-8 * max(0.0, 2026.21 + years - 2030.0), abs=1e-9)
+    assert np.linalg.norm(sun) == pytest.approx(1.0)
+    assert 0.0 <= around.sunlit <= 1.0
+
+
 def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLineElements) -> None:
     known = EstimatedEnvironment(None, SimClock(UTC_NS + 300 * SECOND_NS))
     assert known.at(0) is None

@@ -111,11 +111,34 @@ def test_the_ring_current_weakens_the_field_at_the_magnetic_equator() -> None:
 
 def test_years_and_places_that_no_model_knows_are_refused() -> None:
     with pytest.raises(believed.GeomagneticError, match=r"year 2031\.00: WMM2025 is valid from 2025 to 2030"):
-        believed.field_on_ground_axes(2031.0, 0.0, 0.0, 0.0)
+        believed.check_year(2031.0)
     with pytest.raises(believed.GeomagneticError, match="invalid position"):
         believed.field_on_ground_axes(2026.0, float("nan"), 0.0, 0.0)
     with pytest.raises(OutOfRange, match="year"):
-        true.field(julian_date(2031.0), np.array([7e6, 0.0, 0.0]))
+        true.field(julian_date(2046.0), np.array([7e6, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize("year", [2030.5, 2031.0, 2033.0, 2036.0, 2040.0])
+def test_the_extrapolated_field_is_within_its_standard_deviation(year: float) -> None:
+    rng = np.random.default_rng(int(year))
+    away = rng.standard_normal((60, 3))
+    positions = 6.878e6 * away / np.linalg.norm(away, axis=-1, keepdims=True)
+    date = julian_date(year)
+    truth = true.field(np.full(60, date), positions)
+    belief = np.array([believed.field(date, position) for position in positions])
+    sigma = believed.extrapolation_sigma(date)
+    assert sigma == pytest.approx(2.5e-8 * (year - 2030.0), rel=1e-6)
+    assert np.sqrt(np.mean((truth - belief) ** 2)) < 1.2 * np.hypot(sigma, 2e-8)
+    assert np.abs(truth - belief).max() < 4.0 * np.hypot(sigma, 2e-8)
+
+
+def test_the_extrapolation_begins_without_a_step_and_ends() -> None:
+    before, after = (believed.field_on_ground_axes(2030.0 + s, 0.5, 0.5, 5e5) for s in (-0.001, 0.001))
+    assert np.linalg.norm(after - before) < 1e-9
+    assert believed.extrapolation_sigma(julian_date(2027.0)) == 0.0
+    assert believed.extrapolation_sigma(julian_date(2023.0)) == pytest.approx(5e-8, rel=1e-3)
+    late, later = (believed.field_on_ground_axes(year, 0.5, 0.5, 5e5) for year in (2050.0, 2070.0))
+    np.testing.assert_array_equal(late, later)
 
 
 def test_the_builder_refuses_a_text_that_is_not_a_table_of_the_field() -> None:
