@@ -274,7 +274,7 @@ def _planned(
     return plan_slew(
         inertia=config.craft.inertia_matrix(),
         dipole_limit=coils.limits,
-        heat=np.diag(coils.heat),
+        heat=coils.heat,
         elements=elements,
         time=at,
         start=_target("--from", options.start),

@@ -297,6 +297,7 @@ class SatelliteControl(BodyControl):
             paths,
             environment,
             lambda: LearnedBody(filter_.inertia, filter_.torque_sizes, filter_.residual_dipole),
+            lambda: estimation.coil_monitor.available,
             self._objects,
             services,
         )
@@ -361,13 +362,12 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     )
     pauses = _pauses(config)
     coils = config.coils.map()
-    limit = coils.limits * pauses.act_ns / pauses.period_ns
     # Without a star camera, the keep-out cones are centred on the pointing axis.
     camera = config.camera
     boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
-    heat = np.diag(coils.heat)
-    slew = SlewRequest(config.slew_duration(), heat, np.zeros(3), np.array(boresight), section.cones.angles())
-    return PlannedCraft(config.craft.inertia_matrix(), axes, weights, limit, slew)
+    angles, duty = section.cones.angles(), pauses.act_ns / pauses.period_ns
+    slew = SlewRequest(config.slew_duration(), coils.heat, np.zeros(3), np.array(boresight), angles)
+    return PlannedCraft(config.craft.inertia_matrix(), axes, weights, coils, duty, slew)
 
 
 def _sensor(config: OrbitConfig) -> Sensor | None:

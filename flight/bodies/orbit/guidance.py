@@ -19,6 +19,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,10 +30,11 @@ from flight.loop.body import COMMANDED, KEPT, PLANNER, Target
 from flight.loop.executive import Cycle, JobResult
 from flight.loop.facts import EventLog, Services
 from hal.interfaces.wires import SECOND_NS
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.disturbance import box_areas
 from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.errors import UsageError
+from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.control.pointing_job import (
     STEADY,
     ObjectDirection,
@@ -442,19 +444,26 @@ class LearnedBody:
     residual: FloatArray
 
 
+ACROSS = 0.03
+"""Dipole moment that slews may use across the plane of the coils, relative to the weakest coil.
+
+A dipole moment in the plane of two coils makes any torque that these coils can make, so little is lost.
+"""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedCraft:
     """The planner's model of the satellite.
 
-    The inertia tensor is `inertia` (3, 3), kg m^2, in body axes. The value `limit` (A m^2) is the largest
-    mean dipole over a control window including its pause, either one value for all body axes or one per axis
-    (3,). The request `slew` holds the constraints and heat coefficients of every slew.
+    The inertia tensor is `inertia` (3, 3), kg m^2, in body axes. The value `duty` is the fraction of a
+    control window in which the `coils` are driven. The request `slew` holds the constraints of every slew.
     """
 
     inertia: FloatArray
     axes: BodyAxes
     weights: PointingWeights
-    limit: float | FloatArray
+    coils: CoilMap
+    duty: float
     slew: SlewRequest
 
 
@@ -467,15 +476,17 @@ class PointingPlanner:
         paths: PointingPaths,
         environment: EstimatedEnvironment,
         learned: Callable[[], LearnedBody],
+        usable: Callable[[], BoolArray],
         objects: ObjectAim,
         services: Services,
     ) -> None:
         """Start without a plan.
 
-        The function `learned` returns the present estimates of body and torques.
+        The function `learned` returns the present estimates of body and torques. The function `usable`
+        returns the flags (n,) of the coils that are not isolated.
         """
         self._craft, self._paths, self._environment = craft, paths, environment
-        self._learned, self._objects = learned, objects
+        self._learned, self._usable, self._objects = learned, usable, objects
         self._areas = box_areas(craft.inertia)
         self._smallest = _SMALLEST * float(np.linalg.eigvalsh(craft.inertia)[0])
         self._jobs, self._events = services.jobs, services.events
@@ -526,7 +537,11 @@ class PointingPlanner:
         wanted = self._wanted or astray.ready or astray.leaving or self._objects.moved
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
-        job = self._new_job(estimate, goal, now_ns)
+        try:
+            job = self._new_job(estimate, goal, now_ns)
+        except UsageError as error:
+            self._fail(f"no plan: {error}", now_ns)
+            return
         if job is None:
             self._fail("no plan: the orbit is not known", now_ns)
             return
@@ -541,17 +556,25 @@ class PointingPlanner:
     def _plan_rest(self, estimate: Estimate, goal: PointingTarget, now_ns: int) -> None:
         """Submit the job that plans the rest of the running slew again, if it is not near its end."""
         running = self._paths.running(now_ns)
-        job = None if running is None else self._new_job(estimate, goal, now_ns)
+        job = None
+        with suppress(UsageError):  # the running plan is kept
+            job = None if running is None else self._new_job(estimate, goal, now_ns)
         if job is not None and self._jobs.submit(PLANNER, job := replace(job, running=running)):
             self._job, self._count = job, job.number
             self._after_ns = now_ns + REST_AGAIN_NS
 
     def _new_job(self, estimate: Estimate, goal: PointingTarget, now_ns: int) -> PointingJob | None:
-        """Return the job of a slew to a goal from an estimate, or None while the orbit is unknown."""
+        """Return the job of a slew to a goal from an estimate, or None while the orbit is unknown.
+
+        Raises UsageError if the coils that are not isolated are parallel.
+        """
         orbit, craft = self._environment.state(now_ns), self._craft
         if orbit is None:
             return None
         learned = self._learned()
+        usable, duty = self._usable(), craft.duty
+        limit, slewing = craft.coils.working(usable).limits, craft.coils.working(usable, ACROSS)
+        wish = replace(craft.slew, residual=learned.residual, heat=slewing.heat, limit=duty * slewing.limits)
         # A tensor that no body can have is not used.
         is_plausible = float(np.linalg.eigvalsh(learned.inertia)[0]) > self._smallest
         return PointingJob(
@@ -565,9 +588,9 @@ class PointingPlanner:
             estimate.quaternion,
             estimate.rate,
             learned.sizes,
-            craft.limit,
+            duty * limit,
             self._areas,
-            replace(craft.slew, residual=learned.residual),
+            wish,
         )
 
     def finish(self, result: JobResult, now_ns: int) -> None:

@@ -87,15 +87,16 @@ class CoilMap:
         """Whether different currents can make the same dipole moment."""
         return len(self.current_limits) > 3
 
-    def working(self, used: BoolArray) -> CoilMap:
+    def working(self, used: BoolArray, assumed: float = 0.5) -> CoilMap:
         """Return the map of the coils that work, with limits and heat of these coils.
 
-        If the coils that work lie in a plane, a coil along its normal is assumed, with half the dipole moment
-        of the weakest coil. Allocation makes a dipole moment along the normal by adding a dipole moment along
-        the magnetic field. Raises UsageError if all coils that work are parallel.
+        If the coils that work lie in a plane, a coil along its normal is assumed. Allocation makes a dipole
+        moment along the normal by adding a dipole moment along the magnetic field. Raises UsageError if all
+        coils that work are parallel.
 
         Args:
             used: flags (n,) of the coils that work.
+            assumed: dipole moment of the assumed coil, as a fraction of that of the weakest coil.
         """
         if used.all():
             return self
@@ -106,8 +107,8 @@ class CoilMap:
         normal = missing_direction(dipoles)
         if normal is not None:
             weakest = int(np.argmin(np.linalg.norm(dipoles, axis=0) * limits))
-            assumed = 0.5 * float(np.linalg.norm(dipoles[:, weakest])) * normal
-            dipoles = np.column_stack([dipoles, assumed])
+            strength = assumed * float(np.linalg.norm(dipoles[:, weakest]))
+            dipoles = np.column_stack([dipoles, strength * normal])
             limits = np.append(limits, limits[weakest])
             resistance = np.append(resistance, resistance[weakest])
         return CoilMap(dipoles, limits, resistance)

@@ -99,10 +99,11 @@ class SlewRequest:
 
     Attributes:
         seconds: requested duration of the slew, s; the slew takes longer if this duration is too short.
-        heat: heating power of each coil per squared dipole moment (3,), W/(A m^2)^2.
+        heat: heating power of the coils per squared dipole moment (3, 3), W/(A m^2)^2, or its diagonal (3,).
         residual: residual dipole moment (3,) of the satellite, A m^2.
         camera: body axis (3,) of the camera.
         angles: half angles of the camera's exclusion cones for `sun`, `earth` and `moon`, rad.
+        limit: mean dipole limit of slews along each body axis (3,), A m^2; None for that of the job.
     """
 
     seconds: float
@@ -110,6 +111,7 @@ class SlewRequest:
     residual: FloatArray
     camera: FloatArray
     angles: dict[str, float] = field(default_factory=dict)
+    limit: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,7 +194,8 @@ def _task(
     avoided: tuple[Cone, ...],
 ) -> SlewTask:
     """Return the task of a slew of `seconds` s into the attitude law of a target."""
-    craft = SlewCraft(begin.inertia, np.full(3, RESERVE * begin.limit), wish.heat, wish.residual)
+    limit = begin.limit if wish.limit is None else wish.limit
+    craft = SlewCraft(begin.inertia, np.full(3, RESERVE * limit), wish.heat, wish.residual)
     law = end_law(target, axes, ahead, float(begin.times[0]))
     return SlewTask(
         craft.facing(begin.sizes), around, begin.quaternion, begin.rate, law, seconds, LONGEST, cones=avoided

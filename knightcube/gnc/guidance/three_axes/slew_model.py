@@ -44,14 +44,28 @@ _EYE3: FloatArray = np.eye(3)
 _AXES = np.arange(3)
 
 
+def heat_matrix(weights: FloatArray) -> FloatArray:
+    """Return the matrix (3, 3) of heating powers that are given as a matrix or as its diagonal (3,)."""
+    return np.diag(weights) if weights.ndim == 1 else weights
+
+
+def mean_squares(dipoles: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the means (k,) of m' W m over the k intervals between dipoles m (k + 1, 3).
+
+    Within an interval, the dipole is linear. W is the matrix `weights` (3, 3).
+    """
+    left, right = dipoles[:-1], dipoles[1:]
+    return np.asarray(((left @ weights) * (left + right) + (right @ weights) * right).sum(axis=1) / 3.0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewCraft:
     """The satellite as modelled by the slew planner, in body axes.
 
     Attributes:
         inertia: (3, 3) kg m^2.
-        limit: dipole limit (3,) of each coil, A m^2.
-        weights: heating power of each coil per squared dipole moment (3,), W/(A m^2)^2.
+        limit: dipole limit (3,) along each body axis, A m^2.
+        weights: heating power per squared dipole moment (3, 3), W/(A m^2)^2, or its diagonal (3,).
         residual: residual dipole moment (3,) of the satellite, A m^2.
         torque, air, light: sizes (3,) of the torques that are constant, due to air, and due to sunlight, N m.
     """
@@ -303,10 +317,8 @@ class SlewPath:
         return float(self.times[-1])
 
     def heat(self, weights: FloatArray) -> float:
-        """Return the heat (J) for heating powers per squared dipole moment (3,), W/(A m^2)^2."""
-        left, right = self.dipole[:-1], self.dipole[1:]
-        squares = (left * left + left * right + right * right) @ weights / 3.0
-        return float(np.diff(self.times) @ squares)
+        """Return the heat (J) for heating powers per squared dipole moment (3, 3) or (3,), W/(A m^2)^2."""
+        return float(np.diff(self.times) @ mean_squares(self.dipole, heat_matrix(weights)))
 
     def since(self, time: float, nodes: int) -> SlewPath:
         """Return the rest of the path from a time (s) before its end on, with times from zero on."""
@@ -574,8 +586,10 @@ def check(task: SlewTask) -> None:
         raise PlanningError("the values of the satellite and of the start must be finite")
     if abs(float(np.linalg.norm(task.quaternion)) - 1.0) > 1e-6:
         raise PlanningError(f"the start quaternion {task.quaternion} must have length 1")
-    if not (np.all(craft.limit > 0.0) and np.all(craft.weights > 0.0)):
-        raise PlanningError("every coil needs a limit and a weight above zero")
+    if not np.all(craft.limit > 0.0):
+        raise PlanningError(f"the dipole limits are {craft.limit.tolist()} A m^2: all must be above zero")
+    if np.linalg.eigvalsh(heat_matrix(craft.weights)).min() <= 0.0:
+        raise PlanningError("the heat of every dipole moment must be above zero")
     if np.linalg.eigvalsh(craft.inertia).min() <= 0.0:
         raise PlanningError("the inertia must be positive definite")
     low, high = HORIZON_RANGE

@@ -461,7 +461,7 @@ def plan_slew(
     Args:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
         dipole_limit: dipole limits (3,) of the coils along the body axes, A m^2.
-        heat: heating power of each coil per squared dipole moment (3,), W/(A m^2)^2.
+        heat: heating power of the coils per squared dipole moment (3, 3), W/(A m^2)^2, or its diagonal (3,).
         elements: two lines of the two-line element set of the orbit.
         time: UTC at the start of the slew or of the window, as a datetime without a time zone.
         start: pointing target that is held until the slew begins; a free roll is taken as zero.

@@ -36,6 +36,7 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
     EnvironmentAt,
     SlewCraft,
     SlewDynamics,
+    mean_squares,
 )
 
 STEP = 31
@@ -189,8 +190,8 @@ class LinearisedEquations:
 class Transcription:
     """The collocation equations of a slew of `scale` s from a start state (7,) on `count` intervals.
 
-    Dipoles are in units of `unit` A m^2, and times in units of `scale` s. The cost weights the squares of the
-    dipoles with `weights` (3,).
+    Dipoles are in units of `unit` A m^2, and times in units of `scale` s. The cost is the integral of m' W m
+    for dipoles m and the matrix W of `weights` (3, 3).
     """
 
     def __init__(
@@ -214,10 +215,8 @@ class Transcription:
         self._step = 1.0 / count
 
     def cost(self, at: Trajectory) -> float:
-        """Return the cost: the exact integral of the weighted squares of the dipole components."""
-        left, right = at.dipoles[:-1], at.dipoles[1:]
-        squares = left * left + left * right + right * right
-        return self._step / 3.0 * float(np.sum(squares @ self.weights))
+        """Return the cost: the exact integral of the weighted squares of the dipoles."""
+        return self._step * float(np.sum(mean_squares(at.dipoles, self.weights)))
 
     def remainders(self, at: Trajectory) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the residuals of collocation (k, 14), start conditions (7,) and end conditions (ends,)."""
@@ -273,7 +272,7 @@ class Transcription:
         heat = np.zeros_like(m)
         heat[:-1] += 2.0 * m[:-1] + m[1:]
         heat[1:] += 2.0 * m[1:] + m[:-1]
-        result[layout.dipoles] += self._step / 3.0 * heat * self.weights
+        result[layout.dipoles] += self._step / 3.0 * heat @ self.weights
         result[layout.equations] = linear.between
         result[layout.start], result[layout.end] = linear.begun, linear.ended
         return result
@@ -296,7 +295,8 @@ class Transcription:
         nodes = bend[::2]
         heat = np.full(self.count + 1, 4.0 * h / 3.0)
         heat[[0, -1]] *= 0.5
-        nodes[:, 7 + _AXIS, 7 + _AXIS] += heat[:, None] * self.weights + dipole_part
+        nodes[:, 7:, 7:] += heat[:, None, None] * self.weights
+        nodes[:, 7 + _AXIS, 7 + _AXIS] += dipole_part
         block = np.zeros((self.count, WIDE, WIDE))
         block[:, :10, :10] = nodes[:-1]
         block[:, 17:24, 17:24] = bend[1::2, :7, :7]
@@ -304,7 +304,7 @@ class Transcription:
         for column in (7, 38):
             block[:, 17:24, column : column + 3] = cross
             block[:, column : column + 3, 17:24] = cross.transpose(0, 2, 1)
-        block[:, 7 + _AXIS, 38 + _AXIS] = block[:, 38 + _AXIS, 7 + _AXIS] = h / 3.0 * self.weights
+        block[:, 7:10, 38:41] = block[:, 38:41, 7:10] = h / 3.0 * self.weights
         block[:, EQUATIONS] += linear.jacobian
         block[:, :, EQUATIONS] += linear.jacobian.transpose(0, 2, 1)
         tail = np.zeros((10 + len(linear.ended),) * 2)

@@ -39,6 +39,7 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
     SlewTask,
     blocking_cone,
     cross,
+    heat_matrix,
     shown,
 )
 from knightcube.gnc.guidance.three_axes.slew_program import (
@@ -100,7 +101,8 @@ class SlewSolver:
         self._task = task
         self.unit = float(np.mean(task.craft.limit))
         self._limit = task.craft.limit / self.unit
-        self._full = task.craft.weights / float(task.craft.weights @ self._limit**2)
+        weights = heat_matrix(task.craft.weights)
+        self._full = weights / float(self._limit @ weights @ self._limit)
         self.extra = np.zeros((len(task.cones), 2 * task.nodes))
         self.share = 1.0
         self.steps = self.work = 0
@@ -108,8 +110,8 @@ class SlewSolver:
     def energy(self, found: SolvedPath) -> float:
         """Return the heat of a path, J."""
         equations = found.equations
-        power = float(self._task.craft.weights @ self._task.craft.limit**2)
-        return equations.cost(found.at) * equations.scale * power / float(equations.weights @ self._limit**2)
+        power = float(heat_matrix(self._task.craft.weights)[0, 0] * self.unit**2)
+        return equations.cost(found.at) * equations.scale * power / float(equations.weights[0, 0])
 
     def peak(self, found: SolvedPath) -> float:
         """Return the largest ratio of a dipole component along a path to the dipole limit."""
@@ -143,7 +145,8 @@ class SlewSolver:
         at, before = transferred(start, equations), start.equations.weights
         equations.weights = self._full / max(equations.cost(at), 1e-9)
         same = count == start.equations.count
-        multipliers = start.point.multipliers * float(equations.weights[0] / before[0]) if same else None
+        ratio = float(equations.weights[0, 0] / before[0, 0])
+        multipliers = ratio * start.point.multipliers if same else None
         limit = self.share * self._limit
         near = same and time == start.horizon and self.peak(start) < self.share
         if not near and (last == LAST_BARRIER or self.peak(start) > self.share):

@@ -19,6 +19,8 @@ from flight.bodies.orbit.guidance import (
 )
 from flight.loop.body import Target
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import BoolArray
+from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.control.pointing_job import PointingJob, SlewRequest
 from knightcube.gnc.control.pointing_law import LEAVING
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences, BodyAxes
@@ -43,16 +45,30 @@ def paths() -> PointingPaths:
     return PointingPaths(LIMIT, 0.1)
 
 
-def planned(paths: PointingPaths, goal: PointingTarget, now_ns: int) -> PointingJob:
+ALL = np.ones(3, dtype=bool)
+COILS = CoilMap(0.8 * np.eye(3), np.full(3, 0.5), np.array([10.0, 20.0, 30.0]))
+"""Coils of 2 LIMIT, which are driven half of the time."""
+
+
+def planned(paths: PointingPaths, goal: PointingTarget, now_ns: int, usable: BoolArray = ALL) -> PointingJob:
     """Return the job that a planner submits for a goal when asked for a plan."""
-    (job,) = submitted(paths, goal, now_ns, requested=True)
+    (job,) = submitted(paths, goal, now_ns, requested=True, usable=usable)
     return job
 
 
 def submitted(
-    paths: PointingPaths, goal: PointingTarget, now_ns: int, *, requested: bool
+    paths: PointingPaths,
+    goal: PointingTarget,
+    now_ns: int,
+    *,
+    requested: bool,
+    usable: BoolArray = ALL,
+    told: list[str] | None = None,
 ) -> list[PointingJob]:
-    """Return the jobs that a planner submits for a goal."""
+    """Return the jobs that a planner submits for a goal while these coils (n,) are not isolated.
+
+    The texts of its events are appended to `told`.
+    """
     jobs: list[PointingJob] = []
 
     def submit(_: str, job: PointingJob) -> bool:
@@ -61,14 +77,15 @@ def submitted(
 
     services = SimpleNamespace(
         jobs=SimpleNamespace(submit=submit),
-        events=SimpleNamespace(report=lambda *_: None),
+        events=SimpleNamespace(report=lambda _, __, text: told.append(text) if told is not None else None),
     )
-    craft = PlannedCraft(INERTIA, BodyAxes(Z, X), WEIGHTS, LIMIT, WISH)
+    craft = PlannedCraft(INERTIA, BodyAxes(Z, X), WEIGHTS, COILS, 0.5, WISH)
     planner = PointingPlanner(
         craft,
         paths,
         cast(Any, SimpleNamespace(state=lambda _: ORBIT)),
         lambda: LearnedBody(INERTIA, np.zeros(9), RESIDUAL),
+        lambda: usable,
         ObjectAim(None, LIMIT, cast(Any, services.events)),
         cast(Any, services),
     )
@@ -77,6 +94,31 @@ def submitted(
     estimate = SimpleNamespace(quaternion=np.array([0.0, 0.0, 0.0, 1.0]), rate=np.zeros(3))
     planner.serve(cast(Any, estimate), Target(0, PointingTargetLaw(goal, paths)), now_ns)
     return jobs
+
+
+def test_slews_are_planned_with_the_coils_that_are_not_isolated(paths: PointingPaths) -> None:
+    whole = planned(paths, SUN, 0)
+    assert whole.slew is not None
+    assert whole.slew.limit is not None
+    np.testing.assert_allclose(whole.limit, [0.2] * 3)
+    np.testing.assert_allclose(whole.slew.limit, [0.2] * 3)
+    np.testing.assert_allclose(whole.slew.heat, np.diag([10.0, 20.0, 30.0]) / 0.8**2)
+    crippled = planned(paths, SUN, 0, np.array([True, False, True]))
+    assert crippled.slew is not None
+    assert crippled.slew.limit is not None
+    np.testing.assert_allclose(crippled.limit, [0.2, 0.1, 0.2])
+    np.testing.assert_allclose(crippled.slew.limit, [0.2, 0.006, 0.2], rtol=1e-6)
+    heat = np.diag(crippled.slew.heat)
+    np.testing.assert_allclose(heat[[0, 2]], np.array([10.0, 30.0]) / 0.8**2)
+    assert heat[1] > 500.0 * heat[0]
+
+
+def test_a_slew_is_refused_with_its_reason_if_one_coil_works(paths: PointingPaths) -> None:
+    told: list[str] = []
+    usable = np.array([False, False, True])
+    assert submitted(paths, SUN, 0, requested=True, usable=usable, told=told) == []
+    assert len(told) == 1
+    assert told[0].startswith("no plan: all coils lie along [0.00, 0.00, 1.00]")
 
 
 def test_a_path_that_leaves_its_target_for_a_time_does_not_start_a_slew(

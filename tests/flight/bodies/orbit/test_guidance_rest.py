@@ -23,6 +23,7 @@ from flight.loop.body import Target
 from flight.loop.executive import JobResult
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.earth.disturbance import box_areas
+from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.control.pointing_job import PointingJob
 from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
@@ -34,6 +35,7 @@ from tests.knightcube.gnc.control.pointing_requests import WISH, planned
 RESIDUAL = np.array([1e-3, 0.0, 0.0])
 SUN = PointingTarget(Goal.SUN)
 LEARNED = INERTIA + 1e-4 * np.ones((3, 3))
+COILS = CoilMap.equal(2.0 * LIMIT, 1.0, 20.0)
 ESTIMATE = SimpleNamespace(quaternion=np.array([0.0, 0.0, 0.0, 1.0]), rate=np.zeros(3))
 
 
@@ -49,6 +51,7 @@ class Flight:
     def __init__(self, inertia: Any = LEARNED) -> None:
         self.jobs: list[PointingJob] = []
         self.events: list[str] = []
+        self.usable = np.ones(3, dtype=bool)
 
         def submit(_: str, job: PointingJob) -> bool:
             self.jobs.append(job)
@@ -60,10 +63,11 @@ class Flight:
         )
         self.paths = PointingPaths(LIMIT, 0.1)
         self.planner = PointingPlanner(
-            PlannedCraft(INERTIA, BodyAxes(Z, X), WEIGHTS, LIMIT, WISH),
+            PlannedCraft(INERTIA, BodyAxes(Z, X), WEIGHTS, COILS, 0.5, WISH),
             self.paths,
             cast(Any, SimpleNamespace(state=lambda _: ORBIT)),
             lambda: LearnedBody(inertia, np.zeros(9), RESIDUAL),
+            lambda: self.usable,
             ObjectAim(None, LIMIT, cast(Any, services.events)),
             cast(Any, services),
         )

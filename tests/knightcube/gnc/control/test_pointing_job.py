@@ -13,6 +13,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.control import pointing_job
+from knightcube.gnc.control.allocation import allocate
+from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.control.pointing_job import (
     FINE,
     LEAD,
@@ -23,9 +25,11 @@ from knightcube.gnc.control.pointing_job import (
 )
 from knightcube.gnc.control.pointing_law import PointingLaw
 from knightcube.gnc.control.pointing_table import PointingTable
+from knightcube.gnc.guidance.three_axes.attitude_law import references
 from knightcube.gnc.guidance.three_axes.slew_model import cones
 from tests.knightcube.gnc.control.pointing_cases import (
     INERTIA,
+    LAW,
     LIMIT,
     ORBIT,
     RESIDUAL,
@@ -109,6 +113,32 @@ def test_a_body_that_would_turn_too_fast_slews_for_longer() -> None:
     assert slow is not None
     assert slow.horizon > free.horizon
     assert float(np.linalg.norm(slow.rate, axis=1).max()) < limit
+
+
+@pytest.mark.parametrize("isolated", range(3))
+def test_a_slew_with_an_isolated_coil_is_made_by_the_other_two_within_their_limits(isolated: int) -> None:
+    coils = CoilMap(np.eye(3), np.full(3, LIMIT), np.full(3, 5.0))
+    usable = np.arange(3) != isolated
+    left = coils.working(usable, 0.03)
+    wish = replace(WISH, heat=left.heat, limit=left.limits)
+    path = slew(BEGIN, wish, NADIR, AXES, ORBIT, np.inf)
+    assert path is not None
+    law = references(LAW, ORBIT, np.array([TIMES[0] + path.horizon]))
+    assert angle_between(path.quaternion[-1], law.quaternion[0]) < 1e-3
+    inertial = ORBIT.field_at(TIMES[0] + path.times)
+    field = np.einsum("nij,nj->ni", attitude_matrix(path.quaternion), inertial)
+    torques = np.cross(path.dipole, field)
+    made = [
+        allocate(torque, direction, coils.dipoles, np.full(3, LIMIT), usable.astype(float))
+        for torque, direction in zip(torques, field, strict=True)
+    ]
+    currents = np.array([found.currents for found in made])
+    assert np.abs(currents).max() < LIMIT
+    missed = np.linalg.norm(torques - [found.torque for found in made], axis=1)
+    assert missed.sum() < 0.05 * np.linalg.norm(torques, axis=1).sum()
+    # The planner knows at least what the other coils heat.
+    heat = 5.0 * float((currents**2).sum(axis=1).mean()) * path.horizon
+    assert heat < 1.2 * path.heat(left.heat)
 
 
 def test_a_body_within_a_cone_slews_out_of_it() -> None:

@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.three_axes.slew_model import AttitudeEnd, BoresightEnd, Cone
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus, plan_task
+from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.slew_model import AttitudeEnd, BoresightEnd, Cone, SlewCraft
+from knightcube.gnc.guidance.three_axes.slew_plan import SlewOrder, SlewStatus, plan_order, plan_task
+from tests.support.circular_orbits import circular
 from tests.support.random_slews import clearance, slews
 from tests.support.recorded_slews import (
     flown,
@@ -138,3 +142,29 @@ def test_tasks_that_no_path_can_fulfil_are_refused_with_the_reason() -> None:
     ):
         with pytest.raises(PlanningError, match=reason):
             plan_task(wrong)
+
+
+def test_a_slew_with_coupled_heat_costs_what_it_does_in_the_axes_of_the_coils() -> None:
+    """In body axes that are rotated from the coils, the heat is a full matrix, with the same optimum."""
+    orbit, heat, inertia = circular(3_000.0), np.array([3.0, 30.0, 12.0]), np.array([0.0066, 0.0333, 0.0300])
+    turn = attitude_matrix(from_rotation_vector(np.array([0.5, -0.7, 0.3])))
+    order = SlewOrder(
+        SlewCraft(np.diag(inertia), np.full(3, 1.0), heat),
+        BodyAxes(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])),
+        np.array([0.0, 0.0, 1.0]),
+        PointingTarget(Goal.NADIR, roll=0.0),
+        PointingTarget(Goal.SUN, roll=0.0),
+        600.0,
+        600.0,
+        nodes=24,
+    )
+    along = plan_order(order, orbit, 20.0).plan
+    turned = SlewCraft(turn @ np.diag(inertia) @ turn.T, np.full(3, 1.0), turn @ np.diag(heat) @ turn.T)
+    axes = BodyAxes(turn[:, 2], turn[:, 0])
+    tilted = plan_order(replace(order, craft=turned, axes=axes, camera=turn[:, 2]), orbit, 20.0).plan
+    assert tilted.energy == pytest.approx(along.energy, rel=1e-4)
+    assert tilted.path.heat(turned.weights) == pytest.approx(tilted.energy, rel=1e-3)
+    # The heat of each body axis alone gives another path, which heats more.
+    alone = replace(turned, weights=np.diag(turned.weights))
+    careless = plan_order(replace(order, craft=alone, axes=axes, camera=turn[:, 2]), orbit, 20.0).plan
+    assert careless.path.heat(turned.weights) > 1.02 * along.energy
