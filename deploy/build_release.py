@@ -94,12 +94,17 @@ class Build:
         if _text(old / LOCK) != _text(self._source / _BOARD_LOCK) or not _text(old / LOCK):
             sys.stderr.write(f"install: failed: {old.name} has other packages: add the folder wheels\n")
             raise SystemExit(1)
-        ours = shutil.ignore_patterns(
-            "__pycache__", "flight", "hal", "sim_hal", "knightcube", "knightcube*.dist-info"
-        )
+        ours = shutil.ignore_patterns("flight", "hal", "sim_hal", "knightcube", "knightcube*.dist-info")
+        caches = shutil.ignore_patterns("__pycache__")
         for packages in old.glob("venv/lib/python3*/site-packages"):
             place = release / packages.relative_to(old)
-            shutil.copytree(packages, place, symlinks=True, ignore=ours, dirs_exist_ok=True)
+            for path in packages.iterdir():
+                if path.name in ours(str(packages), [path.name]):
+                    continue
+                if path.is_dir():
+                    shutil.copytree(path, place / path.name, ignore=caches, dirs_exist_ok=True)
+                else:
+                    shutil.copyfile(path, place / path.name)
 
     def _test(self, python: Path) -> None:
         """Test a release: import its modules, print its version, run its link, and fly ten seconds."""

@@ -346,6 +346,7 @@ uninstall_all() {
     fi
     run rm -rf "$units/knightcube.service" "$units/knightcube-safe.service" \
         "$units/knightcube-renewal.service" "$units/knightcube-renewal.timer" "$root$logs-renewal" \
+        "$units/knightcube-renewal.service.d" \
         "$units/knightcube.service.d" "$units/knightcube-safe.service.d" "$rules" "$modules" "$watchdog" \
         "$prefix" "$cache"
     if [ -n "$purge" ]; then

@@ -29,6 +29,7 @@ import subprocess
 import sys
 import tarfile
 import time
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -54,7 +55,7 @@ RESTARTS = {
     "board": (["--no-block", "reboot"],),
 }
 """Arguments of systemctl for each part that can be restarted by command."""
-CONFIGURATION = "flight.yaml"
+CONFIGURATION, RESTART = "flight.yaml", "restart"
 GROUND = "ground"
 """Name of the kept configuration that install.sh accepted."""
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,63}")
@@ -114,6 +115,7 @@ class State:
         previous: name of the configuration that flew before the present one.
         bad: releases that failed a trial.
         trial: open trial.
+        returning: kind, name and replaced version of a return that has begun, and its report.
         reports: number, request, result, name and text of the newest reports.
         note: text that the flight reports as an event at its start.
         note_s: time (s) that the flight has been up since the note was made.
@@ -131,6 +133,7 @@ class State:
     previous: str = ""
     bad: list[str] = dataclasses.field(default_factory=list)
     trial: Trial | None = None
+    returning: list[str] = dataclasses.field(default_factory=list)
     reports: list[list[Any]] = dataclasses.field(default_factory=list)
     note: str = ""
     note_s: float = 0.0
@@ -143,15 +146,15 @@ class State:
 
 
 def encoded(values: object) -> bytes:
-    """Return values as a line of JSON and the SHA-256 of this line."""
+    """Return values as a line of JSON and the CRC-32 of this line."""
     line = json.dumps(values, sort_keys=True).encode() + b"\n"
-    return line + hashlib.sha256(line).hexdigest().encode() + b"\n"
+    return line + b"%08x\n" % zlib.crc32(line)
 
 
 def decoded(data: bytes) -> Any:
     """Return the values of a record. Raises ValueError for a damaged record."""
-    line, end, digest = data.partition(b"\n")
-    if hashlib.sha256(line + end).hexdigest().encode() + b"\n" != digest:
+    line, end, crc = data.partition(b"\n")
+    if crc != b"%08x\n" % zlib.crc32(line + end):
         raise ValueError("its checksum is wrong")
     return json.loads(line)
 
@@ -331,11 +334,19 @@ class Board:
         except (OSError, subprocess.TimeoutExpired) as error:
             return subprocess.CompletedProcess(command, 127, "", f"{type(error).__name__}: {error}")
 
-    def restart(self) -> None:
-        """Restart flight and link with their present units."""
-        self.run(["systemctl", "daemon-reload"], 60.0)
-        self.run(["systemctl", "reset-failed", FLIGHT, LINK], 60.0)
-        self.run(["systemctl", "--no-block", "restart", FLIGHT, LINK], 60.0)
+    def restart(self, *parts: str) -> None:
+        """Let the unit of this program restart parts after this run, flight and link by default."""
+        replace_file(self.own / RESTART, " ".join(parts or ("flight", "link")).encode())
+
+    def restart_parts(self) -> None:
+        """Restart the parts that a run has asked for. Raises OSError."""
+        path = self.own / RESTART
+        parts = path.read_text(encoding="ascii").split() if path.exists() else []
+        path.unlink(missing_ok=True)
+        if parts:
+            self.run(["systemctl", "daemon-reload"], 60.0)
+        for words in (words for part in parts for words in RESTARTS.get(part, ())):
+            self.run(["systemctl", *words], 60.0)
 
     def active(self, unit: str) -> bool:
         """Return whether a unit is active."""
@@ -426,6 +437,8 @@ class Renewal:
         """Continue an interrupted step, execute one request and judge the trial. Raises OSError."""
         if self._state.trial is not None:
             self._continue()
+        if self._state.returning:
+            self._return()
         begun = self._state.trial
         for name, request in self._requests():
             self._obey(name, request)
@@ -483,10 +496,7 @@ class Renewal:
             raise Refused("the request is damaged")
         self._report(name, "completed", "restart", f"{part} is restarted")
         self._save()
-        for words in RESTARTS[part]:
-            done = self._board.run(["systemctl", *words], 60.0)
-        if done.returncode != 0:
-            raise Refused(f"{part}: {done.stderr.strip()[:80]}")
+        self._board.restart(part)
 
     def _activate(self, name: str, kind: str, request: dict[str, Any]) -> None:
         """Check a bundle and begin its trial. Raises Refused and OSError."""
@@ -563,6 +573,9 @@ class Renewal:
         state, trial = self._state, self._state.trial
         if trial is None or trial.stage != "fly" or trial.kind != kind:
             raise Refused(f"no {kind} is on trial")
+        board = self._board
+        if board.active(SAFE) or not (board.active(FLIGHT) and board.active(LINK)):
+            raise Refused("flight or link is not up: confirm it when both are")
         state.versions[kind] = trial.version
         if trial.what == "configuration":
             state.previous = trial.old
@@ -578,10 +591,8 @@ class Renewal:
         trial = self._state.trial
         if trial is None:
             what = "release" if kind == "release" else "configuration"
-            if not self._go_back(what):
+            if not self._go_back(what, name, "withdraw", f"the previous {what} flies, as the ground asked"):
                 raise Refused(f"there is no previous {what}")
-            self._report(name, "completed", "withdraw", f"the previous {what} flies")
-            self._note(f"the ground returned to the previous {what}")
             return
         if trial.kind != kind:
             raise Refused(f"{trial.kind} {trial.version} is on trial, not a {kind}")
@@ -620,9 +631,9 @@ class Renewal:
                 raise Refused("this release flies already")
             board.point("previous", trial.old)
             board.point("current", trial.new)
+        board.restart()  # before the state is stored: a kill in between only repeats this step
         trial.stage = "fly"
         self._save()
-        board.restart()
 
     def _built(self) -> str:
         """Build the release of the bundle, and return its name. Raises Refused and OSError."""
@@ -692,24 +703,42 @@ class Renewal:
         elif trial.left_s <= 0.0:
             self._begin_revert("the ground did not confirm it")
 
-    def _go_back(self, what: str) -> bool:
+    def _go_back(self, what: str, request: str, word: str, text: str) -> bool:
         """Return to the previous release or configuration, or return False if there is none."""
         state, board = self._state, self._board
         if what == "release":
-            current, previous = board.release("current"), board.release("previous")
-            if not previous or previous == current or previous in state.bad:
+            current, name = board.release("current"), board.release("previous")
+            if not name or name == current or name in state.bad:
                 return False
-            board.point("current", previous)
-            board.point("previous", current)
         else:
             name = GROUND if what == GROUND else state.previous
             current = board.keep("")
             if not name or self._same(name):
                 return False
-            board.install(name)
-            state.previous = current
-        board.restart()
+        state.returning = [what, name, current, request, word, text]
+        self._save()
+        self._return()
         return True
+
+    def _return(self) -> None:
+        """Execute the stored return to an earlier version, which an earlier run may have begun."""
+        state, board = self._state, self._board
+        what, name, current, request, word, text = state.returning
+        try:
+            if what == "release":
+                board.point("current", name)
+                if current:
+                    board.point("previous", current)
+            else:
+                board.install(name)
+                state.previous = current
+        except Refused as error:
+            self._report(request, "failed", word, str(error))
+        else:
+            board.restart()
+            self._report(request, "completed", word, text)
+            self._note(text)
+        state.returning = []
 
     def _same(self, name: str) -> bool:
         """Return whether a kept configuration is the installed one, or is missing."""
@@ -736,21 +765,15 @@ class Renewal:
             state.steps += 1
             if state.trial is not None:
                 self._begin_revert("no authentic frame arrived")
-            try:
-                done = self._go_back(step)
-            except (Refused, OSError) as error:
-                self._report("", "failed", "command-loss", f"{step}: {error}")
-                continue
-            if done:
-                what = "configuration accepted on the ground" if step == GROUND else f"previous {step}"
-                text = f"no authentic frame for {state.silent_s:.0f} s: the {what} flies"
-                self._report("", "completed", "command-loss", text)
-                self._note(text)
+            what = "configuration accepted on the ground" if step == GROUND else f"previous {step}"
+            text = f"no authentic frame for {state.silent_s:.0f} s: the {what} flies"
+            if self._go_back(step, "", "command-loss", text):
                 return
             # Without something to return to, the next step follows at once.
             state.silent_s = max(state.silent_s, state.limit_s * (state.steps + 1))
 
     def _note(self, text: str) -> None:
+        """Let the flight report an event at its start."""
         self._state.note, self._state.note_s = text, 0.0
 
     def _age_note(self) -> None:
@@ -817,6 +840,7 @@ def main(words: Sequence[str]) -> int:
     parser.add_argument(
         "--accepted", action="store_true", help="keep the configuration that install.sh accepted"
     )
+    parser.add_argument("--restart", action="store_true", help="restart what a run has asked for")
     options = parser.parse_args(words)
     board = Board(options.root)
     board.own.mkdir(parents=True, exist_ok=True)
@@ -827,7 +851,9 @@ def main(words: Sequence[str]) -> int:
             return 0  # the run before this one builds a release
         now = time.clock_gettime(time.CLOCK_BOOTTIME) if options.now is None else options.now
         try:
-            if options.accepted:
+            if options.restart:
+                board.restart_parts()
+            elif options.accepted:
                 board.keep(GROUND)
             else:
                 Renewal(board, now, boot_id()).step()

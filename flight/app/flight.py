@@ -37,6 +37,7 @@ from flight.app.service import (
     SeparationInhibit,
     StartRetry,
     accepted_config,
+    renewal_note,
     requested_config,
     retried_start,
     start_guardian,
@@ -209,6 +210,8 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
         release = FlownRelease(os.environ)
         if release.note:
             loop.note(events.RELEASE_LEFT, release.note)
+        if note := renewal_note(os.environ):
+            loop.note(events.RETURNED, note)
         if rig.realtime:
             release.serve(rig.clock, stack)
         label = RunLabel(opened.merged, rig.seed, config.simulation is not None, rig.realtime)

@@ -263,11 +263,19 @@ class EndingSignals:
         self._loop.stop(f"stopped by {signal.Signals(number).name}")
 
 
-NAME, NOTE = "KNIGHTCUBE_RELEASE", "KNIGHTCUBE_RELEASE_NOTE"
+NAME, NOTE, RENEWAL = "KNIGHTCUBE_RELEASE", "KNIGHTCUBE_RELEASE_NOTE", "KNIGHTCUBE_RENEWAL"
 TRIALS = "releases.json"
 PROVEN_NS = 60 * SECOND_NS
 """Flight time (ns) after which a release is proven, so that later crashes no longer count against it."""
 _KEPT = 4
+
+
+def renewal_note(environment: Mapping[str, str]) -> str:
+    """Return why the board returned to an earlier version, or an empty text (deploy/renewal.py)."""
+    with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
+        status = read_regular(Path(environment[RENEWAL]), LARGEST_FILE) or b""
+        return str(json.loads(line_of(status) or b"")["note"])
+    return ""
 
 
 class FlownRelease:

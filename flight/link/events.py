@@ -174,6 +174,9 @@ RELEASE_LEFT = _fault(
     "release-left",
     "the current release or the launcher is damaged or did not start; the text names the release in use",
 )
+RETURNED = _warning(
+    150, "returned", "the board returned to an earlier release or configuration; the text gives the reason"
+)
 COMMANDED = _info(80, "commanded", "a command was executed")
 COMMAND_REFUSED = _warning(81, "command-refused", "a command was refused; the text gives the reason")
 COMMAND_SOCKET = _warning(

@@ -26,8 +26,7 @@ from flight.loop.state import LinuxFiles, replace_file
 from flight.schema.document import read_text
 from flight.schema.reader import parse
 from ground.link.commanding import add_link_options, explained, sha256_of, terminal_of
-from ground.link.commanding import command as send
-from knightcube.errors import UsageError
+from knightcube.errors import FlightError, UsageError
 
 ENDLESS = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)
 """Expiry of metadata without an end, which no wrong clock can reach."""
@@ -109,7 +108,7 @@ def run(options: argparse.Namespace) -> int:
             version = replace_signing_key(options.folder, options.root)
             sys.stdout.write(f"root metadata {version}; the next bundle carries them\n")
         case "sign":
-            bundle = sign(options)
+            bundle = sign(options, artefact(options.kind, options.path))
             sys.stdout.write(f"{bundle}: {bundle.stat().st_size} bytes\n")
         case _:
             return _command(options)
@@ -158,10 +157,10 @@ def replace_signing_key(folder: Path, also_root: bool) -> int:
     return root.version
 
 
-def sign(options: argparse.Namespace) -> Path:
-    """Sign an artefact, and return the path of its bundle. Raises UsageError."""
+def sign(options: argparse.Namespace, data: bytes) -> Path:
+    """Sign the bytes of an artefact, and return the path of their bundle. Raises UsageError."""
     folder, kind = options.folder, options.kind
-    signer, data = _read_key(folder / "signing.pem"), _artefact(kind, options.path)
+    signer = _read_key(folder / "signing.pem")
     if signer.public_key.keyid not in _newest_root(folder).roles["targets"].keyids:
         raise UsageError(f"{folder}/signing.pem is not the signing key that the root metadata name")
     expires = ENDLESS if options.expires is None else _date(options.expires)
@@ -201,17 +200,22 @@ def _command(options: argparse.Namespace) -> int:
     else:
         directive = Confirm(kind) if options.what == "confirm" else Withdraw(kind)
 
-    def show(report: Report) -> None:
-        sys.stdout.write(f"{report.stage.name.lower()}: {explained(report)}\n")
-        sys.stdout.flush()
-
+    reports: list[Report] = []
     with closing(terminal_of(options)) as terminal:
-        packet = directives.pack(directive, utc_ns())
-        reports = send(terminal, packet, options.spi, options.timeout, show)
+        counter = terminal.send(directives.pack(directive, utc_ns()), options.spi)
+        for report in terminal.follow(counter, options.spi, options.timeout):
+            reports.append(report)
+            sys.stdout.write(f"{report.stage.name.lower()}: {explained(report)}\n")
+            sys.stdout.flush()
+            # A trial has begun with the second report of a start: the first one is of the link.
+            if options.what == "activate" and [one.stage for one in reports].count(Stage.STARTED) == 2:
+                break
+    if not reports:
+        raise FlightError(f"no answer over the link within {options.timeout:g} s")
     return int(reports[-1].stage in {Stage.REFUSED, Stage.FAILED})
 
 
-def _artefact(kind: str, path: Path) -> bytes:
+def artefact(kind: str, path: Path) -> bytes:
     """Return the bytes to sign. Raises UsageError for an artefact that the board would refuse."""
     if kind == "release":
         return _packed(path)

@@ -194,7 +194,9 @@ ExecStart=/opt/knightcube/bin/fly /etc/knightcube/flight.yaml --archive /var/lib
 """,
         encoding="utf-8",
     )
-    (units / "knightcube-safe.service.d/test.conf").write_text(f"{_opened()}\n", encoding="utf-8")
+    (units / "knightcube-renewal.service.d").mkdir()
+    for unit in ("knightcube-safe", "knightcube-renewal"):
+        (units / f"{unit}.service.d/test.conf").write_text(f"{_opened()}\n", encoding="utf-8")
     (units / "scenario.service").write_text(
         f"""[Unit]
 DefaultDependencies=no

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flight.link.process.renewal import decoded, encoded
-from ground.commands.renewal import make_signing_keys, sign
+from ground.commands.renewal import artefact, make_signing_keys, sign
 from tests.deploy.boards import FakeBoard
 from tests.deploy.scripts import ROOT, changed_testbed
 
@@ -38,10 +38,12 @@ class RenewedBoard:
         self.count = 0
 
     @classmethod
-    def make(cls, place: Path) -> RenewedBoard:
-        """Install a board, and make the signing keys."""
+    def make(cls, place: Path, text: str = "") -> RenewedBoard:
+        """Install a board with a configuration, by default the testbed's, and make the signing keys."""
         place.mkdir(exist_ok=True)
         changed_testbed(place, commands="{socket: /run/knightcube/commands}", link=LINK)
+        if text:
+            (place / "flight.yaml").write_text(text, encoding="utf-8")
         root_metadata = make_signing_keys(place / "signing")
         board = cls(place)
         board.config.parent.mkdir(parents=True)
@@ -82,20 +84,22 @@ class RenewedBoard:
     def step(self, seconds: float = 10.0) -> str:
         """Let time pass and run one step; return its complaints."""
         self.now += seconds
+        return self.run()
+
+    def run(self, *options: str) -> str:
+        """Run the root part with options; return its complaints."""
         done = subprocess.run(
-            self.words(), env=self.environment(), capture_output=True, text=True, check=False
+            [*self.words(), *options], env=self.environment(), capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, done.stderr
         return done.stderr
 
-    def bundle(self, kind: str, path: Path, version: int, **changes: Any) -> Path:
-        """Sign an artefact."""
-        options = {"back": False, "expires": None, "least": 1, "out": self.place}
-        return sign(
-            Namespace(
-                folder=self.place / "signing", kind=kind, path=path, version=version, **options | changes
-            )
-        )
+    def bundle(self, kind: str, path: Path, version: int, *, unchecked: bool = False, **changes: Any) -> Path:
+        """Sign an artefact, without the checks of the ground if `unchecked`."""
+        options = {"back": False, "expires": None, "least": 1, "out": self.place} | changes
+        data = path.read_bytes() if unchecked and path.is_file() else artefact(kind, path)
+        signing = self.place / "signing"
+        return sign(Namespace(folder=signing, kind=kind, version=version, **options), data)
 
     def put(self, bundle: Path, kind: str = "configuration") -> str:
         """Put a bundle where the link puts a selected one; return its SHA-256."""
@@ -136,9 +140,12 @@ class RenewedBoard:
         assert accepted == hashlib.sha256(data).hexdigest()
         return next(line[6:] for line in data.decode().splitlines() if line.startswith("name: "))
 
-    def calls(self) -> str:
-        """Return the calls of systemctl."""
-        return (self.place / "calls").read_text(encoding="utf-8")
+    def restarted(self) -> bool:
+        """Return whether flight and link are to be restarted, which then happens."""
+        path = self.own / "restart"
+        found = path.exists()
+        path.unlink(missing_ok=True)
+        return found
 
     def release(self) -> str:
         """Return the label of the release that would fly now."""

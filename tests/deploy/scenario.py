@@ -107,6 +107,7 @@ def play(facts: Path) -> dict[str, Any]:
     seen["killed"] = service.hurt(lambda pid: os.kill(pid, signal.SIGKILL))
     seen["stopped"] = service.hurt(lambda pid: os.kill(pid, signal.SIGSTOP))
     seen["restarts"] = int(service.show("NRestarts"))
+    seen["renewal"] = _renewal(service)
     wait(service.driven, 20.0)
     systemctl("stop", SERVICE)
     seen["end"] = {"driven": service.driven(), "result": service.show("Result"), "reported": _last_words()}
@@ -121,6 +122,24 @@ def _flight(*words: str) -> str:
         [sys.executable, "-m", "flight", *words], capture_output=True, text=True, check=False
     )
     return done.stdout + done.stderr
+
+
+def _renewal(service: Service) -> dict[str, Any]:
+    """Return whether the privileged part of the renewal runs in its sandbox, and restarts the flight."""
+    own, unit, old = Path("/var/lib/knightcube-renewal"), "knightcube-renewal.service", service.pid()
+    systemctl("start", unit)
+    before = service.pid() == old
+    (own / "restart").touch()
+    systemctl("start", unit)
+    wait(lambda: service.pid() not in (0, old) and service.show("ActiveState") == "active", 30.0)
+    return {
+        "result": service.show("Result", unit),
+        "left_alone": before,
+        "restarted": service.pid() != old,
+        "status": (own / "status").exists(),
+        "ground": (own / "kept/ground/flight.yaml").exists(),
+        "flag": (own / "restart").exists(),
+    }
 
 
 def _damaged(service: Service) -> dict[str, Any]:

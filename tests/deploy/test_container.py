@@ -52,6 +52,17 @@ def test_each_death_was_one_restart(seen: dict[str, Any]) -> None:
     assert seen["restarts"] == 3
 
 
+def test_the_renewal_runs_in_its_sandbox_and_has_systemd_restart_the_flight(seen: dict[str, Any]) -> None:
+    assert seen["renewal"] == {
+        "result": "success",
+        "left_alone": True,
+        "restarted": True,
+        "status": True,
+        "ground": True,
+        "flag": False,
+    }
+
+
 def test_a_command_over_its_socket_is_answered(seen: dict[str, Any]) -> None:
     assert seen["commanded"].startswith("obeyed: "), seen["commanded"]
 

@@ -42,7 +42,7 @@ def test_a_confirmed_configuration_stays(board: RenewedBoard) -> None:
     before = board.flown()
     request = activated(board)
     assert [result for result, _ in board.reports(request)] == ["started"]
-    assert "--no-block restart knightcube.service knightcube-link.service" in board.calls()
+    assert board.restarted()
     board.request("confirm")
     board.step()
     assert board.reports(request)[-1] == ("completed", "configuration 1 stays")
@@ -80,6 +80,17 @@ def test_a_unit_that_does_not_come_up_ends_the_trial(board: RenewedBoard, unit: 
     assert "not up" in board.reports(request)[-1][1]
 
 
+def test_nothing_is_confirmed_while_the_flight_is_down(board: RenewedBoard) -> None:
+    before = board.flown()
+    activated(board)
+    board.set_active("knightcube.service", False)
+    refused = board.request("confirm")
+    board.step()
+    assert board.reports(refused)[-1][0] == "failed"
+    board.step(200.0)
+    assert board.flown() == before
+
+
 def test_the_safe_state_ends_the_trial_at_once(board: RenewedBoard) -> None:
     before = board.flown()
     activated(board)
@@ -100,6 +111,7 @@ def test_a_part_is_restarted_once_by_command(board: RenewedBoard, part: str, cal
     name = board.request("restart", part=part)
     for _ in range(3):
         board.step()
+        board.run("--restart")
     assert (board.place / "calls").read_text(encoding="ascii").splitlines().count(call) == 1
     reports = decoded((board.own / "status").read_bytes())["reports"]
     assert [report[1:4] for report in reports] == [[name, "completed", "restart"]]
@@ -150,7 +162,7 @@ def test_a_reaction_to_safe_ends_the_trial_unless_it_was_permitted(board: Renewe
     ],
 )
 def test_what_is_not_whole_signed_and_flyable_is_refused(
-    board: RenewedBoard, damage: str, words: str, monkeypatch: pytest.MonkeyPatch
+    board: RenewedBoard, damage: str, words: str
 ) -> None:
     before, path = board.flown(), board.changed("second")
     if damage == "invalid":
@@ -164,8 +176,7 @@ def test_what_is_not_whole_signed_and_flyable_is_refused(
         from ground.commands.renewal import make_signing_keys  # noqa: PLC0415
 
         make_signing_keys(board.place / "signing")
-    monkeypatch.setattr("ground.commands.renewal._artefact", lambda _, path: path.read_bytes())
-    bundle = board.bundle("configuration", path, 1)
+    bundle = board.bundle("configuration", path, 1, unchecked=True)
     if damage == "cut":
         bundle.write_bytes(bundle.read_bytes()[:-200])
     request = board.activate(bundle)

@@ -82,6 +82,36 @@ def test_the_sandbox_leaves_an_exposure_of_at_most_1(units: Path, name: str) -> 
 
 
 @needs_systemd
+def test_the_renewal_is_a_valid_unit_with_a_sandbox_although_it_is_root(tmp_path: Path) -> None:
+    for name in ("knightcube-renewal.service", "knightcube-renewal.timer"):
+        shutil.copyfile(DEPLOY / name, tmp_path / name)
+    words = ["systemd-analyze", "verify", *map(str, sorted(tmp_path.iterdir()))]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert exposure(tmp_path / "knightcube-renewal.service") <= 1.3
+
+
+@pytest.mark.parametrize(
+    "name", ["knightcube-link.service", "knightcube-renewal.service", "fly", "knightcube-safe.service"]
+)
+def test_python_runs_isolated_from_environment_and_working_folder(name: str) -> None:
+    text = (DEPLOY / name).read_text(encoding="utf-8")
+    starts = [
+        line
+        for line in text.splitlines()
+        if ("python" in line and " -m flight" in line) or "python3 " in line
+    ]
+    starts = [line for line in starts if not line.lstrip().startswith(("#", "for "))]
+    assert starts
+    assert all(" -I " in line for line in starts), starts
+
+
+@pytest.mark.parametrize("name", ["knightcube.service", "knightcube-link.service"])
+def test_the_services_import_only_what_root_permits(name: str) -> None:
+    assert "KNIGHTCUBE_MODULES=/etc/knightcube/modules" in (DEPLOY / name).read_text(encoding="utf-8")
+
+
+@needs_systemd
 def test_a_radio_that_is_plugged_in_beside_a_network_costs_a_fifth(tmp_path: Path) -> None:
     link = LINK.replace("/dev/null", "/dev/knightcube-radio")
     config = changed_testbed(tmp_path, commands="{socket: /run/knightcube/commands}", link=link)

@@ -1,13 +1,11 @@
 """Part of the link in the renewal in orbit (docs/fly/renewal.md): requests, and reports of their execution.
 
 The privileged program `deploy/renewal.py` reads the requests and the record `contact` in the folder of this
-module, and writes the status file that this module reads. All files have the same form: a line of JSON,
-followed by the SHA-256 of this line.
+module, and writes the status file that this module reads.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from contextlib import suppress
@@ -17,7 +15,7 @@ from typing import Any
 from flight.link.modes import Mode
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import KINDS, PARTS, Activate, Privileged, Restart
-from flight.link.regular_files import overwrite, read_regular
+from flight.link.regular_files import line_of, overwrite, read_regular, to_record
 from flight.link.telemetry.definitions import MODE
 from flight.link.telemetry.packets import LAYOUTS, to_text
 from hal.interfaces.wires import SECOND_NS
@@ -32,17 +30,13 @@ _DAMAGED = (ValueError, TypeError, AttributeError, LookupError, RecursionError)
 
 
 def encoded(values: object) -> bytes:
-    """Return values as a line of JSON and the SHA-256 of this line."""
-    line = json.dumps(values, sort_keys=True).encode() + b"\n"
-    return line + hashlib.sha256(line).hexdigest().encode() + b"\n"
+    """Return values as a record of JSON."""
+    return to_record(json.dumps(values, sort_keys=True).encode())
 
 
 def decoded(data: bytes) -> Any:
-    """Return the values of a record. Raises ValueError for a damaged record."""
-    line, end, digest = data.partition(b"\n")
-    if hashlib.sha256(line + end).hexdigest().encode() + b"\n" != digest:
-        raise ValueError("its checksum is wrong")
-    return json.loads(line)
+    """Return the values of a record of JSON. Raises ValueError for a damaged record."""
+    return json.loads(line_of(data) or b"")
 
 
 class Renewal:

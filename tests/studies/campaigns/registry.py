@@ -29,6 +29,7 @@ from tests.studies.campaigns.orbit_slews import ORBIT_SLEWS
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
 from tests.studies.campaigns.process_kill import PROCESS_KILL
 from tests.studies.campaigns.rate_change import RATE_CHANGE
+from tests.studies.campaigns.renewal_trials import RENEWAL_TRIALS
 from tests.studies.campaigns.resting import RESTING
 from tests.studies.campaigns.restored_keys import RESTORED_KEYS
 from tests.studies.campaigns.robust_controllers import ROBUST_CONTROLLERS
@@ -70,6 +71,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         FAULTS_KILL,
         INSTALLER_KILL,
         RESTORED_KEYS,
+        RENEWAL_TRIALS,
         PROCESS_KILL,
         COIL_FAULTS,
         UNKNOWN_BODY,

@@ -11,6 +11,7 @@ from flight.link.commands import open_unix
 from flight.link.modes import Mode
 from flight.link.process.commanding import ControlLine, Report, Sent
 from flight.link.process.downlink import LogFollower
+from flight.link.process.renewal import STATUS
 from flight.link.process.station import TURN_NS, Station, StationSettings
 from flight.link.security import Vault
 from flight.link.telemetry.definitions import COMMAND, LINK, MODE, VERIFICATION
@@ -103,7 +104,9 @@ class GroundStream(GroundWire):
 
 
 class BothEnds:
-    """A satellite in orbit and its ground."""
+    """A satellite in orbit and its ground; `renewal` is the status file of the privileged program."""
+
+    renewal = STATUS
 
     def __init__(
         self,
@@ -139,6 +142,7 @@ class BothEnds:
             idle_rate=self.idle_rate,
             encrypted=given.encrypted,
             codes=self.codes,
+            renewal=self.renewal,
         )
         control: ControlLine[Sent] = ControlLine(self.place / "commands", self.place)
         self.sky = Vault(self.place / "keys" / "satellite")

@@ -1,0 +1,108 @@
+"""A renewed board with its link and its ground in this process, and services that start as on a board."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from flight.app.flight import fly
+from flight.app.run import RunRequest
+from flight.app.service import FlownConfig, accepted_config
+from flight.link.modes import Mode
+from flight.link.process.directives import Activate, Listing
+from flight.schema.reader import parse
+from ground.link.commanding import sha256_of
+from knightcube.errors import FlightError, UsageError
+from tests.deploy.renewed_board import RenewedBoard
+from tests.flight.link.process.filed_ends import FiledEnds
+from tests.support.flights import CONFIG
+
+KEYS, SOCKET = "/var/lib/knightcube-link/keys", "/run/knightcube/commands"
+FLIGHT, LINK, SAFE = "knightcube.service", "knightcube-link.service", "knightcube-safe.service"
+
+
+def linked_text() -> str:
+    """Return a simulated configuration with a link."""
+    link = json.dumps({"keys": KEYS, "udp": "127.0.0.1:5000"})
+    commands = json.dumps({"socket": SOCKET})
+    return f"{CONFIG.read_text(encoding='utf-8')}\ncommands: {commands}\nlink: {link}\n"
+
+
+class RenewedEnds(FiledEnds):
+    """Satellite and ground.
+
+    Attributes:
+        board: files of the satellite.
+        reacts: name of the configuration whose flight goes to SAFE by a reaction.
+        crashes: label of the release whose flight ends at once.
+    """
+
+    def __init__(self, board: RenewedBoard, seed: int) -> None:
+        """Use a copy of a board."""
+        self.board, self.reacts, self.crashes = board, "", "crashes"
+        self.renewal = board.own / "status"
+        place = board.place / "link"
+        place.mkdir()
+        board.link.rename(place / "keys-of-board")
+        super().__init__(place, up_rate=1e6, seed=seed)
+        # The link's state folder of the board is the parent of its keys.
+        (place / "keys").rename(board.link)
+        (place / "keys-of-board").rename(board.link / "moved")
+        (place / "keys").symlink_to(board.link)
+        self.up = {FLIGHT: True, LINK: True}
+        self.restart()
+
+    def activate(self, bundle: Path, kind: str, hours: float) -> None:
+        """Send a bundle up and activate it."""
+        self.session.put(bundle, f"{kind}/{bundle.name}", self.clock.now_ns())
+        self.until_closed()
+        self.ask(Activate(f"received/{kind}/{bundle.name}", sha256_of(bundle), hours, 0))
+        self.turn(0.5)
+
+    def answers(self) -> bool:
+        """Return whether the link obeys a command."""
+        return self.up[LINK] and self.command(Listing()) == "completed"
+
+    def services(self) -> None:
+        """Start flight and link as systemd does, if they are to be restarted."""
+        if not self.board.restarted():
+            return
+        name = self._flown()
+        self.up = {FLIGHT: bool(name), LINK: self._linked()}
+        for unit, up in self.up.items():
+            self.board.set_active(unit, up)
+        self.board.set_active(SAFE, not name)
+        self.restart()
+        if name and name == self.reacts:
+            self.record(self.mode_packet(Mode.SAFE, "reaction safe"))
+
+    def flown_release(self) -> str:
+        """Return the label of the release that flies, or an empty text if it ends at once."""
+        label = self.board.release()
+        return "" if label == self.crashes else label
+
+    def _flown(self) -> str:
+        """Return the name of the configuration that flies, or an empty text if the flight ends at once."""
+        state = self.board.place / "state"
+        state.mkdir(exist_ok=True)
+        if not self.flown_release():
+            return ""
+        try:
+            chosen = accepted_config(self.board.config, {"STATE_DIRECTORY": str(state)})
+            path = state / "flight.yaml"
+            path.write_text(chosen.text.replace(SOCKET, str(state / "socket")), encoding="utf-8")
+            run = state / f"run-{len(list(state.iterdir()))}"
+            fly(RunRequest(path, run, duration=0.1))
+        except (FlightError, UsageError):
+            return ""
+        FlownConfig(chosen.text, state).keep()
+        return parse(chosen.text, str(path)).name
+
+    def _linked(self) -> bool:
+        """Return whether the link opens."""
+        try:
+            chosen = accepted_config(self.board.config, {"STATE_DIRECTORY": str(self.board.place / "state")})
+            link = parse(chosen.text, "flight.yaml").link
+        except (FlightError, UsageError):
+            return False
+        return link is not None and link.keys == KEYS

@@ -1,0 +1,144 @@
+"""The link hands renewals over to the privileged program, and reports what that program did."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flight.link.modes import Mode
+from flight.link.process.directives import Activate, Confirm, Listing, Withdraw
+from flight.link.process.renewal import Renewal, decoded, encoded
+from tests.flight.link.process.both_ends import BothEnds
+from tests.flight.link.process.filed_ends import FiledEnds
+
+DATA = b"a bundle" * 100
+
+
+class Ends(FiledEnds):
+    """Both ends with the status file of a privileged program."""
+
+    def __init__(self, place: Path) -> None:
+        self.renewal = place / "status"
+        super().__init__(place)
+
+    def write_status(self, *reports: list[object]) -> None:
+        """Write reports as the privileged program does."""
+        self.renewal.write_bytes(encoded({"reports": reports, "trial": "", "note": ""}))
+
+    def requests(self) -> dict[str, dict[str, object]]:
+        """Return the stored requests by their names."""
+        folder = self.place / "keys/renewal"
+        return {path.name: decoded(path.read_bytes()) for path in sorted(folder.glob("1-*"))}
+
+
+@pytest.fixture
+def ends(tmp_path: Path) -> Iterator[Ends]:
+    made = Ends(tmp_path)
+    made.write_status()
+    yield made
+    made.close()
+
+
+def put(ends: Ends) -> Activate:
+    """Send a bundle up; return the directive that activates it."""
+    path = ends.place / "configuration-2.renewal"
+    path.write_bytes(DATA)
+    ends.session.put(path, f"configuration/{path.name}", ends.clock.now_ns())
+    ends.until_closed()
+    return Activate(f"received/configuration/{path.name}", hashlib.sha256(DATA).digest(), 24.0, 1)
+
+
+def stages(ends: BothEnds, name: str) -> list[tuple[str, str]]:
+    """Return stages and texts of the reports about a command."""
+    return [(r.stage.name.lower(), r.text) for r in ends.reports() if r.name == name]
+
+
+def test_an_activation_is_a_request_for_exactly_the_checked_bytes(ends: Ends) -> None:
+    ends.ask(put(ends))
+    ends.turn(1.0)
+    ((name, request),) = ends.requests().items()
+    assert request == {
+        "do": "activate",
+        "kind": "configuration",
+        "name": "configuration-2.renewal",
+        "sum": hashlib.sha256(DATA).hexdigest(),
+        "hours": 24.0,
+        "despite_faults": True,
+    }
+    chosen = ends.place / "keys/files/chosen/configuration/configuration-2.renewal"
+    assert chosen.read_bytes() == DATA
+    assert [stage for stage, _ in stages(ends, "activate")] == ["accepted", "started"]
+    ends.write_status([1, name, "started", "activate", "trial of 24 h"])
+    ends.turn(2.5)
+    ends.write_status(
+        [1, name, "started", "activate", "trial of 24 h"], [2, name, "failed", "activate", "no"]
+    )
+    ends.turn(2.5)
+    assert stages(ends, "activate")[2:] == [("started", "trial of 24 h"), ("failed", "no")]
+    counter = int(name.split("-")[1])
+    assert [report.counter for report in ends.reports() if report.name == "activate"] == [counter] * 4
+    ends.restart()
+    ends.turn(2.5)
+    assert len(stages(ends, "activate")) == 4, "a restarted link repeats no report"
+
+
+def test_other_bytes_are_not_requested(ends: Ends) -> None:
+    directive = put(ends)
+    assert "its SHA-256 is" in ends.command(Activate(directive.name, bytes(32), 24.0, 0))
+    assert ends.requests() == {}
+
+
+def test_confirmation_and_withdrawal_are_requests(ends: Ends) -> None:
+    ends.ask(Confirm(3))
+    ends.ask(Withdraw(1))
+    ends.turn(1.0)
+    assert list(ends.requests().values()) == [
+        {"do": "confirm", "kind": "release"},
+        {"do": "withdraw", "kind": "elements"},
+    ]
+
+
+def test_a_board_without_the_privileged_program_refuses(ends: Ends) -> None:
+    ends.renewal.unlink()
+    assert "has no renewal" in ends.command(Confirm(0))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{}\n", encoded([1]), encoded({"reports": [[1, "x"]]}), b"\xff" * 99]
+)
+def test_a_damaged_status_is_ignored(ends: Ends, content: bytes) -> None:
+    ends.renewal.write_bytes(content)
+    ends.turn(2.5)
+    assert ends.command(Listing()) == "completed"
+
+
+def test_the_contact_counts_authentic_frames_and_reactions_to_safe(ends: Ends) -> None:
+    def contact() -> dict[str, object]:
+        found: dict[str, object] = decoded((ends.place / "keys/renewal/contact").read_bytes())
+        return found
+
+    ends.turn(2.0)
+    assert (contact()["frames"], contact()["safe"], contact()["limit_s"]) == ("0", "", 0.0)
+    ends.wire.up.append(bytes(64))
+    ends.record(ends.mode_packet(Mode.SAFE, "commanded safe"), ends.mode_packet(Mode.HOLD, "reaction hold"))
+    ends.turn(12.0)
+    assert (contact()["frames"], contact()["safe"]) == ("0", "")
+    ends.ask(Confirm(0))
+    ends.record(ends.mode_packet(Mode.SAFE, "reaction safe"))
+    ends.turn(12.0)
+    assert (contact()["frames"], contact()["safe"]) == ("1", "reaction safe")
+    session = contact()["session"]
+    ends.restart()
+    ends.turn(2.0)
+    assert contact()["session"] != session
+
+
+def test_a_disk_that_cannot_be_written_is_reported_and_ends_nothing(tmp_path: Path) -> None:
+    status = tmp_path / "status"
+    status.write_bytes(encoded({"reports": [[1, "", "completed", "command-loss", "x"]]}))
+    renewal = Renewal(tmp_path / "missing" / "folder", status, 5.0)
+    assert [report.text for report in renewal.turn(1, 0)] == ["x"]
+    assert renewal.turn(2, 10**12) == []
