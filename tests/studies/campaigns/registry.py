@@ -14,6 +14,7 @@ from tests.studies.campaigns.false_horizons import FALSE_HORIZONS
 from tests.studies.campaigns.faults import FAULTS
 from tests.studies.campaigns.faults_kill import FAULTS_KILL
 from tests.studies.campaigns.first_orbits import FIRST_ORBITS
+from tests.studies.campaigns.frames import FRAMES_CAMPAIGN
 from tests.studies.campaigns.horizon_methods import HORIZON_METHODS
 from tests.studies.campaigns.installer_kill import INSTALLER_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
@@ -73,6 +74,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         RESTORED_KEYS,
         RENEWAL_TRIALS,
         PROCESS_KILL,
+        FRAMES_CAMPAIGN,
         COIL_FAULTS,
         UNKNOWN_BODY,
         UNLIKE_INERTIA,

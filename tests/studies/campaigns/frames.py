@@ -1,0 +1,146 @@
+"""Campaign `frames`: mutated, repeated and reordered telecommand frames at every edge of the counter.
+
+Each run starts a link process whose next counter lies at an edge, and gives it 1,000 frames in portions:
+genuine frames in another order, repetitions, damaged frames with a wrong and with a right CRC, parts of two
+frames joined, and authentic frames whose IV of 96 bits lies at an edge. No command may be obeyed twice, none
+may be obeyed that the ground did not make, nothing may end the process, and the next genuine command must be
+obeyed.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from flight.link.commands import CommandPacker, Ping, unpack
+from flight.link.frames import close_frame
+from flight.link.security import HIGHEST_COUNTER, Refusal
+from tests.flight.link.process.both_ends import BothEnds
+from tests.flight.link.vaults import frame_with
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
+
+FRAMES, PORTION, GENUINE, LAST = 1000, 50, 30, 9999
+EDGES = (0, 2**31, 2**32, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1, 2**64, 2**95, 2**96 - 1)
+"""Numbers of 96 bits; the lowest 64 bits are the counter."""
+STARTS = (0, 2**31 - 5, 2**32 - 5, 2**63 - 70_000, 2**63 - 20)
+KINDS = ("repeated", "flipped", "flipped, CRC right", "cut", "joined", "edge", "noise")
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` link processes, with each of the starts in turn."""
+    return [Case(f"{run}", (seed, run), {"start": str(STARTS[run % len(STARTS)])}) for run in range(runs)]
+
+
+def run(case: Case) -> Result:
+    """Attack one link process."""
+    with tempfile.TemporaryDirectory(prefix="frames-") as place, closing(BothEnds(Path(place))) as link:
+        return {**case.parameters, **_attack(link, int(case.parameters["start"]), case.seed)}
+
+
+def _attack(link: BothEnds, start: int, seed: Sequence[int]) -> Result:
+    draw = np.random.default_rng(seed)
+    entry = link.sky.read(1)
+    assert entry is not None
+    link.sky.write(replace(entry, unused=start))
+    link.restart()
+    packer = CommandPacker()
+    genuine = [frame_with(link.ground, start + i, packer.pack(Ping(i), 1)) for i in range(GENUINE)]
+    waiting = list(genuine)
+    edges = {GENUINE + i: edge for i, edge in enumerate(EDGES)}
+    forged = [frame_with(link.ground, edge, packer.pack(Ping(number), 1)) for number, edge in edges.items()]
+    kinds: Counter[str] = Counter()
+    ended, possible_last = "", False
+    try:
+        while sum(kinds.values()) < FRAMES:
+            for _ in range(PORTION):
+                kind = KINDS[draw.integers(len(KINDS))] if draw.random() > 0.04 or not waiting else "genuine"
+                kinds[kind] += 1
+                if kind == "genuine":  # among the next three, in any order
+                    link.wire.up.append(waiting.pop(int(draw.integers(min(3, len(waiting))))))
+                else:
+                    past = genuine[: max(GENUINE - len(waiting), 1)]
+                    link.wire.up.append(_frame(kind, past, forged, draw))
+            link.turn(0.02)
+        entry = link.sky.read(1)
+        assert entry is not None
+        possible_last = entry.unused < HIGHEST_COUNTER
+        last = frame_with(link.ground, entry.unused, packer.pack(Ping(LAST), 1))
+        link.wire.up.append(last)
+        link.turn(1.1)
+    except Exception as error:  # noqa: BLE001 - what ends the process is what is looked for
+        ended = repr(error)
+    numbers = [command.number for command in map(unpack, link.obeyed) if isinstance(command, Ping)]
+    possible = {GENUINE + i for i, edge in enumerate(EDGES) if edge % 2**64 < HIGHEST_COUNTER}
+    return {
+        "frames": sum(kinds.values()),
+        "kinds": dict(kinds),
+        "ended": ended,
+        "obeyed": len(numbers),
+        "twice": sum(count - 1 for count in Counter(numbers).values()),
+        "strange": sum(number not in possible | {*range(GENUINE), LAST} for number in numbers),
+        "deaf": possible_last and LAST not in numbers,
+        "refused": {cause.name: link.station._gate.refused[cause] for cause in Refusal},
+    }
+
+
+def _frame(kind: str, past: list[bytes], forged: list[bytes], draw: np.random.Generator) -> bytes:
+    """Return a frame of the attacker, who has seen the frames `past` and has some authentic frames."""
+    known = forged if kind == "edge" else past
+    some = known[draw.integers(len(known))]
+    match kind:
+        case "repeated" | "edge":
+            return some
+        case "flipped":
+            return _flipped(some, draw)
+        case "flipped, CRC right":
+            return close_frame(_flipped(some[:-2], draw))
+        case "cut":
+            part = some[: int(draw.integers(len(some)))]
+            return close_frame(part) if draw.random() < 0.5 else part
+        case "joined":
+            at = int(draw.integers(1, len(some)))
+            return close_frame((some[:at] + forged[draw.integers(len(forged))][at:])[:-2])
+        case _:
+            return draw.bytes(int(draw.integers(0, 1100)))
+
+
+def _flipped(data: bytes, draw: np.random.Generator) -> bytes:
+    changed = bytearray(data)
+    for _ in range(int(draw.integers(1, 4))):
+        changed[draw.integers(len(changed))] ^= 1 << int(draw.integers(8))
+    return bytes(changed)
+
+
+def summarise(results: Sequence[Result], folder: Path) -> Summary:
+    """Return the sums over all link processes."""
+    del folder
+    kinds: Counter[str] = Counter()
+    refused: Counter[str] = Counter()
+    for result in results:
+        kinds.update(result["kinds"])
+        refused.update(result["refused"])
+    facts = {
+        "processes": len(results),
+        "frames": sum(result["frames"] for result in results),
+        **{name: sum(result[name] for result in results) for name in ("obeyed", "twice", "strange", "deaf")},
+        "ended": sorted({result["ended"] for result in results} - {""}),
+        "kinds": dict(kinds),
+        "refused": dict(refused),
+    }
+    return summary(facts)
+
+
+FRAMES_CAMPAIGN = Campaign(
+    "frames",
+    "telecommand frames mutated, repeated and reordered at every edge of the counter: none is obeyed twice",
+    cases,
+    run,
+    summarise,
+    default_runs=1000,
+)
