@@ -12,7 +12,10 @@ import pytest
 
 from flight.link.coding import LinkCodes, kiss_frame
 from flight.link.commands import CommandPacker, Ping, unpack
+from flight.link.files.units import UP, Metadata, Transaction, UnitPacker, pack
 from flight.link.frames import IDLE_CHANNEL, TELEMETRY_HEADER, close_frame, is_idle
+from flight.link.process import directives
+from flight.link.process.directives import Stop
 from flight.link.process.station import TncLine
 from flight.link.security import Refusal
 from flight.link.telemetry.definitions import LINK
@@ -201,3 +204,26 @@ def test_a_tnc_is_connected_again_when_it_was_away() -> None:
                 received += tnc.recv(1000)
     line.close()
     assert line.receive() == []
+
+
+PACKETS = {
+    "command": ping(7),
+    "directive": directives.pack(Stop(), 1),
+    "unit": UnitPacker(UP).pack(pack(Transaction(2, 1, 1), Metadata(1, "a", "configuration/a", 0)), 1),
+}
+
+
+@pytest.mark.parametrize("second", PACKETS)
+@pytest.mark.parametrize("first", PACKETS)
+def test_a_frame_with_two_packets_is_not_obeyed(
+    stack: ExitStack, tmp_path: Path, first: str, second: str
+) -> None:
+    link = stack.enter_context(closing(BothEnds(tmp_path)))
+    link.terminal.send(PACKETS[first] + PACKETS[second])
+    link.turn(1.1)
+    assert link.obeyed == []
+    assert link.station.transfers == 0
+    assert not {"completed", "started"} & {report.stage.name.lower() for report in link.reports()}
+    link.terminal.send(PACKETS["command"])
+    link.turn()
+    assert link.obeyed == [PACKETS["command"]]
