@@ -17,7 +17,13 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import Pressures, pressures
 from knightcube.astro.earth.ephemeris import STEP, Ephemeris, predict
 from knightcube.astro.earth.geomagnetism import extrapolation_sigma
-from knightcube.astro.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
+from knightcube.astro.earth.orbit_knowledge import (
+    LOWEST_RADIUS,
+    GpsFix,
+    OrbitError,
+    OrbitState,
+    TwoLineElements,
+)
 from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_velocity
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
@@ -160,14 +166,22 @@ class EstimatedEnvironment:
         return jumped and self._refused_in_a_row < CONTRADICTED
 
     def _contradicts(self, fix: GpsFix) -> bool:
-        """Return whether a GPS fix contradicts the two-line elements or, without elements, the last fix."""
-        known: GpsFix | TwoLineElements | None = self._elements or self._fix
-        if known is None or (known is self._fix and self._refused_in_a_row >= CONTRADICTED):
-            return False
-        try:
-            expected = known.at(fix.julian_date)
-        except OrbitError:
-            return False
+        """Return whether a GPS fix is impossible, or contradicts the two-line elements or the last fix.
+
+        A lasting contradiction of the last fix is accepted later.
+        """
         found = fix.at(fix.julian_date)
-        off = float(np.linalg.norm(found.position - expected.position))
-        return off > max(LEAST_GATE, GATE * math.sqrt(3.0) * math.hypot(expected.sigma, found.sigma))
+        if not found.perigee_radius >= LOWEST_RADIUS:
+            return True
+        last = None if self._refused_in_a_row >= CONTRADICTED else self._fix
+        for known in (self._elements, last):
+            if known is None:
+                continue
+            try:
+                expected = known.at(fix.julian_date)
+            except OrbitError:
+                continue
+            off = float(np.linalg.norm(found.position - expected.position))
+            if off > max(LEAST_GATE, GATE * math.sqrt(3.0) * math.hypot(expected.sigma, found.sigma)):
+                return True
+        return False

@@ -68,6 +68,18 @@ class OrbitState:
             return math.inf
         return 2.0 * math.pi * GRAVITATIONAL_PARAMETER / math.pow(-2.0 * energy, 1.5)
 
+    @property
+    def perigee_radius(self) -> float:
+        """Radius (m) of the perigee of the Keplerian orbit, or NaN for an open orbit."""
+        energy = 0.5 * float(self.velocity @ self.velocity)
+        energy -= GRAVITATIONAL_PARAMETER / float(np.linalg.norm(self.position))
+        if energy >= 0.0:
+            return math.nan
+        axis = -0.5 * GRAVITATIONAL_PARAMETER / energy
+        momentum = np.cross(self.position, self.velocity)
+        square = 1.0 - float(momentum @ momentum) / (GRAVITATIONAL_PARAMETER * axis)
+        return axis * (1.0 - math.sqrt(max(square, 0.0)))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpsFix:

@@ -97,6 +97,47 @@ def test_a_false_fix_is_refused_by_the_elements_however_often_it_comes(elements:
     assert known.fix(reading(elements, 60 * SECOND_NS))
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.9, 1.5])
+def test_a_fix_with_an_impossible_velocity_is_refused(elements: TwoLineElements, speed: float) -> None:
+    """The orbit would meet the Earth or leave it."""
+    for known in (
+        EstimatedEnvironment(elements, SimClock(UTC_NS)),
+        EstimatedEnvironment(None, SimClock(UTC_NS)),
+    ):
+        sound = reading(elements, 0)
+        assert not known.fix(replace(sound, velocity=speed * sound.velocity))
+        assert known.fix(reading(elements, SECOND_NS))
+
+
+@pytest.mark.parametrize("age", [1, 6, 14, 30, 60])
+@pytest.mark.parametrize("drag", [" 25000-3", " 50000-3"])
+def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(age: int, drag: str) -> None:
+    """Elements with B* 0 of a satellite with B* 2.5e-4 and 5e-4; later fixes are judged by earlier fixes."""
+    first = "1 99001U 26001A   26079.50000000  .00000000  00000-0  00000+0 0  9996"
+    second = "2 99001  97.4640 337.4170 0011973 295.7805  64.3547 15.30000000000102"
+    dragged = first[:53] + drag + first[61:68]
+    total = sum(int(c) if c.isdigit() else c == "-" for c in dragged) % 10
+    old, true = TwoLineElements(first, second), TwoLineElements(f"{dragged}{total}", second)
+    utc_ns = UTC_NS + age * 86_400 * SECOND_NS
+    known = EstimatedEnvironment(old, SimClock(utc_ns))
+
+    def fix(seconds: int, shift: FloatArray | None = None) -> GpsReading:
+        time_ns = age * 86_400 * SECOND_NS + seconds * SECOND_NS
+        sound = reading(true, time_ns, shift)
+        return replace(sound, time_ns=seconds * SECOND_NS + GPS_DELAY_NS)
+
+    before = known.state(0)
+    assert before is not None
+    off = np.linalg.norm(before.position - true.at(before.julian_date).position)
+    assert off < 4.0 * before.sigma
+    assert known.fix(fix(0))
+    state = known.state(0)
+    assert state is not None
+    assert state.sigma < 20.0
+    assert not known.fix(fix(1, np.array([0.0, 4e4, 0.0])))
+    assert known.fix(fix(2))
+
+
 def test_without_elements_a_first_fix_that_was_false_is_given_up(elements: TwoLineElements) -> None:
     known = EstimatedEnvironment(None, SimClock(UTC_NS))
     assert known.fix(reading(elements, 0, np.array([3e4, 0.0, 0.0])))
