@@ -284,7 +284,7 @@ class Navigation:
         odd = link.out_of_range - before.out_of_range
         endless = link.not_finite - before.not_finite
         if odd or endless:
-            text = f"{odd} packets out of range, {endless} not finite"
+            text = f"{odd} packets out of range, {endless} not finite: {link.rejection}"
             self._events.report(events.IMU_IMPLAUSIBLE, now_ns, text)
 
 

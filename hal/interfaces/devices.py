@@ -60,6 +60,7 @@ class ImuLink:
         out_of_range: number of samples rejected because a value is physically impossible.
         not_finite: number of samples rejected because a value is not finite.
         last_byte_ns: host time of the last received byte, ns; -1 before the first byte.
+        rejection: quantity and value for which the last sample was rejected, or an empty text.
     """
 
     bytes_received: int
@@ -69,6 +70,7 @@ class ImuLink:
     out_of_range: int
     not_finite: int
     last_byte_ns: int
+    rejection: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -414,6 +414,7 @@ class ReadingConverter:
         resets: number of restarts of the unit, detected by backward steps of the device time.
         out_of_range: number of samples rejected because values are physically impossible or stuck.
         not_finite: number of samples rejected because a value is not finite.
+        rejection: quantity and value for which the last sample was rejected, or an empty text.
     """
 
     def __init__(self, settings: Vn100Settings, byte_ns: float, on_reset: Callable[[], None]) -> None:
@@ -427,6 +428,7 @@ class ReadingConverter:
         self.resets = 0
         self.out_of_range = 0
         self.not_finite = 0
+        self.rejection = ""
         self._settings = settings
         matrices = (settings.gyro_matrix, settings.field_matrix)
         gyro, magnetometer = (np.asarray(np.linalg.inv(matrix), dtype=float) for matrix in matrices)
@@ -453,6 +455,7 @@ class ReadingConverter:
         # The sum of 32-bit floats cannot overflow, so the sum is finite only if all values are finite.
         if not math.isfinite(sum(numbers)):
             self.not_finite += 1
+            self.rejection = self._fault(q, rate, mag, accel)
             return None
         settings = self._settings
         self._alike = self._alike + 1 if sample[1:] == self._sample else 0
@@ -466,6 +469,7 @@ class ReadingConverter:
             or max(map(abs, accel)) > settings.acceleration_range
         ):
             self.out_of_range += 1
+            self.rejection = self._fault(q, rate, mag, accel)
             return None
         # One common array is faster than an array for each quantity.
         values = np.array(numbers)
@@ -482,6 +486,23 @@ class ReadingConverter:
             field=self._field_map @ values[7:10] * TESLA_PER_GAUSS - self._field_offset,
             acceleration=settings.mounting @ values[10:],
         )
+
+    def _fault(self, *sample: tuple[float, ...]) -> str:
+        """Return which quantity of a rejected sample is impossible, with its value and limit."""
+        settings, quaternion = self._settings, sample[0]
+        quantities = (
+            ("rate", 1.0, settings.rate_range, "rad/s"),
+            ("magnetic field", TESLA_PER_GAUSS, settings.field_range, "T"),
+            ("acceleration", 1.0, settings.acceleration_range, "m/s^2"),
+        )
+        for (name, scale, limit, unit), values in zip(quantities, sample[1:], strict=True):
+            for axis, value in zip("xyz", values, strict=True):
+                if not abs(scale * value) <= limit:
+                    return f"{name} {axis} = {scale * value:g} {unit}, limit {limit:g}"
+        norm = math.hypot(*quaternion)
+        if not abs(norm - 1.0) <= _UNIT_NORM_TOLERANCE:
+            return f"norm of the quaternion = {norm:g}, must be 1"
+        return f"{self._alike + 1} samples in a row are identical"
 
     def check_for_others(self, items: Sequence[BinaryPacket | AsciiLine], foreign: int, now_ns: int) -> None:
         """Detect a unit that sends an output that was not requested.
@@ -648,6 +669,7 @@ class Vn100:
             self._converter.out_of_range,
             self._converter.not_finite,
             self._last_byte_ns,
+            self._converter.rejection,
         )
 
     @property

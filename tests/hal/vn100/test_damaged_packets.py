@@ -8,6 +8,7 @@ from random import Random
 
 import numpy as np
 from hypothesis import given
+from hypothesis import strategies as st
 
 from hal.drivers.vn100.driver import OUTPUT_SET, Vn100
 from hal.drivers.vn100.protocol import BinaryPacket, StreamParser, layout_of
@@ -75,3 +76,34 @@ def test_readings_are_finite_and_in_range_and_whole_packets_come_out(chance: Ran
         assert np.max(np.abs(reading.rate)) <= settings.rate_range
         assert np.max(np.abs(reading.field)) <= settings.field_range * (1.0 + 1e-12)
         assert np.max(np.abs(reading.acceleration)) <= settings.acceleration_range
+
+
+PAYLOAD = ("q0", "q1", "q2", "q3", *(f"rate {axis}" for axis in "xyz"), *(f"acceleration {a}" for a in "xyz"))
+"""Names of the numbers after the time in the packet's group 1; the magnetic field follows in group 3."""
+NAMES = (*PAYLOAD, *(f"magnetic field {axis}" for axis in "xyz"))
+
+
+@given(st.integers(0, len(NAMES) - 1), st.floats(width=32))
+def test_a_changed_number_is_read_or_refused_by_quantity_and_value(which: int, value: float) -> None:
+    numbers = [0.0, 0.0, 0.0, 1.0, 0.1, -0.2, 0.3, 1.0, 2.0, 3.0, 0.1, 0.2, 0.3]
+    numbers[which] = value
+    sent = layout_of(OUTPUT_SET).pack([1_000_000, *numbers])
+    driver = Vn100(ScriptedPort([(1_000_000_000, sent)]), ManualClock(), replace(MISSION, configure=False))
+    readings, link = driver.poll(), driver.link()
+    assert len(readings) + link.out_of_range + link.not_finite == 1
+    name = NAMES[which]
+    scale = 1e-4 if name.startswith("magnetic") else 1.0
+    if readings:
+        assert link.rejection == ""
+    elif name.startswith("q"):
+        assert link.rejection.startswith("norm of the quaternion = ")
+    else:
+        assert link.rejection.startswith(f"{name} = {scale * value:g} ")
+        assert "limit" in link.rejection
+
+
+def test_a_stuck_sensor_is_named() -> None:
+    chunks = [(1_000_000_000 + k, GOOD) for k in range(12)]
+    driver = Vn100(ScriptedPort(chunks), ManualClock(), replace(MISSION, configure=False))
+    assert len(driver.poll()) == 10
+    assert driver.link().rejection == "12 samples in a row are identical"
