@@ -42,6 +42,9 @@ The pressure is a tenth of that at solar maximum and perpendicular incidence on 
 _DIPOLE, _MOMENT = 3.0e-4, 1.047e-3
 """Dipole (A m^2) with the cost of an attitude error of 1 deg, tuned for a mean moment (kg m^2) of a 1U."""
 
+_DIPOLE_PER_MASS = 3.5e-3
+"""Residual dipole (A m^2) per kg of a satellite of class II that does not spin (NASA SP-8018)."""
+
 ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 
 
@@ -53,7 +56,8 @@ class CraftAccuracy(Section, frozen=True, kw_only=True):
 
     `moments` is the relative error of the principal moments of inertia, and `axes_deg` the rotation of the
     principal axes about each body axis. `coil_gain` is the relative error of the dipole of each coil, and
-    `coil_axes_deg` the misalignment of its axis.
+    `coil_axes_deg` the misalignment of its axis. `residual_dipole` (A m^2) is the error of the residual
+    dipole along each body axis; without it, it is computed (`OrbitConfig.dipole_errors`).
     """
 
     moments: Annotated[float, Meta(ge=0.0, le=0.3)] = 0.1
@@ -61,6 +65,7 @@ class CraftAccuracy(Section, frozen=True, kw_only=True):
     coil_gain: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.2
     coil_axes_deg: Annotated[float, Meta(ge=0.0, le=30.0)] = 3.0
     centre_of_mass: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02
+    residual_dipole: Annotated[float, Meta(ge=0.0, le=100.0)] | None = None
 
 
 class Craft(Section, frozen=True, kw_only=True):
@@ -254,6 +259,20 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         rates = 1.0 / np.linalg.eigvalsh(self.craft.inertia_matrix())
         torque = _FIELD * float(self.coils.map().limits.mean())
         return _two_digits(0.1 * torque * float(np.sqrt(np.mean(rates**2))))
+
+    def dipole_errors(self) -> tuple[float, float]:
+        """Return the largest errors (A m^2, each axis) of the residual dipole and its increase in sunlight.
+
+        Unless it is configured, the error of the residual dipole in shadow is that of a satellite with some
+        magnetic cleanliness, in proportion to its mass. Without a mass, that of a homogeneous box with the
+        configured moments of inertia is used. The increase in sunlight is three tenths of this value.
+        """
+        craft = self.craft
+        mass = craft.mass
+        if mass is None:
+            mass = 6.0 * float(np.trace(craft.inertia_matrix())) / sum(edge**2 for edge in craft.size)
+        usual, given = _two_digits(_DIPOLE_PER_MASS * mass), craft.accuracy.residual_dipole
+        return usual if given is None else given, 0.3 * usual
 
     def torque_sizes(self) -> tuple[float, float]:
         """Return size (N m) and random walk (N m per sqrt(s)) of the disturbance torques at 500 km.

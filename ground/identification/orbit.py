@@ -168,6 +168,7 @@ def _craft(found: LearnedDescription) -> list[str]:
         accuracies = [f"moments: {_above(moments)}", f"axes_deg: {_above(axes_deg)}"]
     if dipole.learned:
         values += [f"  residual_dipole: {_row(dipole.value)}   # A m^2 +- {dipole.claim.max():.2g}"]
+        accuracies += [f"residual_dipole: {_above(_UNIFORM * float(dipole.claim.max()))}"]
     if coils.learned:
         gain, axes = _largest(coils)
         accuracies += [

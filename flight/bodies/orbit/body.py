@@ -147,7 +147,7 @@ class OrbitView:
 
     def _record_description(self, now_ns: int) -> None:
         """Record the estimated inertia, coils and sensors."""
-        values = self._filter.description()
+        values = self._filter.description(now_ns)
         fields = {name: values[name].ravel().tolist() for name in values}
         self._recorder.record(DESCRIPTION, now_ns, **fields)
 
@@ -390,6 +390,8 @@ _FIELD_ERROR = 5.0e-8
 """Standard deviation of the magnetic field model, T per axis."""
 _FIELD_BIAS_WALK = 3.0e-10
 """Random walk of the magnetometer's bias, T per sqrt(s)."""
+_DIPOLE_WALK, _SUNLIT_WALK = 1.5e-6, 2.0e-7
+"""Random walk of the residual dipole in shadow and of its increase in sunlight, A m^2 per sqrt(s)."""
 _UNIFORM = 1.0 / math.sqrt(3.0)
 """Standard deviation of a uniformly distributed error whose largest value is one."""
 
@@ -415,9 +417,11 @@ def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
     """Return the filter's settings that follow from the configuration."""
     section, coils = config.estimation, config.coils.map()
     strength = float(np.linalg.norm(coils.dipoles, axis=1).max())
-    errors = description_errors(config)
+    errors, (dipole, sunlit) = description_errors(config), config.dipole_errors()
     return FreeFilterSettings(
         gyro=(section.bias_start, section.bias_walk),
+        dipole=(_UNIFORM * dipole, _DIPOLE_WALK),
+        sunlit=(_UNIFORM * sunlit, _SUNLIT_WALK),
         coil_noise=section.current_noise * strength / math.sqrt(CONTROL_RATE_HZ),
         torque=config.torque_sizes(),
         magnet=(_UNIFORM * config.inertial_unit.accuracy.field_bias, _FIELD_BIAS_WALK),

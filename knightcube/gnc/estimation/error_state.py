@@ -158,6 +158,20 @@ def propagated(
     return after
 
 
+def reset(covariance: FloatArray, at: slice, rotation: Sequence[float]) -> None:
+    """Rotate the remaining error of an attitude to the axes after its correction, in place.
+
+    The attitude has the elements `at` of the error state, and was corrected by `rotation` (3,), rad. To first
+    order, the remaining error rotates by half the correction (Markley and Crassidis 2014, section 6.2.4).
+    """
+    x, y, z = rotation
+    turn = np.array(((1.0, 0.5 * z, -0.5 * y), (-0.5 * z, 1.0, 0.5 * x), (0.5 * y, -0.5 * x, 1.0)))
+    moved = turn.dot(covariance[at])
+    among = moved[:, at].dot(turn.T)
+    covariance[at], covariance[:, at] = moved, moved.T
+    covariance[at, at] = 0.5 * (among + among.T)
+
+
 _MOTION = slice(0, 6)
 """Indices of attitude and rate in the error state of a filter."""
 _IDENTITY: FloatArray = np.eye(6)

@@ -57,6 +57,7 @@ from knightcube.gnc.estimation.error_state import (
     gate_bounds,
     joined,
     propagated,
+    reset,
     slices,
     updated,
     weigh,
@@ -211,7 +212,7 @@ _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
 LASTING = 20.0
-"""Correlation time (s) of the errors of the coils, which the filter represents by scaled white noise."""
+"""Correlation time (s), in body axes, of the errors of coils and field, represented by scaled white noise."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
 """Expected sizes of the constant torque and of the torques by air and sunlight, relative to that by air. The
 constant torque is small, because the error of the inertia has its own states. At one attitude the torques
@@ -243,9 +244,9 @@ class FreeFilterSettings:
             sqrt(s).
         coil_walk: random walk of the elements of the coils' matrix per sqrt(s), for example due to
             temperature.
-        inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s). This random walk
-            limits the claimed accuracy of the inertia, because flexible parts are not contained in Euler's
-            equation of a rigid body.
+        inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular
+            rate in rad/s. The load on flexible parts, which are not contained in Euler's equation of a rigid
+            body, vanishes with the rotation. This random walk limits the claimed accuracy of the inertia.
         errors: largest errors of the description of body and sensors.
         coils: covariance (9, 9) of the coils' matrix, row by row, at the start; None for coils along the body
             axes, whose covariance follows from `errors`.
@@ -268,7 +269,7 @@ class FreeFilterSettings:
     coil_error: float = 0.005
     coil_noise: float = 0.0
     coil_walk: float = 1e-4
-    inertia_walk: float = 1e-5
+    inertia_walk: float = 1e-4
     errors: BodyErrors = dataclasses.field(default_factory=BodyErrors)
     coils: FloatArray | None = None
     roles: Mapping[str, Role] = dataclasses.field(default_factory=dict)
@@ -293,7 +294,7 @@ class FreeFilterSettings:
             StateBlock("sunlit_dipole", self.sunlit[0] * ones, self.sunlit[1]),
             StateBlock("field_bias", self.magnet[0] * ones, self.magnet[1]),
             StateBlock("torques", torques, walk),
-            StateBlock("inertia", inertia_covariance(inertia, errors), self.inertia_walk),
+            StateBlock("inertia", inertia_covariance(inertia, errors)),
             StateBlock("coils", coils, self.coil_walk),
             StateBlock("gyro_matrix", _matrix_errors(errors.gyro_scale, errors.gyro_alignment)),
             StateBlock("field_matrix", _matrix_errors(errors.field_matrix, errors.field_matrix)),
@@ -329,6 +330,7 @@ AIR_WALK = 6e-3
 """Random walk of the air density, relative to the density, per sqrt(s): 15 % in ten minutes."""
 _EYE: FloatArray = np.eye(3)
 _BODY = slice(INERTIA.start, COILS.stop)
+_INERTIA_DIAGONAL = slice(INERTIA.start * (STATES + 1), INERTIA.stop * (STATES + 1), STATES + 1)
 _FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
 
 
@@ -617,13 +619,18 @@ class FreeFilter:
         command. If the dipole changes during `seconds`, `uneven` (3,) A m^2 s^2 is the double time integral
         of the dipole minus that of the mean dipole.
         """
-        speed = math.sqrt(float(self.rate @ self.rate))
-        steps = max(1, math.ceil(speed * seconds / LARGEST_ROTATION))
+        before = self.rate
+        steps = max(1, math.ceil(math.sqrt(float(before @ before)) * seconds / LARGEST_ROTATION))
         for _ in range(steps):
             self._step(seconds / steps, dipole, around, doubt)
         if uneven is not None:
+            changed, rate = self.coil_matrix @ uneven, 0.5 * (before + self.rate)
             field = attitude_matrix(self.quaternion) @ around.field
-            rotation = self.motion.inverse @ cross_product(self.coil_matrix @ uneven, field)
+            slope = cross_product(rate, field)
+            rotation = self.motion.inverse @ cross_product(changed, field + 0.5 * seconds * slope)
+            # The field and the gyroscopic torque change with the time at which the dipole acts.
+            change = self.motion.inverse @ cross_product(changed, slope)
+            self.rate = self.rate + change + self.motion.stiffness(rate) @ rotation
             self.quaternion = multiply(from_rotation_vector(rotation), self.quaternion)
 
     def begin_mean(self) -> None:
@@ -784,14 +791,18 @@ class FreeFilter:
         noise = self.rate_noise(driven, around, doubt)
         self.covariance = propagated(self.covariance, flow, dt, noise, self.layout.walks)
         self.covariance[TORQUES, TORQUES] += dt * density_walk(self._constants[TORQUES])
+        if self.layout.prior[INERTIA, INERTIA].any():
+            flexed = self._settings.inertia_walk**2 * float(rate @ rate)
+            self.covariance.reshape(-1)[_INERTIA_DIAGONAL] += dt * flexed
         self._propagate_field_error(dt, around.field_sigma)
         self._propagate_horizon(dt)
 
     def rate_noise(self, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0) -> FloatArray:
         """Return the noise density (3, 3) of the angular acceleration, rad^2/s^3.
 
-        It depends on the coils' dipole (3,) A m^2, and on the standard deviation `doubt` (A m^2) of an
-        uncertain dipole.
+        It depends on the coils' dipole (3,) A m^2, on the error of the field model, and on the standard
+        deviation `doubt` (A m^2) of an uncertain dipole. Errors of a dipole cause no torque along the field,
+        but the error of the field model does.
         """
         settings, motion, square = self._settings, self.motion, float(dipole @ dipole)
         coils = LASTING * (settings.coil_error**2 * square / 3.0 + doubt**2)
@@ -801,6 +812,9 @@ class FreeFilter:
             field = attitude_matrix(self.quaternion) @ around.field
             across = motion.inverse @ cross_matrix(field)
             density = density + coils * (across @ across.T)
+        if square:
+            across = motion.inverse @ cross_matrix(dipole)
+            density = density + LASTING * self.field_error**2 * (across @ across.T)
         return np.asarray(density)
 
     def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:
@@ -816,6 +830,7 @@ class FreeFilter:
         gain = self.layout.estimated(gain)
         self.covariance = updated(self.covariance, gain, cross, spread)
         error = gain @ value
+        reset(self.covariance, ATTITUDE, error[ATTITUDE].tolist())
         self.quaternion = multiply(from_rotation_vector(error[ATTITUDE]), self.quaternion)
         self.rate = self.rate + error[RATE]
         self._constants[6:] += error[6:]

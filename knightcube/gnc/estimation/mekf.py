@@ -37,7 +37,7 @@ from knightcube.astro.quaternion import (
     times,
     twist,
 )
-from knightcube.gnc.estimation.error_state import Weighed, updated, weigh
+from knightcube.gnc.estimation.error_state import Weighed, reset, updated, weigh
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     DISTURBANCE,
@@ -227,15 +227,8 @@ def correct(
     """Return corrected state and covariance. The gain of `weighed` may differ from the optimal gain."""
     error = weighed.gain.dot(found.value).tolist()
     covariance = updated(covariance, weighed.gain, weighed.cross, weighed.spread)
-    # The reset rotates the axes of the remaining attitude error by half the correction.
     for first in (0, *range(SIZE, len(covariance), 3)):
-        axes = slice(first, first + 3)
-        x, y, z = error[axes]
-        reset = np.array(((1.0, 0.5 * z, -0.5 * y), (-0.5 * z, 1.0, 0.5 * x), (0.5 * y, -0.5 * x, 1.0)))
-        moved = reset.dot(covariance[axes])
-        among = moved[:, axes].dot(reset.T)
-        covariance[axes], covariance[:, axes] = moved, moved.T
-        covariance[axes, axes] = 0.5 * (among + among.T)
+        reset(covariance, slice(first, first + 3), error[first : first + 3])
     corrected = FilterState(
         compose(exponential(*error[0:3]), state.quaternion),
         added(state.rate, error[3:6]),

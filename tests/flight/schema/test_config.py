@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flight.bodies.orbit.body import filter_settings
 from flight.link.commands import Point
 from flight.loop.commanding import command_of
 from flight.schema import reader
@@ -363,6 +364,21 @@ def test_given_values_replace_the_computed_ones() -> None:
     config = reader.replace(config, **changes)
     assert (config.torque_noise(), config.torque_sizes()) == (1e-6, (2e-9, 3e-12))
     assert (config.dipole_weight(), config.slew_duration()) == (4e-4, 500.0)
+
+
+def test_the_error_of_the_residual_dipole_follows_from_the_mass_unless_it_is_given() -> None:
+    config = as_orbit(reader.parse(ORBIT))
+    craft = reader.replace(config.craft, mass=2.0)
+    assert reader.replace(config, craft=craft).dipole_errors() == pytest.approx((7e-3, 2.1e-3))
+    # A box of 3 kg with edges of 0.1, 0.2 and 0.3 m has these moments.
+    inertia = tuple((0.25 * np.array([0.13, 0.10, 0.05])).tolist())
+    box = reader.replace(config.craft, mass=None, size=(0.1, 0.2, 0.3), inertia=inertia)
+    assert reader.replace(config, craft=box).dipole_errors()[0] == pytest.approx(1.05e-2, rel=0.05)
+    accuracy = reader.replace(craft.accuracy, residual_dipole=2e-4)
+    config = reader.replace(config, craft=reader.replace(craft, accuracy=accuracy))
+    assert config.dipole_errors() == pytest.approx((2e-4, 2.1e-3))
+    free = filter_settings(config)
+    assert (free.dipole[0], free.sunlit[0]) == pytest.approx((2e-4 / 3**0.5, 2.1e-3 / 3**0.5))
 
 
 def test_two_coils_leave_the_third_axis_without_a_coil() -> None:

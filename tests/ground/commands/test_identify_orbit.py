@@ -174,4 +174,5 @@ def test_the_learned_sensors_are_combined_with_the_configured_ones(tmp_path: Pat
     np.testing.assert_allclose(to_rotation_vector(between), [0.0, 0.0, 1e-3], atol=1e-8)
     assert flown.camera.accuracy.mounting_deg == pytest.approx(np.degrees(np.sqrt(3.0) * 1e-5), rel=0.01)
     assert flown.craft.residual_dipole == pytest.approx((1e-3, 0.0, -2e-3))
+    assert flown.dipole_errors()[0] == pytest.approx(np.sqrt(3.0) * 1e-4, rel=0.01)
     assert flown.craft.accuracy.moments == as_orbit(load(config)).craft.accuracy.moments, "not learned"

@@ -21,8 +21,9 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Knowledge
-from knightcube.gnc.estimation.free_filter import FilterEnvironment
+from knightcube.gnc.estimation.free_filter import FilterEnvironment, FreeFilterSettings
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from knightcube.gnc.estimation.rigid_body import BodyErrors
 
 PERIOD_NS = SECOND_NS // 40
 INERTIA = np.diag([1.1e-3, 1.05e-3, 0.99e-3])
@@ -41,7 +42,7 @@ def around(_: int) -> FilterEnvironment:
 class Flown:
     """A body under its coils, a few steps of Euler's equation a reading, and its filter."""
 
-    def __init__(self, pulses: bool = False) -> None:
+    def __init__(self, pulses: bool = False, errors: BodyErrors | None = None) -> None:
         self.filter = OrbitFilter(
             OrbitFilterSettings(
                 inertia=INERTIA,
@@ -51,6 +52,7 @@ class Flown:
                 unknown_psd=1e-8,
                 settle_ns=100_000_000,
                 history_ns=12 * SECOND_NS,
+                free=FreeFilterSettings(errors=errors or BodyErrors()),
             ),
             around,
         )
@@ -128,6 +130,39 @@ def test_stars_of_over_a_second_ago_are_applied_at_their_own_time(pulses: bool) 
     assert (np.abs(found.rate - flown.rate) < 4.0 * sigma[RATE]).all()
     assert found.bias == pytest.approx(BIAS, abs=5e-5)
     assert flown.filter.refused == 0
+
+
+def test_within_a_step_a_fast_body_is_propagated_by_the_learned_coils_in_the_rotating_field() -> None:
+    """The coils carry 1.2 times their command, and the body rotates by several degrees within a step."""
+    flown = Flown(pulses=True, errors=BodyErrors(moments=0.0, axes=0.0))
+    flown.rate, flown.carries = np.array([0.08, -0.1, 0.06]), 1.2
+    flown.fly(3.0)
+    assert flown.filter.begin(flown.stars(flown.time_ns - 24 * PERIOD_NS))
+    for _ in range(8):
+        flown.fly(5.0)
+        assert flown.see(52 * PERIOD_NS)
+    assert flown.filter.coil_matrix[0, 0] == pytest.approx(1.2, abs=0.06)
+    flown.fly(0.25)
+    error, change = flown.rate - flown.filter.at(flown.time_ns).rate, flown.rate
+    flown.fly(0.7)
+    found = flown.filter.at(flown.time_ns)
+    assert np.linalg.norm(flown.rate - change) > 4e-4
+    assert flown.rate - found.rate == pytest.approx(error, abs=1.5e-5)
+
+
+def test_the_claim_of_the_star_camera_is_that_of_the_present_and_not_of_the_last_step() -> None:
+    flown = Flown(pulses=True, errors=BodyErrors(camera=0.0))
+    flown.fly(3.0)
+    assert flown.filter.begin(flown.stars(flown.time_ns - PERIOD_NS))
+    claims = []
+    for seconds in (1.5, 0.7):
+        flown.fly(seconds)
+        found = flown.filter.description(flown.time_ns)["camera_attitude_sigma"]
+        # The attitudes of a camera without misalignment and of the body have one uncertainty.
+        present = flown.filter.at(flown.time_ns).covariance[ATTITUDE, ATTITUDE]
+        assert found == pytest.approx(np.sqrt(present.diagonal()))
+        claims.append(found)
+    assert (claims[1] > 1.2 * claims[0]).all()
 
 
 def test_the_past_and_the_rates_of_an_exposure_are_kept() -> None:
@@ -254,7 +289,7 @@ def test_a_magnetometer_that_repeats_its_value_or_is_false_is_doubted_and_left_o
 
 def _coil_x(flown: Flown) -> tuple[float, float]:
     """Return the estimated gain of coil x and its standard deviation."""
-    found = flown.filter.description()
+    found = flown.filter.description(flown.time_ns)
     return float(found["coils"][0]), float(found["coils_sigma"][0])
 
 
