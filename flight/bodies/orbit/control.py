@@ -18,8 +18,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flight.bodies.orbit.environment import EstimatedEnvironment
-from flight.bodies.orbit.filter import OrbitFilter, StuckFieldCheck
+from flight.bodies.orbit.environment import EstimatedEnvironment, StuckFieldCheck
+from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.guidance import PathPoint
 from flight.link import events
 from flight.loop.body import CoilCommand

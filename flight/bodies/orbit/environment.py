@@ -3,6 +3,7 @@
 The position is propagated from the newest GPS fix, or from two-line elements before the first fix. The
 environment is predicted for about 20 s at once, which takes 2 ms, and then interpolated. Predictions for a
 whole revolution belong in a worker, because they take 0.3 ms for each 10 s.
+A check detects a magnetometer that repeats the same field.
 """
 
 from __future__ import annotations
@@ -185,3 +186,35 @@ class EstimatedEnvironment:
             if off > max(LEAST_GATE, GATE * math.sqrt(3.0) * math.hypot(expected.sigma, found.sigma)):
                 return True
         return False
+
+
+STUCK, FIELDS_CONTRADICTED = 20, 4
+"""Number of equal magnetic fields in a row, and of contradicting fields in a row, that indicate a fault."""
+
+
+class StuckFieldCheck:
+    """Detects a magnetometer that repeats the same field."""
+
+    def __init__(self) -> None:
+        self._last: list[float] = []
+        self._same = 0
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the magnetometer has repeated the same field in `STUCK` readings."""
+        return self._same >= STUCK
+
+    def accept(self, field: FloatArray) -> bool:
+        """Accept the field (3,) of a reading, and return whether the magnetometer is working, not stuck."""
+        values = field.tolist()
+        self._same, self._last = (self._same + 1 if values == self._last else 0), values
+        return not self.stuck
+
+    def text(self, refused: int) -> str:
+        """Return why the magnetometer is rejected, or an empty text.
+
+        The number `refused` counts the magnetic fields in a row that contradict the estimate.
+        """
+        if self.stuck:
+            return "the magnetometer gives the same field in every reading"
+        return f"{refused} fields in a row contradict the estimate" if refused >= FIELDS_CONTRADICTED else ""

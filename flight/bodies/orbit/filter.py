@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from flight.bodies.orbit.environment import StuckFieldCheck
 from flight.loop.body import ReadingAgreement
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
@@ -476,38 +477,6 @@ class StepReplay:
         if isinstance(measurement, FieldMeasurement):
             return free.field(measurement.field, measurement.reference, measurement.covariance)
         return free.gyro(measurement.rate, measurement.covariance)
-
-
-STUCK, CONTRADICTED = 20, 4
-"""Number of equal magnetic fields in a row, and of contradicting fields in a row, that indicate a fault."""
-
-
-class StuckFieldCheck:
-    """Detects a magnetometer that repeats the same field."""
-
-    def __init__(self) -> None:
-        self._last: list[float] = []
-        self._same = 0
-
-    @property
-    def stuck(self) -> bool:
-        """Whether the magnetometer has repeated the same field in `STUCK` readings."""
-        return self._same >= STUCK
-
-    def accept(self, field: FloatArray) -> bool:
-        """Accept the field (3,) of a reading, and return whether the magnetometer is working, not stuck."""
-        values = field.tolist()
-        self._same, self._last = (self._same + 1 if values == self._last else 0), values
-        return not self.stuck
-
-    def text(self, refused: int) -> str:
-        """Return why the magnetometer is rejected, or an empty text.
-
-        The number `refused` counts the magnetic fields in a row that contradict the estimate.
-        """
-        if self.stuck:
-            return "the magnetometer gives the same field in every reading"
-        return f"{refused} fields in a row contradict the estimate" if refused >= CONTRADICTED else ""
 
 
 _FROM = np.r_[states.ATTITUDE, states.RATE, states.GYRO, states.MAGNET]
