@@ -265,6 +265,7 @@ class FrameStream:
         length_of: Callable[[bytes], int],
         header_bytes: int,
         decode: Callable[[bytes], bytes] = bytes,
+        wrong_bits: int = 0,
     ) -> None:
         """Find frames in a byte stream.
 
@@ -272,10 +273,13 @@ class FrameStream:
             length_of: function that returns the length (bytes) of a frame from its header.
             header_bytes: length (bytes) of the header that `length_of` needs.
             decode: function that returns the frame in the bytes after a sync marker.
+            wrong_bits: maximum number of wrong bits in a sync marker directly after a valid frame.
         """
         self._length_of = length_of
         self._header_bytes = header_bytes
         self._decode = decode
+        self._wrong_bits = wrong_bits
+        self._follows = False  # whether the data begin directly after a frame with a correct CRC
         self._data = b""
 
     def add(self, data: bytes) -> list[bytes]:
@@ -285,7 +289,7 @@ class FrameStream:
         """
         self._data += data
         found: list[bytes] = []
-        while (mark := self._data.find(SYNC)) >= 0:
+        while (mark := self._mark()) >= 0:
             begin = mark + len(SYNC)
             header = self._data[begin : begin + self._header_bytes]
             whole = len(header) == self._header_bytes
@@ -295,9 +299,22 @@ class FrameStream:
                 return found
             frame = self._decode(self._data[begin:end])
             found.append(frame)
-            self._data = self._data[end if crc16(frame) == 0 else begin :]
-        self._data = self._data[1 - len(SYNC) :]
+            self._follows = crc16(frame) == 0
+            self._data = self._data[end if self._follows else begin :]
+        if not self._follows:
+            self._data = self._data[1 - len(SYNC) :]
         return found
+
+    def _mark(self) -> int:
+        """Return the offset of the next sync marker, -1 if there is none in the received data."""
+        if self._follows and self._wrong_bits:
+            if len(self._data) < len(SYNC):
+                return -1
+            wrong = int.from_bytes(self._data[: len(SYNC)], "big") ^ int.from_bytes(SYNC, "big")
+            if wrong.bit_count() <= self._wrong_bits:
+                return 0
+        self._follows = False
+        return self._data.find(SYNC)
 
 
 def telecommand_stream() -> FrameStream:

@@ -121,6 +121,24 @@ def test_telemetry_frames_pass_a_noisy_stream_in_pieces(
     assert [code.decode(code.encode(frame)) for frame in frames] == frames
 
 
+def test_a_marker_with_wrong_bits_is_accepted_only_behind_a_codeblock() -> None:
+    frames = [close_frame(np.random.default_rng(i).bytes(221)) for i in range(5)]
+    code = TelemetryCode(223, "short", 1)
+    marked = [code.marked(frame) for frame in frames]
+    length = 8 * len(marked[0])
+    wrong = [
+        noisy(one, [length - 1 - bit for bit in bits])
+        for one, bits in zip(marked, [(), (3, 9, 31), (), (0, 1, 2, 7), (5,)], strict=True)
+    ]
+    for step in (1, 50, 1000):
+        stream, found = code.stream(), []
+        line = b"".join(wrong)
+        for begin in range(0, len(line), step):
+            found += stream.add(line[begin : begin + step])
+        assert found == frames[:3], "four wrong bits lose the frame, and one loses the next"
+    assert code.stream().add(wrong[1]) == []
+
+
 @given(data=st.binary(min_size=7, max_size=7))
 def test_parity_is_the_remainder_by_the_generator_of_the_standard(data: bytes) -> None:
     """CCSDS 231.0-B-4, 3.3: x^7 + x^6 + x^2 + 1, parity inverted, then a fill bit of 0."""
