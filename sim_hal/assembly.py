@@ -126,11 +126,13 @@ def assemble(
     lines. `expose` and `expose_wide` replace the renderers of the cameras, which in real time run in another
     process. Raises ConfigError for an invalid world.
     """
+    # All devices begin at one instant; in real time the clock runs on while they are built.
+    start_ns = now_ns()
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
     coils = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns)
-    world = make_world(WorldInputs(config, section, coils.circuit.currents, now_ns()))
-    unit = _unit(config, section, world, coils.circuit, line, np.random.default_rng(unit_seed), now_ns())
-    objects = sky_objects(section, now_ns(), world)
+    world = make_world(WorldInputs(config, section, coils.circuit.currents, start_ns))
+    unit = _unit(config, section, world, coils.circuit, line, np.random.default_rng(unit_seed), start_ns)
+    objects = sky_objects(section, start_ns, world)
     camera = None
     if config.camera is not None:
         make = expose or inline_exposure(StarRenderer(config.camera, section.sky, section.seed))
@@ -145,7 +147,7 @@ def assemble(
         )
     orbit = OrbitDevices()
     if config.gps or config.solar_strings or config.wide_cameras:
-        orbit = assemble_orbit(config, section, world, now_ns, gps_line, expose_wide)
+        orbit = assemble_orbit(config, section, world, start_ns, now_ns, gps_line, expose_wide)
     for part in orbit.cells.parts if orbit.cells is not None else ():
         coils.bus.attach(part)
     faults = FaultTimeline()
@@ -360,13 +362,15 @@ def assemble_orbit(
     config: Config,
     section: Simulation,
     world: World,
+    start_ns: int,
     now_ns: Callable[[], int],
     line: SerialEnd | None,
     expose: ExposeWide | None = None,
 ) -> OrbitDevices:
     """Build the devices that need an orbit; `line` is the device end of the GPS receiver's serial line.
 
-    `expose` replaces the renderer of the horizon cameras. Raises ConfigError in a world without an orbit.
+    The world began at the time `start_ns`. `expose` replaces the renderer of the horizon cameras. Raises
+    ConfigError in a world without an orbit.
     """
     from sim_hal.emulators.gps import EmulatedGps, GpsErrors  # noqa: PLC0415 - see above
     from sim_hal.emulators.solar_cells import EmulatedSolarCells, SolarCellsModel  # noqa: PLC0415 - see above
@@ -376,7 +380,7 @@ def assemble_orbit(
     gps, cells = None, None
     if config.gps is not None and line is not None:
         settings = GpsErrors(walk=truth.gps_walk, noise=truth.gps_noise, start=truth.gps_start)
-        gps = EmulatedGps(orbiting(world, "gps"), line, receiver, settings, now_ns())
+        gps = EmulatedGps(orbiting(world, "gps"), line, receiver, settings, start_ns)
     if config.solar_strings is not None:
         strings = config.solar_strings.strings
         model = SolarCellsModel(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,16 +20,17 @@ from hal.interfaces.wires import SECOND_NS, Rig
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.sun import SunSettings, find_sun
-from sim_hal.assembly import wide_model
+from sim_hal.assembly import assemble, wide_model
 from sim_hal.clock import SimClock
 from sim_hal.faults.schedule import parse, put
 from sim_hal.rig import LockStep, build_lockstep, opened_lockstep, utc_ns
 from sim_hal.settings import SkySection
 from sim_hal.star_camera.objects import aberrated, sunlit_ground_angle, view
 from sim_hal.worlds.free_body import FreeBody
-from sim_hal.worlds.world import OrbitEnvironment
+from sim_hal.worlds.world import OrbitEnvironment, OrbitingWorld
 from tests.sim_hal.faults.benches import bench_of
 from tests.support.flights import TEXT, demo_world
 from tests.support.orbit_devices import UTC, at_first, orbit_config, orbit_world
@@ -302,3 +304,33 @@ def test_the_truth_of_the_orbit_is_logged_once_a_second(tmp_path: Path) -> None:
     sizes = [np.linalg.norm(first[f"{cause}_torque"]) for cause in ("dipole", "gravity", "drag", "sunlight")]
     assert all(0.0 < size < 1e-7 for size in sizes)
     assert len(packets["truth"]) == 201
+
+
+class SilentLine:
+    """Device end of a serial line on which nobody sends."""
+
+    baud_rate = 115200
+
+    def next_arrival_ns(self) -> int:
+        return 2**62
+
+    def read(self, now_ns: int) -> bytes:
+        return b""
+
+    def write(self, data: bytes, now_ns: int) -> None:
+        """Discard the data."""
+
+
+def test_a_slow_start_shifts_no_device_in_time() -> None:
+    """In real time the clock runs on while the devices are built, here by half a second at each reading."""
+    clock = itertools.count(10 * SECOND_NS, SECOND_NS // 2)
+    hardware = assemble(orbit_config(), orbit_world(), clock.__next__, SilentLine(), gps_line=SilentLine())
+    world, gps = hardware.world, hardware.orbit.gps
+    assert isinstance(world, OrbitingWorld)
+    assert gps is not None
+    now_ns = 20 * SECOND_NS
+    world.advance_to(now_ns)
+    truth, seen = world.orbit_truth(), gps._measure(now_ns)
+    longitude, latitude, _ = geodetic(celestial_to_terrestrial(truth.utc) @ truth.position)
+    assert seen.longitude * 1e-7 == pytest.approx(math.degrees(longitude), abs=1e-3)
+    assert seen.latitude * 1e-7 == pytest.approx(math.degrees(latitude), abs=1e-3), "0.5 s are 0.034 deg"
