@@ -167,6 +167,7 @@ def _serve(options: argparse.Namespace) -> int:
             "socket": str(server.socket_path),
             "camera": config.camera is not None,
             "gps": server.gps_device,
+            "utc_offset_ns": server.hardware.utc_offset_ns,
             "gps_baud_rate": None if config.gps is None else config.gps.baud_rate,
             "wide": len(config.wide_cameras),
         }

@@ -86,7 +86,10 @@ class OrbitDevices:
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """All simulated devices. Drivers use only I2C bus and camera; faults and tests use all devices."""
+    """All simulated devices. Drivers use only I2C bus and camera; faults and tests use all devices.
+
+    `utc_offset_ns` is the simulated UTC minus the simulation time, or None in a world without an orbit.
+    """
 
     simulation: TimedSimulation
     world: World
@@ -100,6 +103,7 @@ class Hardware:
     faults: FaultTimeline
     orbit: OrbitDevices
     objects: SkyObjects | None
+    utc_offset_ns: int | None
 
     def release(self, epoch_ns: int) -> None:
         """Release the body at mission time zero, which is `epoch_ns`."""
@@ -131,6 +135,7 @@ def assemble(
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
     coils = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns)
     world = make_world(WorldInputs(config, section, coils.circuit.currents, start_ns))
+    utc_offset_ns = world.utc_ns() - start_ns if isinstance(world, OrbitingWorld) else None
     unit = _unit(config, section, world, coils.circuit, line, np.random.default_rng(unit_seed), start_ns)
     objects = sky_objects(section, start_ns, world)
     camera = None
@@ -169,6 +174,7 @@ def assemble(
         faults,
         orbit,
         objects,
+        utc_offset_ns,
     )
 
 

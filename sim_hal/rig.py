@@ -65,7 +65,7 @@ FARTHEST_ELEMENTS = 100e3
 """Largest accepted distance (m) of the two-line elements from the first revolution of the simulated orbit."""
 _START_S = 20.0
 """Longest time (s) that the server process may take to start."""
-_FACTS = ("serial", "baud_rate", "socket", "camera", "gps", "gps_baud_rate", "wide")
+_FACTS = ("serial", "baud_rate", "socket", "camera", "gps", "gps_baud_rate", "wide", "utc_offset_ns")
 OPENER = "sim_hal.serving.device_link:open_bus"
 
 
@@ -272,6 +272,19 @@ def opened_lockstep(config: Config, section: Simulation, folder: Path) -> Iterat
         log.close()
 
 
+class SimulatedUtcClock(SystemClock):
+    """Clock of the machine whose UTC is that of a simulated orbit."""
+
+    def __init__(self, offset_ns: int) -> None:
+        """`offset_ns` is the simulated UTC minus CLOCK_MONOTONIC, ns."""
+        super().__init__()
+        self._offset_ns = offset_ns
+
+    def utc_ns(self) -> int:
+        """Return the simulated UTC in ns since 1970."""
+        return self.now_ns() + self._offset_ns
+
+
 class RemoteFrameSource:
     """Client of a camera in the server process, which announces frames whose pixels are read from files."""
 
@@ -381,7 +394,8 @@ def running_server(facts_path: Path) -> Iterator[Served]:
 @contextmanager
 def _connected(facts: dict[str, Any]) -> Iterator[Served]:
     """Connect to the device server that a facts file describes."""
-    clock = SystemClock()
+    offset_ns = facts["utc_offset_ns"]
+    clock = SystemClock() if offset_ns is None else SimulatedUtcClock(offset_ns)
     path = Path(facts["socket"])
     with ExitStack() as stack:
         serial = PySerialPort(facts["serial"], facts["baud_rate"], clock)

@@ -116,7 +116,14 @@ def test_a_file_that_names_no_server_is_refused(tmp_path: Path, facts: str | Non
 def test_a_server_that_has_gone_is_said_so(tmp_path: Path) -> None:
     path = tmp_path / "facts.json"
     unit = {"serial": "/dev/ptmx", "baud_rate": 115200, "camera": False}
-    gone = {**unit, "socket": str(tmp_path / "gone"), "gps": None, "gps_baud_rate": 0, "wide": []}
+    gone = {
+        **unit,
+        "socket": str(tmp_path / "gone"),
+        "gps": None,
+        "gps_baud_rate": 0,
+        "wide": [],
+        "utc_offset_ns": None,
+    }
     path.write_text(json.dumps(gone), encoding="utf-8")
     request = RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path)
     with path.open(encoding="utf-8") as held:

@@ -81,7 +81,9 @@ def test_receiver_strings_and_wide_cameras_answer_in_real_time_with_their_faults
                     frames[number] = frame
             time.sleep(0.02)
         reading = strings.latest()
+        host_ns = served.clock.utc_ns() - (served.clock.now_ns() - fixes[0].time_ns)
     assert fixes[0].valid
+    assert abs(host_ns - fixes[0].utc_ns) < PATIENCE_S * SECOND_NS, "the host has the simulated UTC too"
     assert not fixes[-1].valid
     assert frames[0].pixels.shape == (128, 128)
     assert frames[0].pixels.any()
