@@ -85,6 +85,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--satellite", type=int, metavar="NUMBER", help="with --read: satellite number, if there are several"
     )
+    _add_orbit(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(command=run)
+
+
+def _add_orbit(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that describe an orbit."""
     orbit = parser.add_argument_group("with --altitude")
     orbit.add_argument("--inclination", type=finite, metavar="DEG", help="required")
     orbit.add_argument("--epoch", metavar="UTC", help="required, such as 2026-03-20T12:00:00")
@@ -96,8 +103,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     orbit.add_argument("--perigee", type=finite, metavar="DEG", help="argument of perigee (0)")
     orbit.add_argument("--anomaly", type=finite, metavar="DEG", help="true anomaly at the epoch (0)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(command=run)
 
 
 def run(options: argparse.Namespace) -> int:

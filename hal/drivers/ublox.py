@@ -19,6 +19,8 @@ from __future__ import annotations
 import math
 import re
 import struct
+from calendar import monthrange
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import reduce
@@ -482,27 +484,16 @@ def reading_of(
             1024 weeks, and any other date outside the following 1024 weeks is impossible.
         length: length of the payload, bytes.
     """
-    limits: tuple[tuple[str, float, float, float, str], ...] = (
+    limits = (
         ("latitude", pvt.latitude * 1e-7, -90.0, 90.0, "deg"),
         ("longitude", pvt.longitude * 1e-7, -180.0, 180.0, "deg"),
         ("height", pvt.height * 1e-3, -1e4, _HIGHEST, "m"),
         ("speed", 1e-3 * math.hypot(*pvt.velocity), 0.0, _FASTEST, "m/s"),
     )
-    for name, value, low, high, unit in limits:
-        if not low <= value <= high:
-            raise OutOfRange(DEVICE, name, value, low, high, unit)
+    _require(limits)
     position, axes = _position(pvt)
     timed = pvt.valid & DATE_AND_TIME == DATE_AND_TIME
-    told_ns = _utc_ns(pvt) if timed else 0
-    utc_ns = (
-        told_ns + ROLLOVER_NS if timed and earliest_ns - ROLLOVER_NS <= told_ns < earliest_ns else told_ns
-    )
-    if timed and not earliest_ns <= utc_ns < earliest_ns + ROLLOVER_NS:
-        first, last = (
-            datetime.fromtimestamp(limit_ns // SECOND_NS, UTC).year
-            for limit_ns in (earliest_ns, earliest_ns + ROLLOVER_NS)
-        )
-        raise OutOfRange(DEVICE, "year", pvt.date[0], first, last, "")
+    utc_ns, rolled_over = _utc_ns(pvt, earliest_ns) if timed else (0, False)
     accuracies = pvt.horizontal, pvt.vertical
     known = not {0, UNKNOWN_ACCURACY}.intersection(accuracies)
     speed_known = pvt.speed_accuracy not in {0, UNKNOWN_ACCURACY}
@@ -519,18 +510,41 @@ def reading_of(
         and pvt.fix == THREE_DIMENSIONS
         and bool(pvt.flags & FIX_OK)
         and not pvt.flags3 & INVALID_POSITION,
-        rolled_over=utc_ns != told_ns,
+        rolled_over=rolled_over,
     )
 
 
-def _utc_ns(pvt: Pvt) -> int:
+def _require(limits: Iterable[tuple[str, float, float, float, str]]) -> None:
+    """Raise OutOfRange for the first value out of bounds: name, value, lower and upper bound, unit."""
+    for name, value, low, high, unit in limits:
+        if not low <= value <= high:
+            raise OutOfRange(DEVICE, name, value, low, high, unit)
+
+
+def _utc_ns(pvt: Pvt, earliest_ns: int) -> tuple[int, bool]:
+    """Return UTC (ns since 1970) and whether it was moved by 1024 weeks. Raises OutOfRange."""
     year, month, day, hour, minute, second = pvt.date
-    try:
-        # Second 60 is a leap second, which is converted to the first second of the next minute.
-        whole = datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC).timestamp()
-    except ValueError as error:
-        raise OutOfRange(DEVICE, "year", year, 1999, 2099, "") from error
-    return round(whole) * SECOND_NS + (second > 59) * SECOND_NS + pvt.nano
+    _require((("year", year, 1970, 2200, ""), ("month", month, 1, 12, "")))
+    _require(
+        (
+            ("day", day, 1, monthrange(year, month)[1], ""),
+            ("hour", hour, 0, 23, ""),
+            ("minute", minute, 0, 59, ""),
+            ("second", second, 0, 60, ""),
+        )
+    )
+    # Second 60 is a leap second, which is converted to the first second of the next minute.
+    whole = datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC).timestamp()
+    utc_ns = round(whole) * SECOND_NS + (second > 59) * SECOND_NS + pvt.nano
+    if earliest_ns - ROLLOVER_NS <= utc_ns < earliest_ns:
+        return utc_ns + ROLLOVER_NS, True
+    last_ns = earliest_ns + ROLLOVER_NS
+    if not earliest_ns <= utc_ns < last_ns:
+        first, last = (
+            datetime.fromtimestamp(limit // SECOND_NS, UTC).year for limit in (earliest_ns, last_ns)
+        )
+        raise OutOfRange(DEVICE, "year", year, first, last, "")
+    return utc_ns, False
 
 
 def _position(pvt: Pvt) -> tuple[FloatArray, FloatArray]:

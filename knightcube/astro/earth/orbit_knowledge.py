@@ -295,7 +295,7 @@ def check_lines(first: str, second: str) -> None:
     """
     for number, line in enumerate((first, second), 1):
         _check_line(number, line)
-    if first[2:7] != second[2:7]:
+    if first[2:7].lstrip(" 0") != second[2:7].lstrip(" 0"):
         raise UsageError(
             f"{second!r}: line 2, columns 3 to 7: satellite number {second[2:7]}, but line 1 has "
             f"{first[2:7]}: take both lines from one element set"

@@ -192,6 +192,28 @@ def test_a_date_that_no_rollover_explains_is_refused(year: int) -> None:
     assert ROLLOVER_NS == 1024 * 7 * 86_400 * SECOND_NS
 
 
+@pytest.mark.parametrize(
+    ("date", "name"),
+    [
+        ((0, 1, 1, 0, 0, 0), "year = 0"),
+        ((2026, 13, 1, 0, 0, 0), "month = 13"),
+        ((2026, 2, 29, 0, 0, 0), "day = 29"),
+        ((2028, 2, 30, 0, 0, 0), "day = 30"),
+        ((2026, 3, 1, 24, 0, 0), "hour = 24"),
+        ((2026, 3, 1, 23, 60, 0), "minute = 60"),
+        ((2026, 3, 1, 23, 59, 61), "second = 61"),
+    ],
+)
+def test_the_impossible_part_of_a_date_is_named(date: tuple[int, int, int, int, int, int], name: str) -> None:
+    with pytest.raises(OutOfRange, match=name):
+        reading_of(replace(PVT, date=date), 0, 115200)
+
+
+def test_a_leap_second_is_the_first_second_of_the_next_minute() -> None:
+    leap = reading_of(replace(PVT, date=(2035, 6, 30, 23, 59, 60), nano=0), 0, 115200)
+    assert utc(leap) == datetime(2035, 7, 1, tzinfo=UTC)
+
+
 @pytest.mark.parametrize("protocol", [14.0, 18.0, 27.12, 32.0, 34.1])
 def test_each_generation_is_set_up_at_once(protocol: float) -> None:
     gps = bench()

@@ -145,6 +145,10 @@ def test_alpha_5_numbers_are_read(text: str, number: int) -> None:
     assert far((first, second), LINES) == 0.0
 
 
+def test_one_number_may_be_padded_by_blanks_and_by_zeros() -> None:
+    TwoLineElements(with_columns(LINES[0], 3, "    5"), with_columns(LINES[1], 3, "00005"))
+
+
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(
     ("field", "value", "complaint"),
