@@ -1,4 +1,4 @@
-"""A satellite in orbit with three coils, built from its configuration, with its telemetry packets and texts.
+"""A satellite in orbit with two to six coils, built from its configuration, with its packets and texts.
 
 The satellite detumbles with magnetometer and gyro, acquires its attitude with the coils off, and points.
 `ORBIT` builds it.

@@ -86,16 +86,25 @@ def test_samples_that_come_in_a_burst_are_those_of_the_commands_of_their_time() 
 class Orbiting:
     """A tumbling 1U in 37 uT with coils on and off; at the magnetometer their field is twice the Earth's."""
 
-    def __init__(self, signs: FloatArray, speed: float = 1.0, tumble_rate: float = math.inf) -> None:
+    def __init__(
+        self,
+        signs: FloatArray,
+        speed: float = 1.0,
+        tumble_rate: float = math.inf,
+        dipoles: FloatArray | None = None,
+    ) -> None:
+        """Use the `dipoles` (3, n) per ampere, or else those of coils along the body axes."""
         self.signs, self.rate = signs, speed * np.array([0.08, -0.1, 0.07])
+        self._dipoles = 0.65 * np.eye(3) if dipoles is None else dipoles
+        self._allocation = 0.65 * np.linalg.pinv(self._dipoles)
         settings = ResponseSettings(
-            INERTIAS, 0.65, 2.8e-4, bin_samples=16, bins=40, least_bins=20, model_error=2e-4, torsion=1e-6,
-            damping=1e-4, settle_ns=100_000_000,
+            INERTIAS, self._dipoles, 2.8e-4, bin_samples=16, bins=40, least_bins=20, model_error=2e-4,
+            torsion=1e-6, damping=1e-4, settle_ns=100_000_000,
         )  # fmt: skip
         self.response = CoilResponse(settings)
         slow = replace(settings, bin_samples=40, least_bins=8, model_error=3e-5)
         self.watch = CoilMonitor(
-            CoilMonitorSettings((0.148, 0.148, 0.148), slow=slow, tumble_rate=tumble_rate)
+            CoilMonitorSettings((0.148,) * len(signs), slow=slow, tumble_rate=tumble_rate)
         )
         self.moments = MOMENTS
         self._noise = np.random.default_rng(4)
@@ -110,16 +119,16 @@ class Orbiting:
             wanted = 0.14 * np.sign([math.sin(0.7 * time), math.cos(0.5 * time), 1.0])
             if weak:
                 wanted = 0.014 * np.sin([0.2 * time, 0.13 * time + 1.0, 0.17 * time + 2.0])
-            wanted = np.where(self.watch.resting, 0.0, wanted)
-            currents = self.watch.correction.wire(wanted) if within >= 8 else np.zeros(3)
+            wanted = np.where(self.watch.resting, 0.0, self._allocation @ wanted)
+            currents = self.watch.correction.wire(wanted) if within >= 8 else np.zeros(len(wanted))
             self.response.commanded(now_ns, tuple(currents.tolist()))
             self.watch.commanded(now_ns, currents)
             for _ in range(5):
-                torque = _cross(0.65 * self.signs * currents, self._field)
+                torque = _cross(self._dipoles @ (self.signs * currents), self._field)
                 torque = torque - _cross(self.rate, self.moments * self.rate)
                 self.rate = self.rate + 5e-3 * torque / self.moments
                 self._field = self._field - 5e-3 * _cross(self.rate, self._field)
-            seen = self._field + 5e-4 * self.signs * currents
+            seen = self._field + 7.7e-4 * self._dipoles @ (self.signs * currents)
             noise = 2.8e-4 * self._noise.standard_normal(3)
             self.response.observe_motion(now_ns + TICK_NS, self.rate + noise, seen)
             self.watch.observe_motion(now_ns + TICK_NS, self.rate + noise, seen)
@@ -149,6 +158,19 @@ def test_of_a_free_body_a_reversed_coil_is_found_though_its_field_swamps_the_mag
     broken = Orbiting(signs)
     broken.fly(60.0)
     assert broken.response.axes(Finding.REVERSED) == [axis]
+
+
+PYRAMID = 0.4 * np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
+
+
+@pytest.mark.parametrize("reversed_coil", [None, 0, 3])
+def test_of_four_coils_the_reversed_one_is_found(reversed_coil: int | None) -> None:
+    """The four currents always make a dipole together, so that they depend on each other."""
+    signs = np.where(np.arange(4) == reversed_coil, -1.0, 1.0)
+    flown = Orbiting(signs, dipoles=PYRAMID)
+    flown.fly(60.0)
+    assert flown.response.axes(Finding.REVERSED) == ([] if reversed_coil is None else [reversed_coil])
+    assert flown.watch.correction.factors.tolist() == signs.tolist()
 
 
 @pytest.mark.parametrize("gain", [0.0, -1.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,14 @@ def test_a_satellite_with_four_coils_flies_on_when_one_of_them_fails(
     assert int(run["health"]["coils_in_use"][-1]) == 0b0111
     after = told["time_ns"] > event["time_ns"] + 1_000_000_000
     assert not told["command"][after, broken].any()
+    # What the filter has learned of four coils does not hold for three.
+    told_of = run["description"]
+    place = np.searchsorted(told_of["time_ns"], event["time_ns"])
+    learned, anew = told_of["coils_sigma"][place - 1], told_of["coils_sigma"][place]
+    accuracy, left = config.craft.accuracy, config.coils.map().working(np.arange(4) != broken)
+    errors = left.error_covariance(accuracy.coil_gain, math.radians(accuracy.coil_axes_deg))
+    assert (anew > 1.2 * learned).any()
+    assert (anew < 1.001 * np.sqrt(np.diag(errors))).all()
     momentum = np.linalg.norm(run["truth"]["rate"] @ config.craft.inertia_matrix(), axis=1)
     isolated = np.searchsorted(run["truth"]["time_ns"], event["time_ns"])
     seconds = SECONDS - event["time_ns"] * 1e-9

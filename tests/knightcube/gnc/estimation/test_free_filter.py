@@ -208,6 +208,29 @@ def test_the_error_of_a_tilted_coil_is_reset_and_that_of_the_others_is_kept() ->
         assert spread == pytest.approx(scale * along @ prior @ along.T)
 
 
+def test_redundant_coils_start_again_with_the_covariance_of_their_new_allocation() -> None:
+    found = FreeFilter(INERTIA, FreeFilterSettings())
+    prior = found.layout.prior.copy()
+    found.covariance[:] = 0.25 * prior + 1e-9
+    found._constants[COILS] = np.arange(1.0, 10.0)
+    then, changes = found.memory(), found.changes
+    fresh = np.diag(np.arange(1.0, 10.0)) + 0.1
+    found.renew_coils(fresh, [then])
+    others = np.r_[0 : COILS.start, COILS.stop : STATES]
+    for constants, covariance in ((found._constants, found.covariance), (then.constants, then.covariance)):
+        assert not constants[COILS].any()
+        assert covariance[COILS, COILS].tolist() == fresh.tolist()
+        assert not covariance[COILS, others].any()
+        assert not covariance[others, COILS].any()
+        assert covariance[np.ix_(others, others)] == pytest.approx(
+            (0.25 * prior + 1e-9)[np.ix_(others, others)]
+        )
+    assert found.changes == changes + 1
+    known = FreeFilter(INERTIA, EXACT)
+    known.renew_coils(fresh)
+    assert not known.covariance[COILS, COILS].any(), "coils that are known exactly stay known"
+
+
 def test_a_coil_that_is_known_exactly_stays_known() -> None:
     found = FreeFilter(INERTIA, EXACT)
     found.renew_coil(np.eye(3)[0], np.eye(3)[0], 0.3)
