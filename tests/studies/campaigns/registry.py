@@ -7,6 +7,7 @@ from tests.studies.campaigns.campaign import Campaign
 from tests.studies.campaigns.coil_faults import COIL_FAULTS
 from tests.studies.campaigns.controllers import CONTROLLERS_CAMPAIGN
 from tests.studies.campaigns.coverage import COVERAGE
+from tests.studies.campaigns.damaged_files import DAMAGED_FILES
 from tests.studies.campaigns.detumble import DETUMBLE
 from tests.studies.campaigns.eclipse import ECLIPSE
 from tests.studies.campaigns.failures import FAILURES
@@ -17,6 +18,7 @@ from tests.studies.campaigns.first_orbits import FIRST_ORBITS
 from tests.studies.campaigns.frames import FRAMES_CAMPAIGN
 from tests.studies.campaigns.horizon_methods import HORIZON_METHODS
 from tests.studies.campaigns.installer_kill import INSTALLER_KILL
+from tests.studies.campaigns.link_start import LINK_START
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
@@ -71,6 +73,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         FAULTS,
         FAULTS_KILL,
         INSTALLER_KILL,
+        DAMAGED_FILES,
         RESTORED_KEYS,
         RENEWAL_TRIALS,
         PROCESS_KILL,
@@ -80,6 +83,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         UNLIKE_INERTIA,
         SOAK,
         START,
+        LINK_START,
         COVERAGE,
         ORBIT_ATTITUDE,
         ORBIT_FRAMES,
