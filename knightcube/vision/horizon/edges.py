@@ -78,6 +78,7 @@ class ScanLines:
         columns, rows: indices of the columns and of the rows.
         column_bright, row_bright: whether each pixel of the columns and of the rows is bright after the
             majority filter (n, m).
+        column_light, row_light: brightness of the pixels of the columns and of the rows (n, m).
         space: distance between neighbouring columns, and between neighbouring rows, px.
         levels: brightness levels of dark and bright pixels.
     """
@@ -86,6 +87,8 @@ class ScanLines:
     rows: IntArray
     column_bright: BoolArray
     row_bright: BoolArray
+    column_light: FloatArray
+    row_light: FloatArray
     space: float
     levels: Levels
 
@@ -162,7 +165,7 @@ def find_edges(
     span = levels.bright - levels.dark
     threshold = levels.dark + max(settings.threshold * span, _STANDS_OUT * levels.noise)
     bright = [run_filtered(each > threshold, settings.run) for each in light]
-    read = ScanLines(columns, rows, bright[0], bright[1], space, levels)
+    read = ScanLines(columns, rows, bright[0], bright[1], light[0], light[1], space, levels)
     if not levels.bright > levels.dark or not len(columns) + len(rows):
         none = np.zeros(0)
         empty = np.zeros((0, 2))
@@ -317,6 +320,8 @@ def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
 
 _SAMPLE = 32
 """Distance between samples along a scan line (px)."""
+_AVERAGED = 15
+"""Number of pixels along a scan line over which the brightness of a sample is averaged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -340,10 +345,25 @@ class EdgeRays:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Sampled pixels of the scan lines: unit vectors (m, 3), camera axes, and which are bright (m,)."""
+    """Sampled pixels of the scan lines.
+
+    Attributes:
+        rays: unit vectors to the sampled pixels (m, 3), camera axes.
+        bright: whether each sampled pixel is bright (m,).
+        level: mean brightness around each sampled pixel (m,), 0 at the dark level of the image and 1 at the
+            bright level.
+        mottle: curvature of the brightness along the scan line at each sampled pixel (m,), scaled to the
+            standard deviation of `level` for white noise.
+        noise: standard deviation of `level` from the noise of the dark pixels.
+        floor: dark level of the image divided by the bright level.
+    """
 
     rays: FloatArray
     bright: BoolArray
+    level: FloatArray
+    mottle: FloatArray
+    noise: float
+    floor: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -386,9 +406,12 @@ def observe(
         sampled, imaged = _sample_rays(
             Lens.of(camera), tuple(lines.columns.tolist()), tuple(lines.rows.tolist())
         )
-        binary = (lines.column_bright, lines.row_bright)
+        binary, lit = (lines.column_bright, lines.row_bright), (lines.column_light, lines.row_light)
         bright = np.concatenate([each[:, _sample_places(each.shape[1])].ravel() for each in binary])
-        samples = Samples(sampled, bright[imaged])
+        level, mottle = np.concatenate([_sample_levels(each, lines.levels) for each in lit], axis=1)
+        noise = lines.levels.noise / (_span(lines.levels) * _AVERAGED**0.5)
+        floor = lines.levels.dark / lines.levels.bright if lines.levels.bright > 0.0 else 0.0
+        samples = Samples(sampled, bright[imaged], level[imaged], mottle[imaged], noise, floor)
     pixel = np.sqrt(np.einsum("ij,ij->i", brighter, brighter))
     return Observation(lines.space, edges, EdgeRays(here, brighter, pixel), across, down, samples)
 
@@ -396,6 +419,23 @@ def observe(
 def _sample_places(size: int) -> IntArray:
     """Return the positions (px) of the sampled pixels along a scan line of `size` px."""
     return np.arange(_SAMPLE // 2, size, _SAMPLE * max(1, size // 512))
+
+
+def _span(levels: Levels) -> float:
+    """Return the difference between bright and dark level of an image; infinite if no pixel is bright."""
+    return levels.bright - levels.dark if levels.bright > levels.dark else float("inf")
+
+
+def _sample_levels(light: FloatArray, levels: Levels) -> FloatArray:
+    """Return level and mottle (2, k) of the sampled pixels of scan lines (n, m), as defined by `Samples`."""
+    size, half = light.shape[1], _AVERAGED // 2
+    index = _sample_places(size)[:, None] + np.arange(-half, half + 1)
+    before, here, after = (
+        light[:, np.clip(index + step, 0, size - 1)].mean(axis=2).ravel()
+        for step in (-_AVERAGED, 0, _AVERAGED)
+    )
+    mottle = (before - 2.0 * here + after) / 6.0**0.5
+    return np.stack([here - levels.dark, mottle]) / _span(levels)
 
 
 @lru_cache(maxsize=8)

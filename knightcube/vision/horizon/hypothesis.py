@@ -24,6 +24,7 @@ from knightcube.vision.horizon.illumination import (
     agreement,
     limb_rays,
     sun_elevation,
+    why_not_space,
 )
 from knightcube.vision.horizon.initial_guess import SPHERE_ALTITUDE_SIGMA, InitialGuess, sun_from
 from knightcube.vision.horizon.limb import (
@@ -235,6 +236,7 @@ class Hypothesis:
         chance: log10 of the expected number of equally good chance horizons, from `log10_chance`.
         breadth: median width of the edges on the horizon, relative to the width expected from the air's
             brightness profile.
+        not_space: why the image beyond the horizon is not space, or an empty string if it may be space.
         altitude_off: distance of a fitted altitude from the range `HorizonSettings.altitudes`, in standard
             deviations of the altitude; 0 if the altitude is known.
     """
@@ -250,6 +252,7 @@ class Hypothesis:
     allowance: float
     chance: float
     breadth: float
+    not_space: str
     altitude_off: float
 
     @property
@@ -282,7 +285,8 @@ def examine(
     night = 0.0
     if sun is not None and np.any(members):
         night = float(np.mean(sun_elevation(view, observation.rays.rays[members], sun) < _NIGHT))
-    air = UNIT_DEPTH_HEIGHT / (view.limb_distance * float(np.median(observation.rays.pixel[used])))
+    pixel = float(np.median(observation.rays.pixel[used]))
+    air = UNIT_DEPTH_HEIGHT / (view.limb_distance * pixel)
     altitude_off = 0.0
     if not altitude_known:
         (low, high), altitude = settings.altitudes, view.surface.height_of(view.position)
@@ -309,6 +313,7 @@ def examine(
         settings.sphere_sigma if np.isinf(stand.sigma) else 0.0,
         chance + math.log10(stand.share),
         float(np.median(observation.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma),
+        why_not_space(view, sun, observation.samples, pixel),
         altitude_off,
     )
 

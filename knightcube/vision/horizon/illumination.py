@@ -12,6 +12,8 @@ Earth's disc are bright. The coarse nadir is the mean of the trial directions, w
 given the samples, and the covariance of the nadir is the spread of the weighted directions. If the direction
 of the Sun is unknown, any sample on the Earth's disc may be dark.
 
+The function `why_not_space` tests whether the dark side of an assumed limb looks like space.
+
 The function `why_false` compares an image with the view from a known attitude. An image contradicts the
 attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be. An
 image that contradicts the attitude is taken by a camera that is dead, blinded, mounted upside down or sends
@@ -92,6 +94,48 @@ def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agree
     darks, lits = int(np.count_nonzero(dark)), int(np.count_nonzero(lit))
     stray = float(np.count_nonzero(bright & dark)) / max(darks, 1)
     return Agreement(stray, float(np.count_nonzero(lit & ~bright)) / max(lits, 1), darks, lits)
+
+
+_LEAST_SKY = 8
+"""Minimum number of samples in the sky to judge whether the sky is space."""
+_CLEAR = 24.0
+"""Distance from the limb (px) beyond which no pixel that contributes to a sample images the Earth."""
+_DARKEST = 0.15
+"""Largest median brightness of space, as a fraction of the range from the dark to the bright level."""
+_BLACKEST = 0.35
+"""Largest dark level of an image of space, as a fraction of the bright level."""
+_SMOOTHEST, _NOISES = 0.01, 2.0
+"""Largest mottle of space: an absolute value, and a multiple of the noise of a sample."""
+
+
+def why_not_space(view: LimbView, sun: FloatArray | None, samples: Samples, pixel: float) -> str:
+    """Return why the image beyond an assumed limb is not space, or an empty string if it may be space.
+
+    Space is dark and has no texture beyond the noise of the detector. Stray light is smooth. Ground below a
+    bright sky, and clouds, have texture. Medians are compared, so that stars and structure of the spacecraft
+    in less than half of the sky have no effect.
+
+    Args:
+        view: assumed view of the Earth.
+        sun: unit vector (3,) to the Sun in inertial axes, or None if unknown.
+        samples: sampled pixels of the image.
+        pixel: angular size of a pixel, rad.
+    """
+    sky = limb_residuals(view, samples.rays) > np.arctan(_ATMOSPHERE / view.limb_distance) + _CLEAR * pixel
+    if sun is not None:
+        sky &= samples.rays @ (view.rotation @ sun) < np.cos(GLARE)
+    if np.count_nonzero(sky) < _LEAST_SKY:
+        return ""
+    if samples.floor > _BLACKEST:
+        return f"the darkest pixels have {100.0 * samples.floor:.0f} % of the brightness of its bright side"
+    level = float(np.median(samples.level[sky]))
+    if level > _DARKEST:
+        return f"half of its dark side is brighter than {100.0 * level:.0f} % of its bright side"
+    # The median absolute value of Gaussian noise is 0.6745 standard deviations.
+    mottle = float(np.median(np.abs(samples.mottle[sky]))) / 0.6745
+    if mottle > max(_SMOOTHEST, _NOISES * samples.noise):
+        return f"its dark side has a texture of {100.0 * mottle:.1f} % of the contrast, like ground or clouds"
+    return ""
 
 
 def limb_rays(view: LimbView, count: int) -> FloatArray:

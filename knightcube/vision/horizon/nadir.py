@@ -6,9 +6,9 @@
 
 `find_nadir` finds edges on scan lines and cones with which many edges agree, and fits the ellipsoid's limb to
 the edges of each cone. Each fitted limb is tested against chance edges, the width of the atmosphere's
-brightness profile, the brightness of the whole image, the coarse sensors and the rough attitude. If exactly
-one limb passes all tests, this limb gives the nadir. If several limbs pass all tests, the image is ambiguous.
-If no limb passes all tests, the image is refused and the reason is stated.
+brightness profile, the darkness of space, the brightness of the whole image, the coarse sensors and the
+rough attitude. If exactly one limb passes all tests, this limb gives the nadir. If several limbs pass all
+tests, the image is ambiguous. If no limb passes all tests, the image is refused and the reason is stated.
 
 The function `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four
 cameras). The nadirs found by different cameras must agree. An image that gave no nadir, or several nadirs, is
@@ -228,10 +228,13 @@ class _Search:
     def solution(self) -> HorizonSolution:
         """Return the result of the horizon search."""
         points, hypotheses = self.observation.edges.points, self.hypotheses
-        if not hypotheses:
+        if not hypotheses or hypotheses[0].not_space:
+            reason = f"no significant horizon among {len(points)} edges"
+            if hypotheses:
+                reason = f"the best line of edges is not the limb: {hypotheses[0].not_space}"
             return HorizonSolution(
                 HorizonStatus.NO_HORIZON,
-                f"no significant horizon among {len(points)} edges",
+                reason,
                 points=points,
                 on_horizon=np.zeros(len(points), dtype=bool),
                 pixels_read=self.read,
@@ -366,7 +369,7 @@ def _flaw(one: Hypothesis) -> str:
         return f"only {100.0 * one.coverage:.0f} % of the sunlit limb in the image show an edge"
     if one.night > _NIGHT:
         return f"{100.0 * one.night:.0f} % of the horizon's points lie on the night side"
-    return ""
+    return one.not_space
 
 
 def _measurement(fit: FittedLimb, covariance: FloatArray, located: bool, residual: float) -> NadirMeasurement:

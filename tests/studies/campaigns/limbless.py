@@ -147,9 +147,31 @@ def flares(size: Size, generator: np.random.Generator) -> FloatArray:
     return np.asarray(light)
 
 
+def day_sky(size: Size, generator: np.random.Generator) -> FloatArray:
+    """Return a bright sky over darker textured ground, with hills, trees or clouds, as aircraft see it."""
+    x, y = _turned(size, generator) if generator.random() < 0.5 else _level(size)
+    bend = generator.choice([0.01, 0.1]) * generator.normal() * x**2
+    walk = generator.choice([0.0, 0.003, 0.01, 0.04]) * spectral_noise(
+        size, generator.uniform(1.0, 2.0), generator
+    )
+    below = y - generator.uniform(-0.7, 0.7) + bend + walk
+    haze = np.exp(-np.abs(below) / generator.uniform(0.02, 0.5))
+    sky = generator.uniform(0.5, 0.9) + generator.uniform(-0.3, 0.3) * haze
+    if generator.random() < 0.3:
+        sky = sky + generator.uniform(0.02, 0.15) * spectral_noise(
+            size, generator.uniform(1.2, 2.2), generator
+        )
+    texture = spectral_noise(size, generator.uniform(0.8, 1.6), generator)
+    ground = generator.uniform(0.08, 0.4) * (1.0 + generator.uniform(0.05, 0.4) * texture)
+    ground = ground + generator.uniform(0.0, 0.2) * haze
+    soft = generator.uniform(0.002, 0.02)
+    share = np.clip(0.5 + below / soft, 0.0, 1.0)
+    return np.asarray(np.clip(sky + (ground - sky) * share, 0.0, None))
+
+
 MAKERS: dict[str, Maker] = {
     each.__name__: each
-    for each in (clouds, coast, terminator, bands, gradient, flat, noise, stars, marks, flares)
+    for each in (clouds, coast, terminator, bands, gradient, flat, noise, stars, marks, flares, day_sky)
 }
 
 
@@ -167,3 +189,10 @@ def _turned(size: Size, generator: np.random.Generator) -> tuple[FloatArray, Flo
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, columns), np.linspace(-1.0, 1.0, rows))
     turn = generator.uniform(0.0, 2.0 * np.pi)
     return x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
+
+
+def _level(size: Size) -> tuple[FloatArray, FloatArray]:
+    """Return two coordinates (rows, columns) of -1 to 1 along the rows and the columns."""
+    rows, columns = size
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, columns), np.linspace(-1.0, 1.0, rows))
+    return x, y

@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir
+from knightcube.vision.horizon.settings import HorizonKnowledge
 from tests.studies.campaigns.false_horizons import FALSE_HORIZONS, HARD, run
-from tests.studies.campaigns.limbless import MAKERS
+from tests.studies.campaigns.limbless import MAKERS, photographed
 
 SEED = 3
 # Each gave a horizon, with the altitude known or without, before chance was counted.
@@ -27,3 +31,18 @@ def test_pictures_that_once_gave_a_horizon_give_none_and_a_crescent_is_found(tmp
     summary = FALSE_HORIZONS.summarise(results, tmp_path)
     json.dumps(summary.facts, allow_nan=False)
     assert (summary.facts["false"], summary.facts["empty"]) == (0, len(FALSE_ONCE))
+
+
+@pytest.mark.parametrize("seed", [3, 7, 8, 42])
+def test_a_rendered_day_sky_shows_no_horizon_and_the_reason_is_stated(seed: int) -> None:
+    """Edges of each picture form a significant horizon at some field of view, but no side of it is space."""
+    draw = np.random.default_rng([77, seed])
+    picture = photographed(MAKERS["day_sky"]((480, 640), draw), draw)
+    reasons = []
+    for field in (12.0, 30.0, 70.0):
+        camera = Pinhole.from_field_of_view(640, 480, np.radians(field))
+        for altitude in (None, 515e3):
+            found = find_nadir(picture, camera, HorizonKnowledge(altitude=altitude))
+            assert found.status is HorizonStatus.NO_HORIZON, (field, altitude, found.reason)
+            reasons.append(found.reason)
+    assert any("not the limb" in reason for reason in reasons)

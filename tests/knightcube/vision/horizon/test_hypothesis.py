@@ -91,3 +91,17 @@ def test_clouds_below_a_real_limb_show_no_horizon_of_their_own() -> None:
         camera = Pinhole.from_field_of_view(1024, 544, np.radians(6.4))
         found = find_nadir(crop, camera, HorizonKnowledge(altitude=515e3))
         assert found.status is not HorizonStatus.FOUND
+
+
+@pytest.mark.parametrize("field", [8.0, 12.8, 16.0, 30.0, 67.0])
+def test_a_bright_day_sky_over_ground_shows_no_horizon(field: float) -> None:
+    """In the photograph of an aircraft, the bright side is the sky and the dark side is textured ground."""
+    path = DATA / "limb/day_sky_uav.jpg"
+    if not path.exists():
+        pytest.skip("needs ../shared/data/limb")
+    pixels = read_image(path)
+    for picture in (pixels, pixels[::-1], pixels.T):
+        camera = Pinhole.from_field_of_view(*picture.shape[::-1], np.radians(field))
+        for altitude in (None, 350e3, 515e3):
+            found = find_nadir(picture, camera, HorizonKnowledge(altitude=altitude))
+            assert found.status is HorizonStatus.NO_HORIZON, (altitude, found.reason)

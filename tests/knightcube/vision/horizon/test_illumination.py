@@ -17,6 +17,7 @@ from knightcube.vision.horizon.illumination import (
     coarse_nadir,
     image_brightness,
     why_false,
+    why_not_space,
 )
 from knightcube.vision.horizon.limb import MEAN_RADIUS, LimbView, mean_sphere
 from knightcube.vision.horizon_camera_job import SUNLIT_COUNTS
@@ -29,6 +30,12 @@ CAMERA = MountedCamera(PINHOLE, np.array([0.0, 0.0, 0.0, 1.0]))
 AWAY = 1.496e11
 ERROR = math.radians(0.3)
 """Error (rad per axis) of the attitude that judges the images."""
+
+
+def _samples(rays: FloatArray, bright: bool) -> Samples:
+    """Return samples at `rays` (m, 3), all bright or all dark."""
+    count = len(rays)
+    return Samples(rays, np.full(count, bright), np.full(count, float(bright)), np.zeros(count), 0.0, 0.0)
 
 
 def view(seed: int) -> tuple[Image, FloatArray, float, FloatArray]:
@@ -159,7 +166,7 @@ def test_samples_are_compared_by_day_by_night_and_above_the_air(
     view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
     sun = sun_at(math.radians(elevation_deg), min(angle, LIMB - 1e-9))
     for bright in (True, False):
-        found = agreement(view, sun, Samples(at(angle), np.array([bright])))
+        found = agreement(view, sun, _samples(at(angle), bright))
         assert (found.dark_samples, found.lit_samples) == (dark, lit)
         assert (found.stray, found.missing) == (float(bright and dark == 1), float(not bright and lit == 1))
 
@@ -168,8 +175,8 @@ def test_samples_are_compared_by_day_by_night_and_above_the_air(
 def test_the_surroundings_of_the_sun_are_not_compared(apart_deg: float, count: int) -> None:
     view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
     sun = at(2.0 + math.radians(apart_deg))[0]
-    assert agreement(view, sun, Samples(at(2.0), np.array([True]))).dark_samples == count
-    assert agreement(view, None, Samples(at(2.0), np.array([True]))).dark_samples == 1
+    assert agreement(view, sun, _samples(at(2.0), True)).dark_samples == count
+    assert agreement(view, None, _samples(at(2.0), True)).dark_samples == 1
 
 
 def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> None:
@@ -208,3 +215,31 @@ def test_the_samples_of_an_image_stand_in_the_middle_of_its_cells() -> None:
     assert look.rays == pytest.approx(PINHOLE.unit_vectors(points))
     assert look.bright.tolist() == ((points[:, 0] == 40.0) & (points[:, 1] < 64.0)).tolist()
     assert look.share == 4.0 / 64.0
+
+
+@pytest.mark.parametrize(
+    ("level", "mottle", "noise", "floor", "complaint"),
+    [
+        (0.0, 0.0, 0.0, 0.0, ""),
+        (0.1, 0.0, 0.0, 0.3, ""),
+        (0.0, 0.03, 0.02, 0.0, ""),
+        (0.2, 0.0, 0.0, 0.0, "brighter than 20 %"),
+        (0.05, 0.03, 0.01, 0.0, "texture of 3.0 %"),
+        (0.0, 0.0, 0.0, 0.4, "darkest pixels have 40 %"),
+    ],
+    ids=("black", "stray light", "noise", "bright", "ground", "haze"),
+)
+def test_space_is_dark_and_has_no_texture_beyond_the_noise(
+    level: float, mottle: float, noise: float, floor: float, complaint: str
+) -> None:
+    assumed = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
+    angles = LIMB + np.linspace(0.1, 0.5, 40)
+    rays = np.concatenate([at(float(angle)) for angle in angles] + [at(0.3)] * 100)
+    draw = np.random.default_rng(2)
+    # A quarter of the sky shows bright structure, and the ground below the limb is bright and has texture.
+    levels = np.where(np.arange(len(rays)) < 10, 1.0, np.where(np.arange(len(rays)) < 40, level, 1.0))
+    texture = np.where(np.arange(len(rays)) < 40, 0.6745 * mottle * draw.choice([-1.0, 1.0], len(rays)), 1.0)
+    samples = Samples(rays, levels > 0.3, levels, texture, noise, floor)
+    found = why_not_space(assumed, None, samples, 1e-4)
+    assert (found == "") == (complaint == "")
+    assert complaint in found
