@@ -101,7 +101,8 @@ def test_a_bright_day_sky_over_ground_shows_no_horizon(field: float) -> None:
         pytest.skip("needs ../shared/data/limb")
     pixels = read_image(path)
     for picture in (pixels, pixels[::-1], pixels.T):
-        camera = Pinhole.from_field_of_view(*picture.shape[::-1], np.radians(field))
+        rows, columns = picture.shape
+        camera = Pinhole.from_field_of_view(columns, rows, np.radians(field))
         for altitude in (None, 350e3, 515e3):
             found = find_nadir(picture, camera, HorizonKnowledge(altitude=altitude))
             assert found.status is HorizonStatus.NO_HORIZON, (altitude, found.reason)
