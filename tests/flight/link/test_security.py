@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from flight.link.frames import close_frame
@@ -57,6 +58,43 @@ def test_the_frame_is_that_of_the_standard_byte_by_byte(ground: Vault) -> None:
     assert frame[11:19] == (1).to_bytes(8, "big"), "the counter follows 4 random bytes"
     covered = bytes([0, 0, frame[2] & 0xFC, 0, 0]) + b"\0\1" + bytes(12)
     assert AESGCM(KEYS[1]).decrypt(frame[7:19], frame[19:-2], covered) == b"second"
+
+
+def gmac(key: bytes, nonce: bytes, data: bytes) -> bytes:
+    """Return the tag of AES-GMAC by its definition (NIST SP 800-38D, sections 6.3, 6.4 and 7.1)."""
+
+    def encrypted(block: bytes) -> int:
+        aes = Cipher(algorithms.AES(key), modes.ECB()).encryptor()
+        return int.from_bytes(aes.update(block), "big")
+
+    factor, state = encrypted(bytes(16)), 0
+    padded = data + bytes(-len(data) % 16)
+    lengths = (8 * len(data) << 64).to_bytes(16, "big")
+    for begin in range(0, len(padded) + 16, 16):
+        state ^= int.from_bytes((padded + lengths)[begin : begin + 16], "big")
+        product, shifted = 0, factor
+        for bit in reversed(range(128)):
+            product ^= shifted if state >> bit & 1 else 0
+            shifted = shifted >> 1 ^ (0xE1 << 120 if shifted & 1 else 0)
+        state = product
+    return (state ^ encrypted(nonce + b"\0\0\0\1")).to_bytes(16, "big")
+
+
+def test_a_frame_that_is_only_authenticated_has_readable_data_and_the_mac_of_the_standard(
+    ground: Vault,
+) -> None:
+    """The first tag is a vector of NIST (gcmEncryptExtIV256, no plaintext, 128 bits of data)."""
+    key = bytes.fromhex("78dc4e0aaf52d935c3c01eea57428f00ca1fd475f5da86a49c8dd73d68c8e223")
+    data = bytes.fromhex("b96baa8c1c75a671bfb2d08d06be5f36")
+    assert (
+        gmac(key, bytes.fromhex("d79cf22d504cc793c3fb6c8a"), data).hex() == "3e5d486aa2e30b22e040b85723a06e76"
+    )
+    header, mask = bytes.fromhex("1A5200011800"), bytes.fromhex("000E00000000")
+    sealed, _ = Sealer(ground, 2, mask, encrypted=False).seal(header, b"telemetry")
+    spi, iv, plain, mac = sealed[6:8], sealed[8:20], sealed[20:-16], sealed[-16:]
+    assert (sealed[:6], spi, plain) == (header, b"\0\2", b"telemetry")
+    covered = bytes([0, header[1] & 0x0E, 0, 0, 0, 0]) + spi + bytes(12) + plain
+    assert mac == gmac(KEYS[2], iv, covered)
 
 
 def test_a_frame_is_let_in_once_and_forgeries_by_their_cause_not_at_all(sky: Vault, ground: Vault) -> None:

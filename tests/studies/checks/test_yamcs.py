@@ -27,6 +27,17 @@ def test_the_command_writes_the_whole_configuration(tmp_path: Path, monkeypatch:
     assert {path.stat().st_mode & 0o077 for path in tmp_path.rglob("*") if path.is_file()} == {0}, "passwords"
 
 
+@pytest.mark.parametrize(("frame_bytes", "unit_bytes"), [(1024, 900), (300, 246), (128, 74)])
+def test_file_data_fit_into_the_configured_telecommand_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frame_bytes: int, unit_bytes: int
+) -> None:
+    monkeypatch.setattr("sys.argv", ["yamcs", str(tmp_path), "--command-frame-bytes", str(frame_bytes)])
+    main()
+    text = (tmp_path / "etc" / f"yamcs.{INSTANCE}.yaml").read_text(encoding="utf-8")
+    assert f"maxPduSize: {unit_bytes}\n" in text
+    assert 7 + 30 + 6 + 9 + 2 + unit_bytes <= frame_bytes, "headers, security and CRCs around the unit"
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
 def test_yamcs_does_not_obey_a_web_page_that_has_no_password(tmp_path: Path) -> None:
