@@ -132,7 +132,7 @@ class Coils(Section, frozen=True, kw_only=True):
 
     bus: Bus = 1
     address: Address = 0x40
-    windings: Annotated[tuple[Winding, ...], Meta(min_length=1, max_length=8)]
+    windings: Annotated[tuple[Winding, ...], Meta(min_length=1, max_length=64)]
     supply_voltage: Positive
     current_limit: Positive
     stale_after: Annotated[float, Meta(gt=0.0, le=0.4)] = 0.25

@@ -131,7 +131,7 @@ def _check_satellite_coils(coils: Coils, refuse: Refuse) -> None:
     try:
         slots = coils.slots
     except UsageError as error:
-        refuse("coils.windings", str(error))
+        refuse("coils.windings", f"cannot be flown: {error}")
     else:
         if len(slots) > MOST_COILS:
             x, y, z = slots[-1].axis
