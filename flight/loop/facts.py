@@ -150,7 +150,6 @@ GPS_POOR = Fact("gps-poor", events.STREAM_POOR, events.STREAM_GOOD, after=4, men
 STRINGS_LOST = Fact("strings-lost", events.STRINGS_LOST, events.STRINGS_RECOVERED)
 SUN_UNCLEAR = Fact("sun-unclear", events.SUN_UNCLEAR, events.SUN_CLEAR, after=3, mended_after=3)
 CLOCK_OFF = Fact("clock-off", events.CLOCK_OFF, after=2)
-FIELD_EXTRAPOLATED = Fact("field-extrapolated", events.FIELD_EXTRAPOLATED)
 FIELD_REFUSED = Fact("field-refused", events.FIELD_REFUSED, events.FIELD_TRUSTED)
 WIDE_LOST = Fact("wide-lost", events.WIDE_LOST, events.WIDE_RECOVERED)
 WIDE_FALSE = Fact("wide-false", events.WIDE_FALSE, events.WIDE_TRUSTED, after=3)
@@ -166,6 +165,7 @@ COILS_BROKEN = (
     COIL_6_BROKEN,
 )
 """Facts that a coil is broken, in the order of the coils."""
+FIELD_EXTRAPOLATED = Fact("field-extrapolated", events.FIELD_EXTRAPOLATED)
 
 FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isinstance(value, Fact))
 
