@@ -186,6 +186,9 @@ _LEAST_GAIN_ERROR = 0.05
 _WEAK_GAIN, _SIGMAS = 0.7, 2.5
 """Largest gain of a coil that is reported as weak, and number of standard deviations by which the estimate
 must be below this gain."""
+_USED_WEAK_GAIN = 0.6
+"""Upper limit of the gain of a weak coil that is used with its gain. Misaligned coils, neglected in the fit,
+can make the gain of a healthy coil of 0.8 look as small as 0.5."""
 _STRONG_GAIN = 1.25
 """Lower limit of the gain of a coil that is stronger than assumed."""
 LEAST_GAIN, _EXACT = 0.1, 0.1
@@ -500,7 +503,7 @@ class CoilResponse:
             Finding.REVERSED: wrong,
             Finding.FEEBLE: wrong or (sure and weak),
             Finding.SOUND: sure and gain > settings.lowest_sound,
-            Finding.WEAK: exact and gain + 3.0 * sigma < _WEAK_GAIN and gain - 3.0 * sigma > LEAST_GAIN,
+            Finding.WEAK: exact and gain + 3.0 * sigma < _USED_WEAK_GAIN and gain - 3.0 * sigma > LEAST_GAIN,
             Finding.STRONG: exact and gain - 3.0 * sigma > _STRONG_GAIN,
         }
         for finding, holds in findings.items():

@@ -299,6 +299,7 @@ class FieldDetumbler:
         self._braking = braking
         self._expected = expected
         self._filter = FieldRate(settings)
+        self._sigma, self._sigma_of = math.inf, self._filter.covariance
         # A residual momentum causes the fastest rotation about the axis of the smallest moment of inertia.
         self._rest = LEFT * braking.slow * float(np.linalg.eigvalsh(settings.inertia)[0])
         self.begin(0)
@@ -394,7 +395,11 @@ class FieldDetumbler:
         """Standard deviation (rad/s) of the least certain rate component; infinite for an unknown rate."""
         if not self.trusted:
             return math.inf
-        return math.sqrt(float(np.linalg.eigvalsh(self._filter.covariance[RATE, RATE])[-1]))
+        covariance = self._filter.covariance
+        if covariance is not self._sigma_of:
+            self._sigma_of = covariance
+            self._sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[RATE, RATE])[-1]))
+        return self._sigma
 
     @property
     def restarts(self) -> int:

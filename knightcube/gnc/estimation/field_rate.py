@@ -42,6 +42,8 @@ RATE, FIELD, CHANGE, INERTIA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 1
 SIZE = 15
 LARGEST_ROTATION = 0.15
 """Largest rotation (rad) of the body in one integration step."""
+COVARIANCE_STEP, COVARIANCE_ROTATION = 0.1, 0.03
+"""Longest time (s), and largest rotation (rad) of the body, of one step of the covariance."""
 _LINEARISED = 0.2
 """Fraction of the inertia's standard deviation that is added as noise for a known rate, because the filter is
 linearised."""
@@ -126,6 +128,9 @@ class FieldRate:
         self._field = self._change = _NONE
         self._set_inertia(np.zeros(6))
         self._covariance = np.zeros((SIZE, SIZE))
+        self._pending = 0.0  # time (s) by which the covariance is behind the state
+        self._pending_impulse = np.zeros(3)  # integral of the dipole over this time, A m^2 s
+        self._pending_start = _NONE, _NONE, _NONE  # rate, field and change at the start of this time
 
     @property
     def started(self) -> bool:
@@ -164,7 +169,10 @@ class FieldRate:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance (15, 15) of the rate, the field, its derivative and the inertia."""
+        """Covariance (15, 15) of the rate, the field, its derivative and the inertia.
+
+        After `advance`, the covariance may be older than the state by up to `COVARIANCE_STEP`.
+        """
         return self._covariance
 
     def advance(self, dipole: FloatArray, seconds: float) -> None:
@@ -175,8 +183,14 @@ class FieldRate:
         speed = math.sqrt(sum(w * w for w in self._rate))
         steps = max(1, math.ceil(speed * seconds / LARGEST_ROTATION))
         mx, my, mz = dipole.tolist()
+        if not self._pending:
+            self._pending_start = self._rate, self._field, self._change
+        self._pending += seconds
+        self._pending_impulse = self._pending_impulse + seconds * dipole
         for _ in range(steps):
             self._step((mx, my, mz), seconds / steps)
+        if self._pending >= COVARIANCE_STEP or speed * self._pending >= COVARIANCE_ROTATION:
+            self._propagate_covariance()
 
     def measure(self, field: FloatArray, age: float = 0.0) -> bool:
         """Apply a field (3,) T measured `age` s ago with the coils off; return whether it passed the gate.
@@ -188,6 +202,7 @@ class FieldRate:
         if self._rate is None:
             self._start(field)
             return True
+        self._propagate_covariance()
         if age:
             x, y, z = self._rate
             field = np.array(matrix(exponential(age * x, age * y, age * z))) @ field
@@ -210,7 +225,9 @@ class FieldRate:
         gyro is also excluded if the field predictions fail after its rate was used. If the gyro contradicts
         an estimate that used the gyro, the filter restarts.
         """
-        settings, covariance = self._settings, self._covariance
+        settings = self._settings
+        self._propagate_covariance()
+        covariance = self._covariance
         if self._rate is None or self._gyro_refused >= settings.refusals or not np.all(np.isfinite(rate)):
             return
         innovation = rate - np.array(self._rate)
@@ -304,14 +321,13 @@ class FieldRate:
         self._inertia_rows, self._inverse_rows = rows_of(self._inertia), rows_of(self._inverse)
 
     def _step(self, dipole: Vector, dt: float) -> None:
-        """Propagate state and covariance by one step of the midpoint rule."""
+        """Propagate the state by one step of the midpoint rule."""
         assert self._rate is not None
         rate, field, change = self._rate, self._field, self._change
         acceleration = self._acceleration(rate, field, dipole)
         middle = _moved(rate, acceleration, 0.5 * dt)
         half = _moved(field, _difference(change, cross(rate, field)), 0.5 * dt)
         acceleration = self._acceleration(middle, half, dipole)
-        flow = self._flow(middle, half, change, dipole, dt)
         rotated = exponential(dt * middle[0], dt * middle[1], dt * middle[2])
         rotation = matrix(rotated)
         self._rate = _moved(rate, acceleration, dt)
@@ -319,6 +335,19 @@ class FieldRate:
         self._field = _moved(times(rotation, field), times(rotation, change), dt)
         self._change = times(rotation, change)
         self._rotation = compose(rotated, self._rotation)
+
+    def _propagate_covariance(self) -> None:
+        """Propagate the covariance to the time of the state, about the middle of both times."""
+        dt = self._pending
+        if not dt or self._rate is None:
+            return
+        starts, ends = self._pending_start, (self._rate, self._field, self._change)
+        middle, half, change = (
+            _moved(start, _difference(end, start), 0.5) for start, end in zip(starts, ends, strict=True)
+        )
+        mx, my, mz = (self._pending_impulse / dt).tolist()
+        self._pending, self._pending_impulse = 0.0, np.zeros(3)
+        flow = self._flow(middle, half, change, (mx, my, mz), dt)
         transition = _EYE + flow + 0.5 * (flow @ flow)
         covariance = transition @ self._covariance @ transition.T
         settings = self._settings

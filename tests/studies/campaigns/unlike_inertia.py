@@ -85,7 +85,7 @@ def run(case: Case) -> Result:
     time = found["corrected_s"] if state == "reversed" else found["isolated_s"]
     if time is not None and state == "reversed" and found["flown_with"] >= 0.0:
         time = None  # the sign was changed back
-    pointed = bool((flown["mode"]["mode"] == int(Mode.POINT)).any())
+    pointed = bool((flown["mode"]["mode"] == int(Mode.SUN)).any())
     return {
         **found,
         "name": name,
