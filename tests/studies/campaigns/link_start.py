@@ -17,7 +17,7 @@ from pathlib import Path
 from knightcube.errors import UsageError
 from tests.flight.app.cli.linked_board import write_linked_config
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
-from tests.studies.campaigns.start import CALLS, Board, cases_of, points
+from tests.studies.campaigns.start import CALLS, Board, cases_of, check_injection, points
 from tests.studies.campaigns.start import summarise as summarise_starts
 
 LINK_CALLS = (
@@ -58,6 +58,7 @@ def _board() -> Iterator[Board]:
     """Provide a board with keys and a link. Raises UsageError without strace."""
     if shutil.which("strace") is None:
         raise UsageError("the campaign link-start needs strace")
+    check_injection()
     with tempfile.TemporaryDirectory(prefix="kc-") as name:
         place = Path(name)
         config = write_linked_config(place, udp="127.0.0.1:0", tcp="127.0.0.1:0")

@@ -111,6 +111,7 @@ def _board() -> Iterator[Board]:
     """Provide a board; its devices run beside it. Raises UsageError without strace."""
     if shutil.which("strace") is None:
         raise UsageError("the campaign start needs strace")
+    check_injection()
     # The socket's name must be short.
     with tempfile.TemporaryDirectory(prefix="kc-") as name:
         place = Path(name)
@@ -121,6 +122,14 @@ def _board() -> Iterator[Board]:
                 yield board
             finally:
                 board.close()
+
+
+def check_injection() -> None:
+    """Raise UsageError if strace cannot make calls fail here, as in some containers."""
+    fault = ["-e", "trace=none", "-e", "inject=openat:error=EIO:when=1+"]
+    words = ["strace", "-o", "/dev/null", *fault, sys.executable, "-c", "open('/dev/null')"]
+    if subprocess.run(words, capture_output=True, check=False).returncode == 0:
+        raise UsageError("strace cannot make system calls fail on this machine: use another one")
 
 
 class Board:

@@ -1,18 +1,23 @@
 """Starts the link again and again in one process; in each start other calls of the operating system fail.
 
-Run as `python -m tests.flight.app.cli.failing_starts FOLDER`, in a process of its own: the hook that makes
-calls fail stays for the life of its process. Prints one JSON object a start.
+Run as `python -m tests.flight.app.cli.failing_starts FOLDER [all]`, in a process of its own: the hook that
+makes calls fail stays for the life of its process. Prints one JSON object a start.
+
+Opening files and sockets raises audit events before the call. With `all`, each call fails with each error,
+and calls without an audit event fail too; they are replaced in the modules that contain them.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import signal
+import socket
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import redirect_stderr
+from contextlib import ExitStack, redirect_stderr
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -25,6 +30,12 @@ from tests.flight.app.cli.linked_board import write_linked_config
 
 CALLS = frozenset({"open", "os.mkdir", "os.remove", "os.listdir", "os.scandir", "socket.bind"})
 """Audit events (Python's documentation, "Audit events table"), each raised before its call."""
+REPLACED: tuple[tuple[Any, tuple[str, ...]], ...] = (
+    (os, ("read", "pwrite", "fsync", "ftruncate", "fstat", "stat", "lstat", "replace")),
+    (fcntl, ("flock",)),
+    (socket.socket, ("setsockopt", "listen", "setblocking")),
+)
+"""Calls without an audit event, by the module or class in which the product finds them."""
 ERRORS = (errno.EIO, errno.ENOSPC, errno.ENOENT, errno.EACCES, errno.EROFS)
 NETWORK_ERRORS = (errno.EADDRINUSE, errno.EADDRNOTAVAIL)
 
@@ -54,20 +65,34 @@ class Faults:
         """Make a call fail: the hook of `sys.addaudithook`. Raises OSError."""
         if self._error_of is None or event not in CALLS:
             return
-        about = str(arguments[-1] if event == "socket.bind" else arguments[0])
+        self._fail(event, str(arguments[-1] if event == "socket.bind" else arguments[0]))
+
+    def failing(self, name: str, called: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that fails like an audited call, and otherwise calls `called`."""
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            if self._error_of is not None:
+                self._fail(name, str(arguments[0]))
+            return called(*arguments, **named)
+
+        return call
+
+    def _fail(self, event: str, about: str) -> None:
+        assert self._error_of is not None
         self.seen.append((event, about))
         if error := self._error_of(event, about):
             raise OSError(error, os.strerror(error), about)
 
 
-def cases(faults: Faults, place: Path) -> Iterator[tuple[str, Callable[[str, str], int]]]:
+def cases(faults: Faults, place: Path, complete: bool) -> Iterator[tuple[str, Callable[[str, str], int]]]:
     """Yield each start: what fails in it, and the error of a call."""
     for _ in range(2):  # the first start imports modules
         yield "nothing", lambda *_: 0
     calls = list(faults.seen)
     for number, (event, about) in enumerate(calls, 1):
-        errors = NETWORK_ERRORS if event == "socket.bind" else (ERRORS[number % len(ERRORS)],)
-        for error in errors:
+        errors = set(NETWORK_ERRORS if event == "socket.bind" else ERRORS[number % len(ERRORS) :][:1])
+        errors = errors | set(ERRORS) if complete else errors
+        for error in sorted(errors):
 
             def once(*_: str, number: int = number, error: int = error) -> int:
                 return error if len(faults.seen) == number else 0
@@ -81,7 +106,7 @@ def cases(faults: Faults, place: Path) -> Iterator[tuple[str, Callable[[str, str
         yield f"the whole disk for three attempts: {errno.errorcode[error]}", long
 
 
-def run(place: Path) -> None:
+def run(place: Path, complete: bool = False) -> None:
     """Make all starts under `place` and print how each went."""
     (place / "board").mkdir()
     config = write_linked_config(place / "board", udp="127.0.0.1:0", tcp="127.0.0.1:0")
@@ -103,8 +128,13 @@ def run(place: Path) -> None:
 
     sys.addaudithook(faults.hook)
     # The start alone is tried, and without the pauses.
-    with patch.object(Station, "run", run_shortly), patch.object(StartRetry, "wait", count_waits):
-        for name, error_of in cases(faults, place):
+    with ExitStack() as stack:
+        stack.enter_context(patch.object(Station, "run", run_shortly))
+        stack.enter_context(patch.object(StartRetry, "wait", count_waits))
+        for owner, names in REPLACED if complete else ():
+            for name in names:
+                stack.enter_context(patch.object(owner, name, faults.failing(name, getattr(owner, name))))
+        for name, error_of in cases(faults, place, complete):
             came_up = False
             faults.start(error_of)
             with redirect_stderr(StringIO()) as said:
@@ -115,4 +145,4 @@ def run(place: Path) -> None:
 
 
 if __name__ == "__main__":
-    run(Path(sys.argv[1]))
+    run(Path(sys.argv[1]), sys.argv[2:] == ["all"])
