@@ -13,15 +13,15 @@ import pytest
 from flight.link.coding import LinkCodes, kiss_frame
 from flight.link.commands import CommandPacker, Ping, unpack
 from flight.link.files.units import UP, Metadata, Transaction, UnitPacker, pack
-from flight.link.frames import IDLE_CHANNEL, TELEMETRY_HEADER, close_frame, is_idle
+from flight.link.frames import IDLE_CHANNEL, TELEMETRY_HEADER, TelecommandHeader, close_frame, is_idle
 from flight.link.process import directives
 from flight.link.process.directives import Stop
-from flight.link.process.station import TncLine
+from flight.link.process.station import TcpLine, TncLine, UdpLine
 from flight.link.security import Refusal
 from flight.link.telemetry.definitions import LINK
 from flight.link.telemetry.packets import LAYOUTS
 from flight.schema.sections import LinkCoding
-from ground.link.terminal import TerminalSettings
+from ground.link.terminal import StreamGround, TerminalSettings, UdpGround
 from knightcube.errors import FlightError
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.process.filed_ends import FiledEnds
@@ -204,6 +204,42 @@ def test_a_tnc_is_connected_again_when_it_was_away() -> None:
                 received += tnc.recv(1000)
     line.close()
     assert line.receive() == []
+
+
+@pytest.mark.parametrize("kind", ["udp", "tcp"])
+def test_datagrams_and_streams_of_both_ends_are_coded_alike(stack: ExitStack, kind: str) -> None:
+    settings = TerminalSettings(
+        frame_bytes=300, coding=LinkCoding(randomiser="long", reed_solomon=2, cltu="randomised")
+    )
+    codes, far = settings.codes(), settings.codes()
+    command, telemetry = close_frame(TelecommandHeader(1, 0, 0).pack(40) + bytes(33)), close_frame(bytes(298))
+    line: UdpLine | TcpLine
+    ground: UdpGround | StreamGround
+    if kind == "udp":
+        line = UdpLine("127.0.0.1:0", codes=codes)
+        ground = UdpGround(f"127.0.0.1:{line.port}", far)
+    else:
+        line = TcpLine("127.0.0.1:0", framing=codes.on_board())
+        caller = stack.enter_context(socket.create_connection(("127.0.0.1", line.port), timeout=10.0))
+        ground = StreamGround("tcp", caller.fileno(), far.on_ground(), lambda: None)
+    stack.callback(line.close)
+    stack.callback(ground.close)
+    ground.send(command)
+    while not (taken := line.receive()):
+        pass
+    assert [frame for frame, _ in taken] == [command]
+    line.trust(taken[0][1], 0)
+    line.send([telemetry, telemetry], 1)
+    found: list[bytes] = []
+    while len(found) < 2:
+        found += ground.receive()
+    assert found == [telemetry] * 2
+    if kind == "udp":
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.sendto(command, ("127.0.0.1", line.port))  # a frame without code
+            while not (taken := line.receive()):
+                pass
+        assert [frame for frame, _ in taken] == [b""]
 
 
 PACKETS = {
