@@ -1,13 +1,14 @@
-"""Channel coding and framing between transfer frames and a radio that does neither (a bare radio).
+"""Channel coding and framing of transfer frames, for a radio that does neither itself (a bare radio).
 
 Telemetry follows CCSDS 131.0-B-5: Reed-Solomon code (255,223) in the dual basis with interleaving and
 virtual fill, then a pseudo-randomiser, then the attached sync marker. Telecommands follow CCSDS 231.0-B-4: a
 pseudo-randomiser, the BCH code (63,56) and the communications link transmission unit (CLTU), which carries
 one frame. A terminal node controller (TNC) is connected by KISS, with or without the header of AX.25 frames.
 
-A code changes a frame into a unit, which one datagram or KISS frame carries. In a byte stream (serial line,
-TCP) the beginning of each unit is marked. Both ends need the same settings, which are in the section
-`link.coding` of the configuration. The radio must find the boundaries of the bytes.
+A code encodes a frame as a unit, which is carried by one datagram or KISS frame. In a byte stream (serial
+line, TCP) a marker precedes each unit. Both ends need the same settings, which are in the section
+`link.coding` of the configuration. The radio must deliver whole bytes, because units are not searched for at
+other bit offsets.
 
 The library reedsolo computes in the Galois field and corrects erroneous codewords. Encoding, and the check
 that a received codeword has no errors, use a table of parity symbols, because both are done for every frame.
@@ -74,7 +75,7 @@ DATA_SYMBOLS = _CODEWORD - _PARITY
 _FIELD_POLYNOMIAL = 0x187
 _ROOT = 173  # alpha^11, whose powers 112 to 143 are the roots of the generator polynomial
 _FIRST_ROOT = 112
-_DUAL_BASE_ROOT = 117  # beta = alpha^117 generates the basis to which the symbols' basis is dual
+_DUAL_BASE_ROOT = 117  # exponent of beta = alpha^117; the basis of the symbols is dual to the powers of beta
 
 
 class ReedSolomon:
@@ -86,7 +87,7 @@ class ReedSolomon:
     """
 
     def __init__(self, depth: int) -> None:
-        """Interleave `depth` codewords."""
+        """Prepare a code that interleaves `depth` codewords."""
         self._depth = depth
         self._codec = RSCodec(_PARITY, _CODEWORD, _FIRST_ROOT, _FIELD_POLYNOMIAL, _ROOT)
         self._dual, self._conventional, self._parity_of = _tables()
@@ -171,7 +172,7 @@ class Code(Protocol):
         """Return the frame in a unit. The CRC of the frame is wrong if the unit is damaged beyond repair."""
 
     def marked(self, frame: bytes) -> bytes:
-        """Return the unit of a frame for a byte stream, in which the begin of the unit is marked."""
+        """Return the unit of a frame for a byte stream, after the marker that precedes it."""
 
     def stream(self) -> FrameDecoder:
         """Return a decoder of the units in a byte stream."""
@@ -351,7 +352,7 @@ class CommandCode:
     """
 
     def __init__(self, cltu_kind: str | None) -> None:
-        """Encode by CLTUs that are "plain" or "randomised", or not at all for None."""
+        """Encode frames in CLTUs that are "plain" or "randomised". For None, frames are not encoded."""
         self._coded = cltu_kind is not None
         self._kind = "command" if cltu_kind == "randomised" else None
         self.corrected = 0
@@ -395,7 +396,7 @@ def ax25_header(to: str, source: str) -> bytes:
 
 
 class KissStream:
-    """Decoder of the units in KISS frames (Chepponis and Karn, 1987) or in AX.25 frames inside of these."""
+    """Decoder of units in KISS frames (Chepponis and Karn, 1987), which may contain AX.25 frames."""
 
     def __init__(self, decode: Callable[[bytes], bytes], ax25: bool) -> None:
         """Decode units by the function `decode`, after the AX.25 header if `ax25`."""
@@ -411,7 +412,7 @@ class KissStream:
         return [self._decode(unit) for unit in units]
 
     def _unit(self, kiss: bytes) -> bytes:
-        """Return the unit in a KISS frame, empty for other frames than data."""
+        """Return the unit in a KISS data frame, or empty bytes for another KISS frame."""
         if not kiss or kiss[0] & 0x0F:
             return b""
         content = kiss[1:].replace(_ESCAPED_END, _FRAME_END).replace(_ESCAPED_ESCAPE, _ESCAPE)
@@ -430,7 +431,7 @@ def kiss_frame(content: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Framing:
-    """Form of the frames in a byte stream: bytes to send for a frame, and a new decoder of received bytes."""
+    """Form of frames in a byte stream, as a function that encodes a frame and one that makes a decoder."""
 
     wrap: Callable[[bytes], bytes]
     stream: Callable[[], FrameDecoder]
