@@ -52,18 +52,26 @@ class _TangentPlane:
         return np.degrees(directions @ np.stack([self.east, self.north], axis=1) / along[:, None])
 
 
-def world_coordinates(sky: SkyMap) -> dict[str, str | int | float | bool]:
-    """Return the values of the FITS header by key; A and B map pixels to the sky, AP and BP the reverse."""
+def world_coordinates(sky: SkyMap, reversed_rows: bool = False) -> dict[str, str | int | float | bool]:
+    """Return the values of the FITS header by key; A and B map pixels to the sky, AP and BP the reverse.
+
+    If `reversed_rows` is true, the first row of the file is the bottom row of the image.
+    """
     camera = sky.camera
-    centre = np.array(camera.centre)
-    middle = sky.directions(centre[None])[0]
+
+    def sky_of(points: FloatArray) -> FloatArray:
+        return sky.directions(_in_file(points, camera.rows) if reversed_rows else points)
+
+    centre = np.array([camera.centre])
+    centre = (_in_file(centre, camera.rows) if reversed_rows else centre)[0]
+    middle = sky_of(centre[None])[0]
     plane = _TangentPlane.at(middle)
     step = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
-    right, left, down, up = plane.degrees(sky.directions(centre + step))
+    right, left, down, up = plane.degrees(sky_of(centre + step))
     cd = np.stack([right - left, down - up], axis=1)
     x, y = np.meshgrid(np.linspace(0, camera.columns - 1, _GRID), np.linspace(0, camera.rows - 1, _GRID))
     points = np.stack([x.ravel(), y.ravel()], axis=-1)
-    directions = sky.directions(points)
+    directions = sky_of(points)
     seen = np.isfinite(directions).all(axis=1) & (directions @ middle > 0.0)
     off = points[seen] - centre
     straight = plane.degrees(directions[seen]) @ np.linalg.inv(cd).T
@@ -89,6 +97,11 @@ def world_coordinates(sky: SkyMap) -> dict[str, str | int | float | bool]:
     return header | _polynomials(("AP", "BP"), straight, off - straight, least=1)
 
 
+def _in_file(points: FloatArray, rows: int) -> FloatArray:
+    """Return pixels (n, 2) of an image as pixels of a file with the opposite order of rows."""
+    return points * np.array([1.0, -1.0]) + np.array([0.0, rows - 1.0])
+
+
 def _polynomials(
     names: tuple[str, str], places: FloatArray, shift: FloatArray, least: int
 ) -> dict[str, str | int | float | bool]:
@@ -108,9 +121,10 @@ def _polynomials(
     return found
 
 
-def header_text(sky: SkyMap) -> str:
-    """Return the text of a FITS file that consists of a header only."""
-    cards: list[Card] = [("SIMPLE", True), ("BITPIX", 8), ("NAXIS", 0), *world_coordinates(sky).items()]
+def header_text(sky: SkyMap, reversed_rows: bool = False) -> str:
+    """Return the text of a FITS file that consists of a header only, as for `world_coordinates`."""
+    values = world_coordinates(sky, reversed_rows)
+    cards: list[Card] = [("SIMPLE", True), ("BITPIX", 8), ("NAXIS", 0), *values.items()]
     text = "".join(_card(key, value) for key, value in cards) + "END".ljust(_CARD)
     return text.ljust(-(-len(text) // _BLOCK) * _BLOCK)
 
@@ -167,8 +181,11 @@ _SAME_PX = 0.1
 each."""
 
 
-def sky_facts(sky: SkyMap | None, bodies: Sequence[SkyBody]) -> dict[str, Any]:
-    """Return image centre, optical axis, bodies and world coordinates as JSON data."""
+def sky_facts(sky: SkyMap | None, bodies: Sequence[SkyBody], reversed_rows: bool = False) -> dict[str, Any]:
+    """Return image centre, optical axis, bodies and world coordinates as JSON data.
+
+    The argument `reversed_rows` is that of `world_coordinates`.
+    """
     if sky is None:
         return {}
     camera = sky.camera
@@ -180,7 +197,7 @@ def sky_facts(sky: SkyMap | None, bodies: Sequence[SkyBody]) -> dict[str, Any]:
             {"name": body.name, **_coordinates(body.direction), "point_px": body.point.tolist()}
             for body in bodies
         ],
-        "wcs": world_coordinates(sky),
+        "wcs": world_coordinates(sky, reversed_rows),
     }
 
 

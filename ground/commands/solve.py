@@ -33,7 +33,7 @@ from knightcube.astro.catalogue import PROPER_NAMES
 from knightcube.astro.earth.sun import julian_date
 from knightcube.errors import UsageError
 from knightcube.reference.star_identification import DEFAULT_METHOD, METHODS, method_of
-from knightcube.vision.camera.images import grey_stretch, write_picture
+from knightcube.vision.camera.images import grey_stretch, rows_reversed, write_picture
 from knightcube.vision.star_tracker import (
     FOV_TOLERANCE,
     UNKNOWN_FOV_DEG,
@@ -117,14 +117,15 @@ def run(options: argparse.Namespace) -> int:
     sky_map, bodies = solution.sky_map, []
     if sky_map is not None and options.date is not None:
         bodies = bodies_in(sky_map, julian_date(options.date))
+    reversed_rows = options.raw is None and rows_reversed(options.image)
     if options.json:
         values = {"attitude_method": options.attitude, "centroid_method": options.centroid}
-        values |= facts(solution, seconds) | sky_facts(sky_map, bodies)
+        values |= facts(solution, seconds) | sky_facts(sky_map, bodies, reversed_rows)
         sys.stdout.write(json.dumps(values, allow_nan=False) + "\n")
     else:
         sys.stdout.write(_text(solution, seconds) + sky_text(sky_map, bodies))
     if options.wcs is not None and sky_map is not None:
-        write_new(options.wcs, header_text(sky_map))
+        write_new(options.wcs, header_text(sky_map, reversed_rows))
     if options.overlay is not None:
         write_picture(options.overlay, draw_solution(grey_stretch(pixels), solution.frame, solution.index))
         if not options.json:

@@ -91,3 +91,20 @@ def test_a_lens_told_without_its_distortion_is_noticed() -> None:
     plain = wcs.WCS(fits.Header.fromstring(header_text(sky)))
     radec, place = _stars(sky)
     assert np.abs(plain.wcs_world2pix(radec, 0) - place).max() > 1.0
+
+
+@pytest.mark.parametrize(("mirrored", "reversed_rows"), [(True, False), (False, True), (True, True)])
+def test_the_header_is_of_the_pixels_of_the_file(mirrored: bool, reversed_rows: bool) -> None:
+    """A mirrored picture has a CD matrix with a determinant of the other sign than the sky."""
+    plain = _sky(2)
+    radec, place = _stars(plain)
+    if mirrored:
+        place = np.array([2.0 * _LENS.centre[0], 0.0]) + place * np.array([-1.0, 1.0])
+    sky = SkyMap(_LENS, plain.quaternion, mirrored=mirrored)
+    directions = sky.directions(place)
+    assert np.abs(sky.pixels(directions) - place).max() < 1e-6
+    in_file = np.array([0.0, _LENS.rows - 1.0]) + place * np.array([1.0, -1.0]) if reversed_rows else place
+    header = fits.Header.fromstring(header_text(sky, reversed_rows))
+    assert np.abs(wcs.WCS(header).all_world2pix(radec, 0) - in_file).max() < 0.01
+    determinant = header["CD1_1"] * header["CD2_2"] - header["CD1_2"] * header["CD2_1"]
+    assert (determinant < 0.0) == (mirrored != reversed_rows)

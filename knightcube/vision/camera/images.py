@@ -4,13 +4,14 @@
     pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # pixels without a header
     write_picture(Path("found.png"), grey_stretch(pixels))
 
-Row 0 of an image array is the first row of the file. FITS viewers show the first row at the bottom, and other
-viewers show it at the top. An image read in the wrong row order is a mirror image of the sky. The orientation
-in the EXIF data of a photograph is ignored.
+Row 0 of an image array is the top row. A photograph is rotated as the orientation in its EXIF data states.
+In a FITS file, the first row is the top row unless the keyword ROWORDER is 'BOTTOM-UP'. An image read in the
+wrong row order is a mirror image of the sky.
 
-The FITS reader follows FITS Standard 4.0, sections 3, 4.4.1 and 5. The reader accepts primary images with two
-axes and BITPIX 8, 16, 32, -32 or -64, and applies BZERO and BSCALE. The reader rejects blank pixels (BLANK),
-extensions, tables, compressed images and cubes.
+The FITS reader follows FITS Standard 4.0, sections 3, 4.4.1, 5 and 7.1. The reader accepts files compressed
+by gzip, and reads the primary image or the first image extension. An image may have BITPIX 8, 16, 32, -32 or
+-64, and one plane or three planes of colour. The reader applies BZERO and BSCALE. The reader rejects blank
+pixels (BLANK), tables and tile-compressed images.
 
 The vision worker keeps its newest frames on disk (`keep_frame`). A kept frame is a PGM file (Netpbm), which
 most image programs can open. The PGM file contains the unchanged grey counts of the frame, of 8 or 16 bits,
@@ -19,11 +20,13 @@ and metadata in JSON as a comment.
 
 from __future__ import annotations
 
+import gzip
 import json
 import math
 import struct
 import sys
 import warnings
+import zlib
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,40 +44,117 @@ if TYPE_CHECKING:
 SIGNATURE = b"SIMPLE  ="
 BLOCK = 2880
 CARD = 80
+_GZIP, _MOST_BYTES, _MOST_AXES = b"\x1f\x8b", 1 << 30, 999
+"""First bytes of a gzip file, largest size (bytes) of its content, and largest NAXIS of the FITS Standard."""
 KINDS = {8: ">u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
 """NumPy types of the pixels of a FITS file by the value of its BITPIX keyword."""
 UNSIGNED = {"i2": (32768.0, np.uint16), "i4": (2147483648.0, np.uint32)}
 """BZERO of unsigned integers that are stored as signed ones (FITS Standard 4.0, section 4.4.2.5)."""
 
 
-def primary_image(content: bytes, name: str) -> Image:
-    """Return the image (rows, columns) in the bytes of a FITS file; row 0 is the first row of the file.
+def fits_image(content: bytes, name: str) -> Image:
+    """Return the image (rows, columns) in the bytes of a FITS file; row 0 is the top row.
 
-    Integer pixels without BZERO and BSCALE keep their type. Signed pixels with the BZERO value of unsigned
-    integers become unsigned. Pixels with any other BZERO or BSCALE value become float64. Raises UsageError,
-    with the file's `name`, if the image is not supported.
+    The image is the primary image or, if the primary image is empty, the first image extension. Integer
+    pixels without BZERO and BSCALE keep their type. Signed pixels with the BZERO value of unsigned integers
+    become unsigned. Pixels with any other BZERO or BSCALE value become float64. Three planes of colour are
+    converted to luminance. Raises UsageError, with the file's `name`, if the image is not supported.
     """
-    header, start = _header(content, name)
+    header, axes, start = _first_image(content, name)
     bits = _whole(header, "BITPIX", name)
-    if bits not in KINDS:
-        raise UsageError(f"{name}: BITPIX = {bits} is not supported: use {', '.join(map(str, KINDS))}")
-    axes = [_whole(header, f"NAXIS{axis + 1}", name) for axis in range(_whole(header, "NAXIS", name))]
-    if len(axes) < 2 or min(axes) < 1 or math.prod(axes[2:]) != 1:
-        shape = " x ".join(map(str, axes)) or "nothing"
-        raise UsageError(
-            f"{name}: the primary image is {shape}: only one plane of columns x rows is supported"
-        )
-    columns, rows = axes[:2]
-    kind = np.dtype(KINDS[bits])
-    if len(content) < start + rows * columns * kind.itemsize:
-        raise UsageError(f"{name}: ends before the last of {columns} x {rows} pixels: it was cut short")
-    stored = np.frombuffer(content, dtype=kind, count=rows * columns, offset=start).reshape(rows, columns)
+    kind, size = np.dtype(KINDS[bits]), math.prod(axes)
+    if len(content) < start + size * kind.itemsize:
+        shape = " x ".join(map(str, axes))
+        raise UsageError(f"{name}: ends before the last of {shape} pixels: it was cut short")
+    stored = np.frombuffer(content, dtype=kind, count=size, offset=start).reshape(axes[::-1])
     if bits > 0 and "BLANK" in header and np.any(stored == _whole(header, "BLANK", name)):
-        raise UsageError(f"{name}: has blank pixels: fill them first")
-    image = _scaled(stored, _real(header, "BZERO", 0.0, name), _real(header, "BSCALE", 1.0, name))
-    if not np.all(np.isfinite(image)):
-        raise UsageError(f"{name}: has pixels that are not finite: fill them first")
-    return image
+        raise UsageError(f"{name}: has blank pixels (BLANK = {header['BLANK']}): fill them first")
+    zero, scale = _real(header, "BZERO", 0.0, name), _real(header, "BSCALE", 1.0, name)
+    planes = _scaled(stored, zero, scale).reshape(-1, axes[1], axes[0])
+    if not np.all(np.isfinite(planes)):
+        scaled = f" with BZERO = {zero:g} and BSCALE = {scale:g}" if (zero, scale) != (0.0, 1.0) else ""
+        raise UsageError(f"{name}: has pixels that are not finite{scaled}: fill them first")
+    image = planes[0] if len(planes) == 1 else _grey_of_planes(planes)
+    return image[::-1].copy() if _bottom_up(header, name) else image
+
+
+def _first_image(content: bytes, name: str) -> tuple[dict[str, str], list[int], int]:
+    """Return header, axes (columns, rows and possibly 3) and offset of the first image of a FITS file."""
+    place, empty = 0, ""
+    while place == 0 or content.startswith(b"XTENSION=", place):
+        header, start = _header(content, name, place)
+        axes = _axes(header, name)
+        bits = _whole(header, "BITPIX", name)
+        if bits not in KINDS:
+            raise UsageError(f"{name}: BITPIX = {bits} is not supported: use {', '.join(map(str, KINDS))}")
+        if header.get("ZIMAGE") == "T":
+            method = header.get("ZCMPTYPE", "unknown")
+            raise UsageError(f"{name}: the image is tile-compressed (ZCMPTYPE = {method}): use funpack first")
+        if header.get("XTENSION", "'IMAGE").strip("' ") == "IMAGE" and len(axes) >= 2 and min(axes) >= 1:
+            colours = math.prod(axes[2:])
+            if colours not in (1, 3):
+                shape = " x ".join(map(str, axes))
+                raise UsageError(f"{name}: the image is {shape}: only one plane or 3 colours are supported")
+            return header, [*axes[:2], *([3] if colours == 3 else [])], start
+        empty = empty or " x ".join(map(str, axes)) or "nothing"
+        parameters = _whole(header, "PCOUNT", name) if "PCOUNT" in header else 0
+        size = abs(bits) // 8 * ((math.prod(axes) if axes else 0) + max(parameters, 0))
+        place = start + -(-max(size, 0) // BLOCK) * BLOCK
+    raise UsageError(f"{name}: the primary image is {empty or 'nothing'} and no extension has an image")
+
+
+def _axes(header: dict[str, str], name: str) -> list[int]:
+    """Return the sizes of the axes of a FITS image: columns, rows and further axes."""
+    count = _whole(header, "NAXIS", name)
+    if not 0 <= count <= _MOST_AXES:
+        raise UsageError(f"{name}: NAXIS = {count}: give 2 axes, or 3 for colour")
+    axes = [_whole(header, f"NAXIS{axis + 1}", name) for axis in range(count)]
+    for number, size in enumerate(axes, start=1):
+        if size < 0:
+            raise UsageError(f"{name}: NAXIS{number} = {size} is negative")
+    return axes
+
+
+def _grey_of_planes(planes: Image) -> Image:
+    """Return the luminance (rows, columns) of red, green and blue planes (3, rows, columns), same type."""
+    grey = np.tensordot(_LUMINANCE, planes.astype(np.float64), 1)
+    return np.asarray((np.rint(grey) if planes.dtype.kind in "iu" else grey).astype(planes.dtype))
+
+
+def _bottom_up(header: dict[str, str], name: str) -> bool:
+    order = header.get("ROWORDER", "'TOP-DOWN'").strip("' ").upper()
+    if order not in ("TOP-DOWN", "BOTTOM-UP"):
+        raise UsageError(f"{name}: ROWORDER = {order!r}: give TOP-DOWN or BOTTOM-UP")
+    return order == "BOTTOM-UP"
+
+
+def rows_reversed(path: Path) -> bool:
+    """Return whether `read_image` reverses the rows of a file: a FITS file with ROWORDER = 'BOTTOM-UP'."""
+    content = _fits_content(path)
+    return bool(content) and _bottom_up(_first_image(content, str(path))[0], str(path))
+
+
+def _fits_content(path: Path) -> bytes:
+    """Return the bytes of a FITS file, decompressed by gzip, or no bytes for files of other formats."""
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(len(SIGNATURE))
+            file.seek(0)
+            if beginning == SIGNATURE:
+                return file.read()
+            if beginning[:2] != _GZIP:
+                return b""
+            with gzip.open(file) as packed:
+                content = packed.read(_MOST_BYTES + 1)
+    except (EOFError, zlib.error) as error:
+        raise UsageError(f"{path}: is damaged: {error}") from error
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not content.startswith(SIGNATURE):
+        raise UsageError(f"{path}: contains no FITS image in gzip: decompress or convert it")
+    if len(content) > _MOST_BYTES:
+        raise UsageError(f"{path}: is larger than {_MOST_BYTES >> 20} MiB: decompress it first")
+    return content
 
 
 def _scaled(stored: npt.NDArray[np.generic], zero: float, scale: float) -> Image:
@@ -85,13 +165,18 @@ def _scaled(stored: npt.NDArray[np.generic], zero: float, scale: float) -> Image
     if unsigned is not None and (zero, scale) == (offset, 1.0):
         # Adding the BZERO value of unsigned integers flips only the highest bit of a pixel.
         return np.asarray(native.view(unsigned) ^ unsigned(offset))
-    return np.asarray(zero + scale * native.astype(np.float64))
+    # Pixels beyond the range of float64 become infinite, which the caller refuses.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(zero + scale * native.astype(np.float64))
 
 
-def _header(content: bytes, name: str) -> tuple[dict[str, str], int]:
-    """Return the FITS header values by keyword, as text, and the byte offset of the first pixel."""
+def _header(content: bytes, name: str, begin: int) -> tuple[dict[str, str], int]:
+    """Return the values of a FITS header by keyword, as text, and the byte offset of the first pixel.
+
+    The header begins at the byte `begin`.
+    """
     header: dict[str, str] = {}
-    for place in range(0, len(content) - CARD + 1, CARD):
+    for place in range(begin, len(content) - CARD + 1, CARD):
         card = content[place : place + CARD].decode("ascii", errors="replace")
         keyword = card[:8].rstrip()
         if keyword == "END":
@@ -149,14 +234,8 @@ def read_image(path: Path) -> Image:
     BT.601). Raises UsageError if the file is missing, damaged or of another format, or if pixels are not
     finite.
     """
-    try:
-        with path.open("rb") as file:
-            beginning = file.read(len(SIGNATURE))
-            file.seek(0)
-            content = file.read() if beginning == SIGNATURE else b""
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
-    return primary_image(content, str(path)) if content else _through_pillow(path)
+    content = _fits_content(path)
+    return fits_image(content, str(path)) if content else _through_pillow(path)
 
 
 def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
@@ -222,9 +301,9 @@ def _through_pillow(path: Path) -> Image:
                 high = _colours(picture)
                 with pillow.open(path, formats=FORMATS) as again:
                     again.tile = [tile._replace(args=_low_bytes(tile.args)) for tile in again.tile]
-                    return _luminance(256.0 * high + _colours(again))
+                    return _upright(_luminance(256.0 * high + _colours(again)), picture)
             picture.load()
-            return _grey(path, picture)
+            return _upright(_grey(path, picture), picture)
     except UnidentifiedImageError as error:
         raise UsageError(f"{path}: is not a {', '.join(FORMATS)} or FITS image: convert it") from error
     except pillow.DecompressionBombError as error:
@@ -234,12 +313,42 @@ def _through_pillow(path: Path) -> Image:
         raise UsageError(f"{path}: is damaged: {error}") from error
 
 
+_ON_SIDE = (5, 6, 7, 8)
+"""Values of the tag Orientation of images whose stored rows are columns."""
+_ORIENTATION = 0x0112
+"""The tag Orientation of EXIF 2.3 and TIFF 6.0: where row 0 and column 0 of the stored pixels belong."""
+
+
+def _upright(image: Image, picture: Picture) -> Image:
+    """Return an image (rows, columns) rotated and mirrored as the EXIF data of its file states."""
+    orientation: object = 1
+    # Pillow itself rotates TIFF images by half a turn or mirrors them. Damaged metadata are ignored.
+    with suppress(OSError, SyntaxError, ValueError, TypeError, LookupError, struct.error):
+        orientation = picture.getexif().get(_ORIENTATION, 1)
+    if orientation not in range(1, 9):
+        return image
+    if orientation in _ON_SIDE:
+        image = image.T
+    if orientation in (3, 4, 7, 8):
+        image = image[::-1]
+    if orientation in (2, 3, 6, 7):
+        image = image[:, ::-1]
+    return np.ascontiguousarray(image)
+
+
 def _check_kept(path: Path, picture: Picture) -> None:
-    """Raise UsageError for images that Pillow misreads, namely truncated 16-bit colour and inverted grey."""
+    """Raise UsageError for images that Pillow misreads.
+
+    Pillow truncates 16-bit colour, does not invert inverted grey, and mixes up the rows of TIFF images that
+    are stored on their side.
+    """
     deep = any(";16" in _raw_mode(tile[3]) for tile in getattr(picture, "tile", ()))
     if picture.mode in COLOUR_MODES and deep and not _is_deep(picture):
         raise UsageError(f"{path}: 16-bit colour of this kind is not supported: convert it to 16-bit grey")
-    interpretation = getattr(picture, "tag_v2", {}).get(PHOTOMETRIC_INTERPRETATION)
+    tags = getattr(picture, "tag_v2", {})
+    orientation, interpretation = tags.get(_ORIENTATION), tags.get(PHOTOMETRIC_INTERPRETATION)
+    if orientation in _ON_SIDE:
+        raise UsageError(f"{path}: this TIFF is on its side (Orientation = {orientation}): save it upright")
     if picture.mode.startswith("I") and interpretation == WHITE_IS_ZERO:
         raise UsageError(f"{path}: in this TIFF zero is white: convert it to a TIFF in which zero is black")
 

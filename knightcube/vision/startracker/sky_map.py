@@ -161,16 +161,20 @@ class SkyMap:
             is exact.
         velocity: velocity of the camera (3,), m/s, by which directions are corrected for aberration, or None
             for no correction.
+        mirrored: whether the image shows the mirrored sky; the attitude is then that of the image with left
+            and right exchanged about the optical axis.
     """
 
     camera: CameraModel
     quaternion: FloatArray
     bend: FloatArray = field(default_factory=lambda: np.zeros(BENDS))
     velocity: FloatArray | None = None
+    mirrored: bool = False
 
     def directions(self, points: FloatArray) -> FloatArray:
         """Return the ICRS directions of pixels (n, 2), as unit vectors (n, 3)."""
-        seen = bent(self.camera.unit_vectors(points), self.bend) @ attitude_matrix(self.quaternion)
+        rays = self.camera.unit_vectors(self._exchanged(points))
+        seen = bent(rays, self.bend) @ attitude_matrix(self.quaternion)
         # The aberration for the opposite velocity is the inverse, accurate to (v/c)^2 or 0.002".
         return seen if self.velocity is None else apparent(seen, -self.velocity)
 
@@ -182,7 +186,13 @@ class SkyMap:
         points = wanted
         for _ in range(_BEND_STEPS if self.bend.any() else 0):
             points = points + wanted - self.camera.project(bent(self.camera.unit_vectors(points), self.bend))
-        return points
+        return self._exchanged(points)
+
+    def _exchanged(self, points: FloatArray) -> FloatArray:
+        """Return pixels (n, 2) with left and right exchanged if the image shows the mirrored sky."""
+        if not self.mirrored:
+            return points
+        return np.array([2.0 * self.camera.centre[0], 0.0]) + points * np.array([-1.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -112,7 +112,9 @@ class FrameSolution:
 
         `velocity` (3,), m/s, is the camera's velocity with which the frame was solved.
         """
-        return None if self.fix is None else SkyMap(self.camera, self.fix.quaternion, self.bend, velocity)
+        if self.fix is None:
+            return None
+        return SkyMap(self.camera, self.fix.quaternion, self.bend, velocity, self.mirrored)
 
 
 NODES = (0.0, 0.25, 0.75, 1.0)

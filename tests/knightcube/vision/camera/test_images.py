@@ -19,9 +19,9 @@ from knightcube.errors import UsageError
 from knightcube.vision.camera.images import (
     KeptFrames,
     facts_of,
+    fits_image,
     grey_stretch,
     keep_frame,
-    primary_image,
     read_image,
     write_picture,
 )
@@ -286,7 +286,7 @@ PIXELS = np.array([[0, 1, 2], [127, 128, 255]])
     ],
 )
 def test_every_kind_of_pixel_keeps_its_type_and_value(bits: int, kind: str, expected: type) -> None:
-    image = primary_image(fits_file(PIXELS.astype(kind), bits), "x.fits")
+    image = fits_image(fits_file(PIXELS.astype(kind), bits), "x.fits")
     assert image.dtype == expected
     assert image.tolist() == PIXELS.tolist()
 
@@ -294,30 +294,30 @@ def test_every_kind_of_pixel_keeps_its_type_and_value(bits: int, kind: str, expe
 def test_unsigned_integers_keep_their_values() -> None:
     """FITS 4.4.2.5 stores value - BZERO, so that 0, 32768 and 65535 are stored as -32768, 0 and 32767."""
     stored = np.array([[-32768, 0, 32767]])
-    image = primary_image(fits_file(stored.astype(">i2"), 16, BZERO=32768, BSCALE=1), "x.fits")
+    image = fits_image(fits_file(stored.astype(">i2"), 16, BZERO=32768, BSCALE=1), "x.fits")
     assert image.dtype == np.uint16
     assert image.tolist() == [[0, 32768, 65535]]
     stored = np.array([[-(2**31), -1, 2**31 - 1]])
-    image = primary_image(fits_file(stored.astype(">i4"), 32, BZERO="2147483648.", BSCALE="1.0E0"), "x.fits")
+    image = fits_image(fits_file(stored.astype(">i4"), 32, BZERO="2147483648.", BSCALE="1.0E0"), "x.fits")
     assert image.dtype == np.uint32
     assert image.tolist() == [[0, 2**31 - 1, 2**32 - 1]]
 
 
 def test_a_scale_gives_physical_values() -> None:
     """The value is BZERO + BSCALE times the stored value, with a D in the exponent of a double."""
-    image = primary_image(fits_file(PIXELS.astype(">i2"), 16, BZERO="-1.5", BSCALE="2.5D-1"), "x.fits")
+    image = fits_image(fits_file(PIXELS.astype(">i2"), 16, BZERO="-1.5", BSCALE="2.5D-1"), "x.fits")
     assert image.dtype == np.float64
     assert image.tolist() == (-1.5 + 0.25 * PIXELS).tolist()
 
 
 def test_the_array_has_native_byte_order_and_starts_with_the_first_row() -> None:
-    image = primary_image(fits_file(PIXELS.astype(">i2"), 16), "x.fits")
+    image = fits_image(fits_file(PIXELS.astype(">i2"), 16), "x.fits")
     assert image.dtype.isnative
     assert image[0].tolist() == [0, 1, 2]
 
 
 def test_a_third_axis_of_one_plane_is_accepted() -> None:
-    image = primary_image(fits_file(PIXELS.astype(">i2"), 16, NAXIS=3, NAXIS3=1), "x.fits")
+    image = fits_image(fits_file(PIXELS.astype(">i2"), 16, NAXIS=3, NAXIS3=1), "x.fits")
     assert image.shape == (2, 3)
 
 
@@ -326,7 +326,12 @@ def test_a_third_axis_of_one_plane_is_accepted() -> None:
     [
         ({"BITPIX": 64}, "BITPIX = 64"),
         ({"NAXIS": 0}, "is nothing"),
-        ({"NAXIS": 3, "NAXIS3": 3}, "3 x 2 x 3"),
+        ({"NAXIS": 3, "NAXIS3": 4}, "3 x 2 x 4"),
+        ({"NAXIS": 3, "NAXIS1": 999, "NAXIS3": 3}, "last of 999 x 2 x 3"),
+        ({"NAXIS": 1000}, "NAXIS = 1000"),
+        ({"NAXIS1": -3}, "NAXIS1 = -3"),
+        ({"ROWORDER": "'UP'"}, "ROWORDER = 'UP'"),
+        ({"BSCALE": "1E306"}, "BSCALE = 1e"),
         ({"NAXIS1": 0}, "0 x 2"),
         ({"NAXIS1": 3000}, "cut short"),
         ({"NAXIS2": None}, "no NAXIS2"),
@@ -338,23 +343,23 @@ def test_a_third_axis_of_one_plane_is_accepted() -> None:
 )
 def test_an_unsupported_file_is_reported_in_one_line(cards: dict[str, object], says: str) -> None:
     with pytest.raises(UsageError, match=says) as caught:
-        primary_image(fits_file(PIXELS.astype(">i2"), 16, **cards), "night.fits")
+        fits_image(fits_file(PIXELS.astype(">i2"), 16, **cards), "night.fits")
     assert str(caught.value).startswith("night.fits: ")
     assert "\n" not in str(caught.value)
 
 
 def test_a_blank_value_that_no_pixel_has_is_accepted() -> None:
-    assert primary_image(fits_file(PIXELS.astype(">i2"), 16, BLANK=-32768), "x.fits").shape == (2, 3)
+    assert fits_image(fits_file(PIXELS.astype(">i2"), 16, BLANK=-32768), "x.fits").shape == (2, 3)
 
 
 def test_pixels_that_are_not_finite_are_refused() -> None:
     with pytest.raises(UsageError, match="not finite"):
-        primary_image(fits_file(np.array([[1.0, np.nan]]).astype(">f4"), -32), "x.fits")
+        fits_image(fits_file(np.array([[1.0, np.nan]]).astype(">f4"), -32), "x.fits")
 
 
 def test_a_header_without_an_end_is_refused() -> None:
     with pytest.raises(UsageError, match="no END"):
-        primary_image(fits_file(PIXELS.astype(">i2"), 16)[:400], "x.fits")
+        fits_image(fits_file(PIXELS.astype(">i2"), 16)[:400], "x.fits")
 
 
 @settings(max_examples=200, deadline=None)
@@ -364,7 +369,7 @@ def test_a_damaged_fits_file_gives_an_image_or_one_clear_line(data: st.DataObjec
     for _ in range(data.draw(st.integers(1, 8))):
         content[data.draw(st.integers(0, 800))] = data.draw(st.integers(0, 255))
     with contextlib.suppress(UsageError):
-        image = primary_image(bytes(content[: data.draw(st.integers(0, len(content)))]), "x.fits")
+        image = fits_image(bytes(content[: data.draw(st.integers(0, len(content)))]), "x.fits")
         assert image.ndim == 2
         assert np.all(np.isfinite(image))
 
@@ -393,3 +398,32 @@ def test_a_full_disk_loses_only_the_stored_frame(tmp_path: Path) -> None:
     keep_frame(KeptFrames(tmp_path / "file" / "frames", 3, "a"), np.zeros((2, 2), np.uint8), {})
     with pytest.raises(ValueError, match="no kept frame"):
         facts_of(b"P5\n2 2\n255\n")
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tiff"])
+def test_a_photograph_is_rotated_as_its_metadata_state(tmp_path: Path, name: str, orientation: int) -> None:
+    """The marks are at the top left, and the wide side of the stored image is the high one from 5 on."""
+    pixels = np.zeros((32, 48), dtype=np.uint8)
+    pixels[:8, :24], pixels[16:24, 8:16] = 200, 100
+    # Each orientation says where row 0 and column 0 of the stored image belong (EXIF 2.3, section 4.6.4).
+    stored = {
+        1: pixels,
+        2: pixels[:, ::-1],
+        3: pixels[::-1, ::-1],
+        4: pixels[::-1],
+        5: pixels.T,
+        6: np.rot90(pixels),
+        7: pixels[::-1, ::-1].T,
+        8: np.rot90(pixels, -1),
+    }
+    exif = pillow.Exif()
+    exif[0x0112] = orientation
+    pillow.fromarray(np.ascontiguousarray(stored[orientation])).save(tmp_path / name, exif=exif)
+    if name == "a.tiff" and orientation >= 5:
+        with pytest.raises(UsageError, match=f"Orientation = {orientation}"):
+            read_image(tmp_path / name)
+        return
+    image = read_image(tmp_path / name)
+    assert image.shape == (32, 48)
+    assert np.abs(image.astype(int) - pixels).max() <= (30 if name == "a.jpg" else 0)
