@@ -99,7 +99,7 @@ def world_coordinates(sky: SkyMap, reversed_rows: bool = False) -> dict[str, str
 
 def _in_file(points: FloatArray, rows: int) -> FloatArray:
     """Return pixels (n, 2) of an image as pixels of a file with the opposite order of rows."""
-    return points * np.array([1.0, -1.0]) + np.array([0.0, rows - 1.0])
+    return np.asarray(points * np.array([1.0, -1.0]) + np.array([0.0, rows - 1.0]))
 
 
 def _polynomials(

@@ -63,9 +63,12 @@ def run(options: argparse.Namespace) -> int:
             sys.stderr.write(f"{path}: {picture.reason}\n")
         return 1
     if options.json:
-        sys.stdout.write(json.dumps(_facts(lens, pictures), allow_nan=False) + "\n")
+        facts = _facts(lens, pictures) | {"mirrored": found.mirrored}
+        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
     else:
         sys.stdout.write(_text(lens, pictures))
+        if found.mirrored:
+            sys.stdout.write("mirrored:     yes; the lens is that of the pictures as they are\n")
     if options.out is None:
         return 0
     problem, stars = "", lens.calibration.stars

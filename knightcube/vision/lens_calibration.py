@@ -69,8 +69,11 @@ With a better lens model, more stars in the image corners match.
 """
 _MIN_SIGMA_PX = 0.02
 """Minimum standard deviation (px) of a star position, for errors that the covariance does not include."""
+_FIRST_SETTINGS = SolveSettings()
+"""Settings of the star tracker in the first pass, which recognises mirrored images."""
 _SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
-"""Settings of the star tracker that do not accept mirrored images, because a lens does not mirror."""
+"""Settings of the star tracker in later passes, which do not accept mirrored images."""
+_REVERSED = "it shows the mirrored sky, but the other pictures do not"
 _MIN_USED = 0.5
 """Minimum fraction of accepted matches of a frame at which the frame belongs to the common lens."""
 
@@ -608,10 +611,13 @@ class LensCalibration:
     Attributes:
         determined: lens, standard deviations, omitted terms and accuracy, or None if no image was solved.
         images: images in the given order, each with its solution or the reason for excluding it.
+        mirrored: whether the images show the mirrored sky. The lens is that of the given images, and the
+            solutions of the images are those of the images with left and right exchanged.
     """
 
     determined: DeterminedLens | None
     images: tuple[CalibrationImage, ...]
+    mirrored: bool = False
 
     def __bool__(self) -> bool:
         """Return whether a lens was determined."""
@@ -633,7 +639,8 @@ def calibrate_lens(
 
     All images must be taken by one camera at one focus setting. Images that do not fit the lens of the other
     images are excluded. Ten images with stars in the corners give a better calibration than a hundred
-    without. Lens terms that the stars do not determine are omitted.
+    without. Lens terms that the stars do not determine are omitted. If most images show the mirrored sky, as
+    behind a mirror or with reversed rows, they are mirrored back for the calibration.
 
     Args:
         images: arrays (rows, columns) of counts, all of one shape.
@@ -653,13 +660,22 @@ def calibrate_lens(
     model, scale = camera_of_field(fov_deg, None, images[0].shape)
     lens: DeterminedLens | None = None
     outcomes: list[CalibrationImage] = []
+    reversed_images: list[int] = []
     for round_number in range(1, _ROUNDS + 1):
         outcomes = []
         for number, image in enumerate(images, start=1):
             if progress is not None:
                 progress(round_number, number)
-            outcomes.append(CalibrationImage(solve_frame(image, model, scale, 1.0, sky, _SETTINGS)))
+            settings = _FIRST_SETTINGS if round_number == 1 else _SETTINGS
+            outcomes.append(CalibrationImage(solve_frame(image, model, scale, 1.0, sky, settings)))
         solved = [number for number, outcome in enumerate(outcomes) if outcome.solution.fix is not None]
+        reversed_images += [number for number in solved if outcomes[number].solution.mirrored]
+        if lens is None and 2 * len(reversed_images) > len(solved):
+            turned = [image[:, ::-1] for image in images]
+            return _mirrored_back(calibrate_lens(turned, fov_deg=fov_deg, progress=progress))
+        for number in reversed_images:
+            outcomes[number] = replace(outcomes[number], excluded=_REVERSED)
+        solved = [number for number in solved if number not in reversed_images]
         if not solved:
             return LensCalibration(None, tuple(outcomes))
         solutions = [outcomes[number].solution for number in solved]
@@ -673,6 +689,26 @@ def calibrate_lens(
             outcomes[solved[number]] = replace(outcomes[solved[number]], excluded=reason)
         model, scale = lens.calibration.lens, (0.999, 1.001)
     return LensCalibration(lens, tuple(outcomes))
+
+
+def _mirrored_back(found: LensCalibration) -> LensCalibration:
+    """Return the calibration of images from the calibration of the images with left and right exchanged."""
+    if found.determined is None:
+        return replace(found, mirrored=True)
+    determined = found.determined
+    calibration = determined.calibration
+    last = calibration.lens.columns - 1.0
+    lens = replace(calibration.lens, centre=(last - calibration.lens.centre[0], calibration.lens.centre[1]))
+    sign = np.array([-1.0 if name == "centre_x" else 1.0 for name in PARAMETERS])
+    covariance = calibration.covariance * np.outer(sign, sign)
+    omitted = dict(determined.omitted)
+    if "centre" in omitted:
+        x, y = omitted["centre"].values
+        omitted["centre"] = replace(omitted["centre"], values=(last - x, y))
+    calibration = replace(calibration, lens=lens, covariance=covariance)
+    return replace(
+        found, determined=replace(determined, calibration=calibration, omitted=omitted), mirrored=True
+    )
 
 
 def _matches(solution: FrameSolution, sky: SkyIndex) -> MatchedFrame:

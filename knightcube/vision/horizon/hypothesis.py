@@ -287,10 +287,6 @@ def examine(
         night = float(np.mean(sun_elevation(view, observation.rays.rays[members], sun) < _NIGHT))
     pixel = float(np.median(observation.rays.pixel[used]))
     air = UNIT_DEPTH_HEIGHT / (view.limb_distance * pixel)
-    altitude_off = 0.0
-    if not altitude_known:
-        (low, high), altitude = settings.altitudes, view.surface.height_of(view.position)
-        altitude_off = max(low - altitude, altitude - high, 0.0) / fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA)
     # The part of the limb that is known to be on the night side is not expected to show edges.
     rays = limb_rays(view, _FINE_RAYS)
     points = camera.project(rays)
@@ -314,8 +310,14 @@ def examine(
         chance + math.log10(stand.share),
         float(np.median(observation.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma),
         why_not_space(view, sun, observation.samples, pixel),
-        altitude_off,
+        0.0 if altitude_known else _altitude_off(fit, settings.altitudes),
     )
+
+
+def _altitude_off(fit: FittedLimb, altitudes: tuple[float, float]) -> float:
+    """Return the distance of the fitted altitude from the range `altitudes` (m), in standard deviations."""
+    (low, high), altitude = altitudes, fit.view.surface.height_of(fit.view.position)
+    return max(low - altitude, altitude - high, 0.0) / fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA)
 
 
 def _fitted(

@@ -192,7 +192,7 @@ class SkyMap:
         """Return pixels (n, 2) with left and right exchanged if the image shows the mirrored sky."""
         if not self.mirrored:
             return points
-        return np.array([2.0 * self.camera.centre[0], 0.0]) + points * np.array([-1.0, 1.0])
+        return np.asarray(np.array([2.0 * self.camera.centre[0], 0.0]) + points * np.array([-1.0, 1.0]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

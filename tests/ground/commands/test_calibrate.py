@@ -108,3 +108,20 @@ def test_a_file_that_is_there_is_not_overwritten(pictures: list[Path], tmp_path:
     assert done.returncode == 2
     assert "exists already" in done.stderr
     assert out.read_text() == "camera: mine\n"
+
+
+def test_mirrored_pictures_give_the_lens_of_the_pictures_as_they_are(
+    pictures: list[Path], tmp_path: Path
+) -> None:
+    """Two of three pictures are mirrored, and the third one is excluded and named."""
+    paths = [tmp_path / path.name for path in pictures]
+    for number, (path, source) in enumerate(zip(paths, pictures, strict=True)):
+        pixels = np.asarray(pillow.open(source))
+        pillow.fromarray(pixels if number == 1 else np.ascontiguousarray(pixels[:, ::-1])).save(path)
+    done = command("calibrate", *paths, "--fov", "12.3", "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["mirrored"]
+    assert [bool(each["left_out"]) for each in facts["pictures"]] == [False, True, False]
+    assert "mirrored" in facts["pictures"][1]["left_out"]
+    assert abs(facts["focal_length"] - NARROW.pinhole.focal_length) < 5.0 * facts["sigma"]["focal_length"]
