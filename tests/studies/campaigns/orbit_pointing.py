@@ -4,7 +4,8 @@ A 3U and the KnightCube. Cells `hold` start at nadir along the flight with nothi
 revolutions and more; the first one teaches the filter the residual dipole and the torques and is not judged.
 Cells `day` are the same over a day, a quarter of the runs. Cells `heavy` are the same over half a day in the
 dense air of a solar maximum; of their star attitudes it is counted how many the filter rejected, and how
-many in a row. Cells `turn` start 30 to 180 deg off nadir, Sun
+many in a row. Cells `unknown` are holds of a body whose moments, principal axes and coils differ from the
+described ones by up to the default accuracies. Cells `turn` start 30 to 180 deg off nadir, Sun
 or an inertial attitude, turning at 0.3 deg/s, and fly 100 min: `arrived` counts bodies whose pointing axis
 comes within ARRIVED deg and stays there for the rest, half a revolution at least; `lost` is farther than
 LOST deg off at the end. A turn about that axis is cheap (WEIGHTS of `orbit_pointing_flight`),
@@ -15,13 +16,18 @@ drag, sunlight, and the turn of the principal axes; the residual dipole is alway
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.rigid_body import BodyErrors
+from sim_hal.description_errors import DescriptionErrors
+from sim_hal.worlds.free_body import CRAFTS
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
+from tests.studies.campaigns.detumble import description
 from tests.studies.campaigns.free_flight import WATTS
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, TARGETS, PointingFlight
 
@@ -40,6 +46,8 @@ HOLDS = (
     ("knightcube", 0.3, 5.0),
 )
 """Craft, share, and deg rms wanted of issue 19."""
+UNKNOWN = {"cubesat_3u": 1.2, "knightcube": 2.0}
+"""Wanted deg rms of the nadir axis of an unknown body, at a share of 0.3 (issue 34)."""
 DAYS = (("cubesat_3u", 1.0), ("knightcube", 0.3))
 """Craft and share."""
 DAY = 86_400.0
@@ -63,6 +71,9 @@ def cases(runs: int, seed: int) -> list[Case]:
         for craft, share in DAYS if 4 * run < max(runs, 4) else ():
             same = {"kind": "day", "craft": craft, "share": share, "target": "nadir"}
             found.append(Case(f"day/{craft}/{share}/{run}", (seed, run), same | {"seconds": DAY}))
+        for craft in UNKNOWN:
+            same = {"kind": "unknown", "craft": craft, "share": 0.3, "target": "nadir"}
+            found.append(Case(f"unknown/{craft}/0.3/{run}", (seed, run), same))
         for craft in WATTS:
             for orbit, density in HEAVY:
                 same = {"kind": "heavy", "craft": craft, "share": HEAVY_SHARE, "target": "nadir"}
@@ -79,7 +90,9 @@ def run(case: Case) -> Result:
     """Fly the case."""
     wanted = case.parameters
     turns = wanted["kind"] == "turn"
-    flight = PointingFlight(wanted, case.seed[0] * 100_003 + case.seed[1])
+    seed = case.seed[0] * 100_003 + case.seed[1]
+    errors = {"description": unknown_body(wanted["craft"], seed)} if wanted["kind"] == "unknown" else {}
+    flight = PointingFlight({**wanted, **errors}, seed)
     seconds = wanted.get("seconds", 6_000.0 if turns else 2.5 * REVOLUTION)
     for cycle in range(round(seconds / CYCLE)):
         flight.cycle(cycle * CYCLE)
@@ -88,6 +101,14 @@ def run(case: Case) -> Result:
     notes = np.array(flight.notes)
     facts = {**wanted, "hours": float(notes[-1, 0] / 3600.0), **_stars(flight.passed)}
     return facts | (_arrival(wanted, notes) if turns else _hold(notes, seconds))
+
+
+def unknown_body(craft: str, seed: int) -> DescriptionErrors:
+    """Return errors of the described inertia, and of the gain and axis of each coil, drawn by a seed."""
+    generator, bounds = np.random.default_rng([seed, 0xC011]), BodyErrors()
+    coils = np.eye(3) + bounds.coil_axes * generator.uniform(-1.0, 1.0, (3, 3))
+    np.fill_diagonal(coils, 1.0 + bounds.coil_gain * generator.uniform(-1.0, 1.0, 3))
+    return replace(description("inertia", seed, CRAFTS[craft].inertia), coils=coils)
 
 
 def _stars(passed: Sequence[bool]) -> Result:
@@ -151,6 +172,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return pointing errors and arrivals by craft and share."""
     facts: dict[str, Any] = {"hold": {}, "heavy": {}, "turn": {}}
     held = [("hold", *cell) for cell in HOLDS] + [("day", *cell, None) for cell in DAYS]
+    held += [("unknown", craft, 0.3, wanted) for craft, wanted in UNKNOWN.items()]
     for kind, craft, share, wanted in held:
         mine = _of(results, kind, craft, share)
         if judged := [r for r in mine if "rms" in r]:
