@@ -194,7 +194,8 @@ switch_release() {
         place 644 "$source/hal/buses/smbus_byte.py" "$folder/smbus_byte.py"
         # The checksums come last: an interrupted update leaves one folder that agrees with its checksums.
         if [ -n "$dry" ]; then
-            echo "would write: $folder/sums"
+            (cd "$folder" && sha256sum --check --strict --status sums) 2>/dev/null ||
+                echo "would write: $folder/sums"
         else
             (cd "$folder" && sha256sum $programs smbus_byte.py >.sums)
             place 644 "$folder/.sums" "$folder/sums"

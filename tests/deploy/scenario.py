@@ -129,7 +129,7 @@ def _renewal(service: Service) -> dict[str, Any]:
     own, unit, old = Path("/var/lib/knightcube-renewal"), "knightcube-renewal.service", service.pid()
     systemctl("start", unit)
     before = service.pid() == old
-    (own / "restart").touch()
+    (own / "restart").write_text("flight", encoding="ascii")
     systemctl("start", unit)
     wait(lambda: service.pid() not in (0, old) and service.show("ActiveState") == "active", 30.0)
     return {
