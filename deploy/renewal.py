@@ -844,7 +844,7 @@ def main(words: Sequence[str]) -> int:
     options = parser.parse_args(words)
     board = Board(options.root)
     board.own.mkdir(parents=True, exist_ok=True)
-    with open(board.own / "lock", "w", encoding="ascii") as lock:
+    with open(board.own / "lock", "a", encoding="ascii") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | (0 if options.accepted else fcntl.LOCK_NB))
         except OSError:
