@@ -35,8 +35,9 @@ def call(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
 class Image:
     """The files of a board that is not running."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, environment: Path | None = None) -> None:
         self.root = root
+        self.environment = environment or root.parent / "environment"
         self.config = self.root / "etc/knightcube/flight.yaml"
         self.sum = self.root / "etc/knightcube/flight.yaml.sha256"
         self.rules = self.root / "etc/udev/rules.d/99-knightcube.rules"
@@ -47,7 +48,7 @@ class Image:
 
     def install(self, *words: str) -> tuple[int, str]:
         """Install with an environment that runs the code of this folder."""
-        python = self.root.parent / "environment" / "bin" / "python"
+        python = self.environment / "bin" / "python"
         if not python.exists():
             python.parent.mkdir(parents=True)
             python.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} "$@"\n', encoding="utf-8")
@@ -73,7 +74,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Image:
 def image(installed: Image, tmp_path: Path) -> Image:
     """Return a copy of an image with the testbed's configuration installed."""
     shutil.copytree(installed.root, tmp_path / "image", symlinks=True)
-    return Image(tmp_path / "image")
+    return Image(tmp_path / "image", installed.environment)
 
 
 def test_everything_is_put_in_its_place_once(image: Image) -> None:

@@ -161,7 +161,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         if result["which"] == "another"
         or not result["answers"]
         or (result["which"] == "new") != result["stays"]
-        or (result["flaw"] and result["which"] != "old")
+        or (result["flaw"] not in {"", "reacts"} and result["which"] != "old")
     ]
     which = Counter(f"{result['kind']} {result['flaw'] or 'good'}: {result['which']}" for result in results)
     killed = sum(result["killed"] for result in results)
