@@ -252,7 +252,7 @@ class SatelliteEstimation(BodyEstimation):
             gains = np.full(len(coils.current_limits), errors.coil_gain)
             corrected = self.coil_monitor.correction.deviations[used] / _UNIFORM
             gains[: len(corrected)] = np.maximum(errors.coil_gain, corrected)
-            self.orbit_filter.renew_coils(coils.error_covariance(gains, errors.coil_axes))
+            self.orbit_filter.renew_coils(coils.error_covariance(gains, errors.coil_axes), used)
 
     def knowledge(self) -> Knowledge:
         """Return how well the attitude is known."""

@@ -25,7 +25,7 @@ from flight.bodies.orbit.environment import StuckFieldCheck
 from flight.loop.body import ReadingAgreement
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
-from knightcube.astro.arrays import FloatArray, IntArray, cross_matrix, cross_product
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_matrix, cross_product
 from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
 from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation import estimate as form
@@ -118,7 +118,8 @@ class FilterStep:
 
     Attributes:
         dipole: mean commanded dipole (3,), A m^2.
-        doubt: standard deviation of the true dipole from `dipole`, A m^2 per axis; zero for known dipoles.
+        doubt: standard deviation of the true dipole from `dipole` beyond that of the coils' matrix, A m^2
+            per axis; zero for known dipoles of three coils.
         gyro: mean angular rate (3,), rad/s, of `samples` gyro readings, whose mean time is `gyro_ns`.
         impulse: time integral (3,), A m^2 s, of the dipole from a gyro reading to the end of the step,
             averaged over the readings.
@@ -280,7 +281,7 @@ class StepReplay:
             self.contradicted, self._refused_ns = self.contradicted + 1, now_ns
         elif steps[-1].dipole.any() or now_ns - self._refused_ns >= FORGOTTEN_NS:
             self.contradicted = 0  # coils that are off between two commands give no evidence
-        if refused and not steps[-1].doubt:
+        if refused and steps[-1].doubt < self._settings.dipole_limit:
             first = max(len(steps) - 2, 0)
             for k in range(first, len(steps)):
                 steps[k].doubt = self._settings.dipole_limit
@@ -620,6 +621,8 @@ class OrbitFilter:
         self._open: OpenStep | None = None
         self._field_check = StuckFieldCheck()
         self._refused_attitudes = 0
+        self._shifted = 0.0  # error (A m^2) of redundant coils in the open step beyond their matrix
+        self._shares = settings.coils.linear_shares(np.ones(len(settings.coils.current_limits), dtype=bool))
         self._placed_ns = 0  # time of the last attitude that was used
         self.restarts = 0
 
@@ -719,7 +722,12 @@ class OrbitFilter:
 
         The flag `known` states whether the coils certainly carry these currents.
         """
-        x, y, z = self._settings.coils.dipole(currents).tolist()
+        coils, gain = self._settings.coils, self._settings.free.errors.coil_gain
+        x, y, z = coils.dipole(currents).tolist()
+        if coils.is_redundant:
+            # The matrix of the coils holds only for currents that are linear in the dipole.
+            shifted = coils.dipoles * (currents - self._shares @ currents)
+            self._shifted = max(self._shifted, gain * float(np.linalg.norm(shifted)) / 3.0)
         self._dipoles.record(time_ns, (x, y, z), known)
 
     def mark_unknown(self, since_ns: int) -> None:
@@ -736,9 +744,10 @@ class OrbitFilter:
         self._replay.correct_coils(change, deviations)
         self._dipoles.unknown_ns = max(self._dipoles.unknown_ns, self.measured_ns)
 
-    def renew_coils(self, covariance: FloatArray) -> None:
-        """Reset the learned matrix of the coils to a covariance (9, 9), because the allocation changed."""
+    def renew_coils(self, covariance: FloatArray, used: BoolArray) -> None:
+        """Reset the learned matrix to a covariance (9, 9), because the coils `used` (n,) are in use now."""
         self._close()
+        self._shares = self._settings.coils.linear_shares(used)
         self._replay.renew_coils(covariance)
 
     def accept(self, reading: ImuReading) -> bool:
@@ -863,7 +872,8 @@ class OrbitFilter:
         around = self._around((begin_ns + end_ns) // 2)
         if around is None:
             return
-        doubt = self._settings.dipole_limit if self._dipoles.unknown_ns >= begin_ns else 0.0
+        doubt = self._settings.dipole_limit if self._dipoles.unknown_ns >= begin_ns else self._shifted
+        self._shifted = 0.0
         step = gathered.close(self._dipoles.mean(begin_ns, end_ns), doubt, around)
         self._replay.add(step)
         self._replay.follow_gyro()

@@ -155,6 +155,15 @@ class CoilMap:
             value, held, weights = at(multipliers)
         return held
 
+    def linear_shares(self, used: BoolArray) -> FloatArray:
+        """Return the matrix (n, n) from currents to the currents of least heat with the same dipole moment.
+
+        Only the coils `used` (n,) carry the currents of least heat, which are linear in the dipole moment.
+        """
+        weights = np.sqrt(self.resistance / self.resistance.max())
+        inverse = np.linalg.pinv(self.dipoles * used / weights) / weights[:, None]
+        return np.asarray(inverse @ self.dipoles)
+
     def dipole(self, currents: FloatArray) -> FloatArray:
         """Return the dipole moment (3,), A m^2, of currents (n,), A."""
         if self._strength is not None:

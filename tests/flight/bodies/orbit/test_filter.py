@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -98,6 +100,9 @@ class Flown:
     def error(self) -> float:
         """Return the error of the present attitude, rad."""
         return float(angle_between(self.filter.at(self.time_ns).quaternion, self.attitude))
+
+    def _reading_at(self, time_ns: int) -> ImuReading:
+        return replace(self._reading(), time_ns=time_ns, arrival_ns=time_ns)
 
     def _reading(self) -> ImuReading:
         noise = self.generator.standard_normal(6)
@@ -355,3 +360,30 @@ def test_the_impulse_of_a_dipole_is_that_by_which_a_rate_differs_from_its_mean()
     assert history.impulse(SECOND_NS, 2 * SECOND_NS) == pytest.approx([0.0, 0.04, 0.0]), (
         "half of a constant dipole"
     )
+
+
+def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_less_certain() -> None:
+    """The matrix of four coils holds for the least heat of all coils, or of those that are not isolated."""
+    flown = acquired()
+    pyramid = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
+    coils = CoilMap(pyramid, np.full(4, 0.1), np.full(4, 30.0))
+    errors = BodyErrors(coil_gain=0.2)
+    settings = replace(flown.filter._settings, coils=coils, free=FreeFilterSettings(errors=errors))
+    idle = 0.02 * np.array([1.0, -1.0, 1.0, -1.0])  # a current without a dipole
+    linear = coils.currents(np.array([DIPOLE, 0.0, 0.0]))
+    doubts = []
+    for used, currents in (
+        (np.ones(4, dtype=bool), linear),
+        (np.ones(4, dtype=bool), linear + idle),
+        (np.array([True, True, True, False]), linear + linear[3] * np.array([1.0, -1.0, 1.0, -1.0])),
+    ):
+        filter_ = OrbitFilter(settings, around)
+        if not used.all():
+            filter_.renew_coils(np.zeros((9, 9)), used)
+        filter_.command(0, currents)
+        for cycle in range(60):
+            filter_.accept(flown._reading_at(cycle * PERIOD_NS))
+            filter_.command((cycle + 1) * PERIOD_NS, currents)
+        doubts.append(filter_._steps[0].doubt)
+    expected = 0.2 * 0.02 * np.sqrt(12.0) / 3.0  # four coils of length sqrt(3) m^2 per ampere
+    assert doubts == pytest.approx([0.0, expected, 0.0], abs=1e-12)

@@ -122,6 +122,20 @@ def test_the_coils_that_work_have_their_own_limits_and_heat() -> None:
         CoilMap.equal(0.6, 0.1).working(np.zeros(3, dtype=bool))
 
 
+def test_the_linear_shares_of_coils_are_those_of_the_allocation_below_the_limits() -> None:
+    pyramid = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
+    coils = CoilMap(pyramid, np.full(4, 0.1), np.array([10.0, 20.0, 30.0, 40.0]))
+    every, three = np.ones(4, dtype=bool), np.array([True, True, False, True])
+    wanted = np.array([0.01, -0.02, 0.03])
+    linear = coils.currents(wanted)
+    np.testing.assert_allclose(coils.linear_shares(every) @ linear, linear)
+    other = linear + 0.01 * np.array([1.0, -1.0, 1.0, -1.0])  # the same dipole
+    np.testing.assert_allclose(coils.linear_shares(every) @ other, linear)
+    shared = coils.linear_shares(three) @ other
+    assert shared[2] == 0.0
+    np.testing.assert_allclose(pyramid @ shared, wanted)
+
+
 def test_the_covariance_of_redundant_coils_is_that_of_drawn_errors() -> None:
     pyramid = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [0.7, 0.7, 0.7, 0.7]])
     coils = CoilMap(pyramid, np.full(4, 0.1), np.array([10.0, 20.0, 30.0, 40.0]))
