@@ -22,7 +22,7 @@ from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex, load_once
-from knightcube.vision.startracker.sky_map import Pointing, SkyMap
+from knightcube.vision.startracker.sky_map import ASPECT, Pointing, SkyMap
 from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, RatePrior, SolveSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 
@@ -295,7 +295,9 @@ def _solution(
     pointing = Pointing(math.nan, math.nan, math.nan) if fix is None else Pointing.of(fix.quaternion)
     if fix is None:
         matched = matched[:0]
-    fov = math.nan if fix is None else field_of_view(frame.camera)
+    # The aspect of the pixels changes the focal length along the columns.
+    camera = frame.camera.rescaled(1.0 / (1.0 + float(frame.bend[ASPECT])))
+    fov = math.nan if fix is None else field_of_view(camera)
     star = frame.star[matched]
     measured = motion if exposure_known else None
     return StarSolution(

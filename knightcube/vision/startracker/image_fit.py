@@ -34,7 +34,7 @@ from knightcube.vision.startracker.attitude_fit import (
     stretched,
     turned,
 )
-from knightcube.vision.startracker.sky_map import BENDS, bend_slope, bent
+from knightcube.vision.startracker.sky_map import ASPECT, BENDS, bend_slope, bent
 
 _MOST_STEPS = 8
 _SETTLED = 1e-11
@@ -57,8 +57,8 @@ class Unknowns:
 
     Attributes:
         scale: whether the scale of the image, and thus the focal length, is fitted.
-        bend: reciprocal prior variances (6,) of tilt, decentring and distortion of the lens (`sky_map`);
-            empty (0,) if the lens is exact.
+        bend: reciprocal prior variances (6,) of tilt, decentring and distortion of the lens (`sky_map`), or
+            (8,) if the pixels may not be square; empty (0,) if the lens is exact.
         late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
             line time; (0, 2) if the line time is exact.
         scatter: whether a variance common to all stars may be added to the variances of the positions.
@@ -81,8 +81,9 @@ class ImageFit:
         fix: attitude from the stars that agree; its covariance is increased if their residuals are too large.
         scale: factor by which the observed tangents x/z, y/z must be multiplied; 1 if the focal length was
             fixed.
-        scale_sigma: relative standard deviation of the scale; 0 if the focal length was fixed.
-        bend: fitted tilt, decentring and distortion of the lens (6,), see `sky_map`; zeros for an exact lens.
+        scale_sigma: relative standard deviation of the scale along the columns; 0 if the focal length was
+            fixed.
+        bend: fitted lens errors (8,), see `sky_map`; zeros for an exact lens.
         delay: fitted error of the shutter's line time, in standard deviations.
         squares: chi-square of the residual of each star (n,), with two degrees of freedom.
         agree: mask of the stars that were used for the attitude (n,).
@@ -135,13 +136,17 @@ def fit_in_image(
     inverse = pose.covariance * inflation(squares[agree], seen.parameters(pose))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
     fix = AttitudeFix(from_matrix(pose.matrix), turn, 0.5 * float(squares[agree].sum()))
-    scale_sigma = float(np.sqrt(inverse[3, 3])) if unknowns.scale else 0.0
+    along = np.zeros(len(inverse))
+    along[3 : 3 + int(unknowns.scale)] = 1.0
+    if unknowns.scale and len(unknowns.bend) == BENDS:
+        along[4 + ASPECT] = 1.0
+    scale_sigma = float(np.sqrt(along @ inverse @ along))
     return ImageFit(fix, pose.scale, scale_sigma, pose.bend, pose.delay, squares, agree)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FittedPose:
-    """Fitted attitude matrix (3, 3), scale, lens errors (bend, (6,)) and delay, and their covariance."""
+    """Fitted attitude matrix (3, 3), scale, lens errors (bend, (8,)) and delay, and their covariance."""
 
     matrix: FloatArray
     scale: float
@@ -224,12 +229,12 @@ class _Seen:
         return replace(self._pose(matrix, scale, held), covariance=np.asarray(inverse, dtype=np.float64))
 
     def _pose(self, matrix: FloatArray, scale: float, held: FloatArray) -> _FittedPose:
-        """Return a pose; `held` contains the fitted lens errors (bend) and delay: 0, 1, 6 or 7 values."""
+        """Return a pose; `held` contains the fitted lens errors (bend, 0, 6 or 8) and the delay (0 or 1)."""
         bends = len(self.unknowns.bend)
         return _FittedPose(matrix, scale, np.pad(held[:bends], (0, BENDS - bends)), float(held[bends:].sum()))
 
     def _slope(self, whitener: FloatArray, seen: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the derivatives of the residuals, scaled to unit variance, by the parameters, (2n, 3 to 11).
+        """Return the derivatives of the residuals, scaled to unit variance, by the parameters, (2n, 3 to 13).
 
         The parameters are the rotation, ln scale, the lens errors (bend) and the delay, as far as they are
         fitted.
@@ -238,7 +243,7 @@ class _Seen:
         if self.unknowns.scale:
             slopes.append(whitener @ scale_slope(seen)[:, :, None])
         if len(self.unknowns.bend):
-            slopes.append(whitener @ bend_slope(seen))
+            slopes.append(whitener @ bend_slope(seen)[:, :, : len(self.unknowns.bend)])
         if len(self.late):
             slopes.append(-whitener @ self.late[:, :, None])
         return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)

@@ -6,8 +6,9 @@ up to 20.8". Aberration is computed by the exact formula of special relativity (
 
 The conversion also includes lens errors: tilt and decentring, which displace the optical axis from the image
 centre, and distortion. The lens errors displace a point with the tangents u by (u . a) u + |u|^2 b + k |u|^2
-u + l |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966). The vector (a, b, k, l) of the six
-lens errors is called the bend of the lens.
+u + l |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966). Pixels that are not square, as in a
+picture that was scaled differently along its axes, displace the point by p (u_x, -u_y) + q (u_y, u_x), with
+aspect p and shear q. The vector (a, b, k, l, p, q) of the eight lens errors is called the bend of the lens.
 
 `Pointing` gives the right ascension, declination and roll of an attitude.
 """
@@ -45,25 +46,28 @@ def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
     return np.asarray(shifted / (1.0 + along))
 
 
-BENDS = 6
+BENDS, ASPECT = 8, 6
+"""Number of lens errors in the bend of a lens, and index of the aspect."""
 # Standard deviation of the tilt of a typical lens, relative to the corner's tangent (20 px of 1024 px).
 # Standard deviations of a typical lens's two distortion terms at the image corner (3 % and 1 %).
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
+_ASPECT = 0.01
+"""Prior standard deviation of aspect and shear; 0.01 changes the ratio of width to height by 2 %."""
 
 # Minimum standard deviations of the optical axis (px) and of the distortion (relative to the radius).
 _LEAST_CENTRE, _LEAST_DISTORTION = 1e-3, 1e-6
 
 
 def usual_bend(camera: CameraModel) -> FloatArray:
-    """Return the reciprocal prior variances (6,) of the lens errors of a typical uncalibrated lens."""
+    """Return the reciprocal prior variances (8,) of the lens errors of a typical uncalibrated lens."""
     corner = float(np.tan(camera.half_diagonal))
     first, second = _DISTORTION
     off = [_TILT * corner] * 2 + [_TILT * first / corner] * 2
-    return np.array([*off, first / corner**2, second / corner**4]) ** -2.0
+    return np.array([*off, first / corner**2, second / corner**4, _ASPECT, _ASPECT]) ** -2.0
 
 
 def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
-    """Return the reciprocal prior variances (6,) of the lens errors of a lens of known accuracy.
+    """Return the reciprocal prior variances (6,) of lens errors for a known accuracy and square pixels.
 
     For an exact lens, an empty array (0,) is returned. An error of the optical axis in the image acts as a
     tilt of the lens. The common rotation of all stars by an error of the optical axis counts as an error of
@@ -79,7 +83,7 @@ def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
 
 
 def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
-    """Return unit vectors (n, 3) corrected for the lens errors `bend` (6,)."""
+    """Return unit vectors (n, 3) corrected for the lens errors `bend` (8,)."""
     if not bend.any():
         return direction
     out = direction + bend_slope(direction) @ bend
@@ -87,7 +91,7 @@ def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
 
 
 def bend_slope(seen: FloatArray) -> FloatArray:
-    """Return derivatives (n, 3, 6) of unit vectors `seen` (n, 3) by the six lens errors."""
+    """Return derivatives (n, 3, 8) of unit vectors `seen` (n, 3) by the eight lens errors."""
     tangent = seen[:, :2] / seen[:, 2:]
     square = np.sum(tangent**2, axis=1, keepdims=True)
     # Tilt and distortion scale a tangent u by relative amounts proportional to u_x, u_y, |u|^2 and |u|^4.
@@ -95,7 +99,9 @@ def bend_slope(seen: FloatArray) -> FloatArray:
     stretch = scale_slope(seen)[:, :, None] * along[:, None, :]
     across = np.eye(3)[:, :2] - seen[:, :, None] * seen[:, None, :2]
     shift = across * (seen[:, 2:] * square)[:, :, None]
-    return np.asarray(np.concatenate([stretch[:, :, :2], shift, stretch[:, :, 2:]], axis=2))
+    aspect, shear = tangent * np.array([1.0, -1.0]), tangent[:, ::-1]
+    pixels = across @ (np.stack([aspect, shear], axis=2) * seen[:, 2:, None])
+    return np.asarray(np.concatenate([stretch[:, :, :2], shift, stretch[:, :, 2:], pixels], axis=2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +163,7 @@ class SkyMap:
     Attributes:
         camera: camera model.
         quaternion: attitude quaternion (4,) from ICRS to camera axes.
-        bend: tilt, decentring and distortion that the camera model does not include (6,); zeros if the lens
-            is exact.
+        bend: lens errors that the camera model does not include (8,); zeros if the lens is exact.
         velocity: velocity of the camera (3,), m/s, by which directions are corrected for aberration, or None
             for no correction.
         mirrored: whether the image shows the mirrored sky; the attitude is then that of the image with left

@@ -69,8 +69,7 @@ class FrameSolution:
         expected: predicted positions of the guide stars (n, 2), px, or NaN for a point without a guide star.
         fix: attitude from ICRS to camera axes and its covariance; the quaternion's scalar is not negative.
         scale_sigma: relative standard deviation of the focal length; 0 if the focal length was given.
-        bend: fitted tilt, decentring and distortion of the lens (6,), see `sky_map`; zeros if the lens is
-            exact.
+        bend: fitted lens errors (8,), see `sky_map`; zeros if the lens is exact.
         log10_false_alarm: log10 of the probability that a frame of random points would have been solved.
         tracked: whether the stars were identified by a search near the prior attitude.
         motion: motion of the camera from the streaks, camera frame, or None for points.

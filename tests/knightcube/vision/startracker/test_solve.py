@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import (
@@ -22,7 +23,9 @@ from knightcube.astro.quaternion import (
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.star_tracker import StarTracker
 from knightcube.vision.startracker.detection import FrameKind
+from knightcube.vision.startracker.sky_map import ASPECT
 from knightcube.vision.startracker.solve import (
     ENDS,
     MEAN,
@@ -266,3 +269,36 @@ def test_the_kind_of_motion_determines_the_time_weighting() -> None:
     assert weighting_of(FrameMotion(moved, 0, 1.0)) is ENDS
     assert weighting_of(MotionResult(StreakStatus.AMBIGUOUS, 0, 1.0)) is ENDS
     assert weighting_of(MotionResult(moved, 0, 1.0, rate_model="accelerating")) is MIDDLE
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not _PHOTOGRAPHS.is_dir(), reason="needs ../shared/data/sky")
+@pytest.mark.parametrize("name", ["esa_alt40_azi45.tiff", "orion2.jpg"])
+@pytest.mark.parametrize(
+    ("aspect", "shear", "tangential"),
+    [(0.004, 0.0, 0.0), (-0.01, 0.0, 0.0), (0.02, 0.0, 0.0), (0.0, 0.008, 0.0), (0.0, 0.0, 0.008)],
+)
+def test_a_distorted_photograph_is_solved_within_its_claim_or_refused(
+    name: str, aspect: float, shear: float, tangential: float
+) -> None:
+    """The truth is the solution of the photograph itself; the distortion leaves the image centre in place."""
+    pixels = read_image(_PHOTOGRAPHS / name)
+    rows, columns = pixels.shape
+    y, x = np.mgrid[:rows, :columns].astype(float)
+    u, v = (2.0 * x - columns + 1.0) / columns, (2.0 * y - rows + 1.0) / columns
+    right = aspect * u + shear * v + tangential * (3.0 * u * u + v * v)
+    down = -aspect * v + shear * u + 2.0 * tangential * u * v
+    places = [y + 0.5 * columns * down, x + 0.5 * columns * right]
+    warped = map_coordinates(pixels.astype(float), places, order=1, mode="nearest").astype(pixels.dtype)
+    plain, found = StarTracker(10.8).solve(pixels), StarTracker(10.8).solve(warped)
+    assert plain
+    if not found:
+        assert abs(aspect) > 0.01
+        return
+    turn = to_rotation_vector(multiply(found.quaternion, conjugate(plain.quaternion)))
+    spread = np.sqrt(np.diag(found.covariance + plain.covariance))
+    assert np.all(np.abs(turn) < 3.0 * spread)
+    if tangential == 0.0:
+        assert found.frame.bend[ASPECT:].tolist() == pytest.approx([aspect, shear], abs=0.001)
+        expected = plain.field_of_view * (1.0 + aspect)
+        assert found.field_of_view == pytest.approx(expected, abs=4.0 * found.field_of_view_sigma + 2e-4)
