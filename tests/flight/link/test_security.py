@@ -249,6 +249,28 @@ def test_a_block_of_counters_ends_when_another_sender_has_reserved_counters(grou
     assert counters == sorted(set(counters)), "the receiver refuses a counter below the highest"
 
 
+def test_a_block_of_counters_is_used_up_without_another_reservation(ground: Vault) -> None:
+    sealer = Sealer(ground, 1, bytes(5), 3, shared=True)
+    counters, reserved = [], []
+    for _ in range(7):
+        counters.append(sealer.seal(bytes(5), b"x")[1])
+        entry = ground.read(1)
+        assert entry is not None
+        reserved.append(entry.unused)
+    assert counters == [0, 1, 2, 3, 4, 5, 6]
+    assert reserved == [3, 3, 3, 6, 6, 6, 9]
+
+
+def test_a_sender_uses_its_reserved_counters_although_both_copies_are_lost(ground: Vault) -> None:
+    sealer = Sealer(ground, 1, bytes(5), 3, shared=True)
+    assert sealer.seal(bytes(5), b"x")[1] == 0
+    for path in ground.folder.glob("spi-1.*"):
+        path.unlink()
+    assert [sealer.seal(bytes(5), b"x")[1] for _ in range(2)] == [1, 2]
+    with pytest.raises(FlightError, match="both copies of the counter of SPI 1 are lost"):
+        sealer.seal(bytes(5), b"x")
+
+
 def test_no_nonce_is_used_twice_if_the_folder_is_restored_from_a_backup(ground: Vault) -> None:
     draw = random.Random(7)
     backup = {path: path.read_bytes() for path in ground.folder.glob("spi-*")}

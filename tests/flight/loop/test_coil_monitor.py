@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flight.loop.coil_currents import (
+    ELECTRICAL,
     MEAN,
     NEWEST,
     PLACE,
@@ -20,7 +21,7 @@ from flight.loop.coil_currents import (
     predict,
     supply_currents,
 )
-from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings, StuckLeg
+from flight.loop.coil_monitor import BrakeProof, CoilMonitor, CoilMonitorSettings, StuckLeg
 from flight.loop.coil_response import Evidence
 from hal.interfaces.devices import NO_AXES, ImuReading, PowerReading
 from knightcube.astro.arrays import FloatArray
@@ -94,6 +95,23 @@ def test_a_probe_of_few_readings_rejects_a_fault_that_explains_all_earlier_readi
     evidence.add([_alone(0, 0.04)] * 2)
     assert [axis for axis, fault in evidence.possible_faults({}) if fault is CoilFault.OPEN] == [1, 2]
     assert len(evidence) == 42
+
+
+def test_cleared_evidence_contains_no_earlier_readings() -> None:
+    evidence = Evidence(BOUNDS)
+    evidence.add([_alone(0, 0.04)] * 3)
+    evidence.begin_segment()
+    evidence.add([_alone(1, 0.0)] * 2)
+    assert len(evidence.possible_faults({})) < 3 * len(ELECTRICAL)
+    evidence.clear()
+    assert (len(evidence), evidence.readings()) == (0, [])
+    assert len(evidence.possible_faults({})) == 3 * len(ELECTRICAL)
+    evidence.add([_alone(2, 0.04)] * 2)
+    assert not evidence.shows_working_monitor({}), "the readings are those of the first segment"
+    evidence.begin_segment()
+    assert not evidence.rejects_healthy_now({}), "a segment without readings contradicts nothing"
+    evidence.add([_alone(2, 0.04)] * 2)
+    assert evidence.shows_working_monitor({})
 
 
 def test_normal_readings_of_another_coil_do_not_end_a_suspicion() -> None:
@@ -247,6 +265,32 @@ def test_a_verdict_of_a_stuck_leg_that_the_brake_does_not_bear_out_is_braked_no_
                 break
     assert not watch.braked
     assert not watch.available[0]
+
+
+@pytest.mark.parametrize(
+    ("samples", "wrong", "remains"),
+    [
+        ([True], [()], True),
+        ([True, True], [(), (0, 2)], False),
+        ([False, False], [(), ()], False),
+        ([True, False, True], [(), (), ()], True),
+        ([False, True, True], [(), (), (0, 2)], False),
+        ([True, False, False], [(), (), ()], False),
+    ],
+)
+def test_two_consecutive_samples_confirm_or_refute_that_a_brake_helps(
+    samples: list[bool], wrong: list[tuple[int, ...]], remains: bool
+) -> None:
+    proof = BrakeProof()
+    assert not proof
+    for axis in (0, 1, 2):
+        proof.add(axis)
+    proof.discard(1)
+    assert [tuple(sorted(proof.ingest(sample))) for sample in samples] == wrong
+    assert bool(proof) is remains
+    if not remains:
+        proof.add(1)
+        assert proof.ingest(True) == frozenset(), "the samples of an earlier brake do not count"
 
 
 def reading(time: float, current: float) -> PowerReading:

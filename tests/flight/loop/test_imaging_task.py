@@ -352,11 +352,11 @@ def test_a_torn_frame_is_counted_but_not_processed() -> None:
         bench.finish(FrameFound(motion(StreakStatus.TOO_SHORT), None), (at + 100) * MS)
     assert bench.reports == [events.CAMERA_TORN]
     assert (len(bench.jobs), bench.task.counts()[0]) == (2, 3)
-    assert [values["status"] for packet, values in bench.records if packet is STREAK] == [
-        "too-short",
-        "too-short",
-        "failed",
-    ]
+    assert [
+        (values["status"], values["sequence"], values["accepted"])
+        for packet, values in bench.records
+        if packet is STREAK
+    ] == [("too-short", 1, 0), ("too-short", 2, 0), ("failed", 3, 0)]
 
 
 def test_a_busy_worker_is_reported() -> None:
@@ -391,7 +391,8 @@ def test_a_failed_job_is_reported_and_recorded() -> None:
     bench.take(1, 1 * S, 1300 * MS)
     bench.finish(None, 1400 * MS, "died")
     assert bench.reports == [events.VISION_FAILED]
-    assert bench.only(STREAK)["status"] == "failed"
+    values = bench.only(STREAK)
+    assert (values["status"], values["sequence"], values["accepted"]) == ("failed", 1, 0)
 
 
 @pytest.mark.parametrize(

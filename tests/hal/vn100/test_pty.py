@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from flight.schema.sections import CONTROL_RATE_HZ
+from hal.buses import serial_port
 from hal.buses.clock import SystemClock
 from hal.buses.serial_port import PySerialPort
 from hal.drivers.vn100.driver import Vn100
@@ -92,6 +93,30 @@ def test_the_port_is_exclusive(served: tuple[str, subprocess.Popen[str]]) -> Non
     with pytest.raises(NotResponding, match="port free"):
         PySerialPort(served[0], 115200, clock)
     port.close()
+
+
+def test_an_open_port_cannot_be_opened_again_until_the_driver_closes_it() -> None:
+    near, far = os.openpty()
+    port = PySerialPort(os.ttyname(far), 115200, SystemClock())
+    driver = Vn100(port, SystemClock(), MISSION)
+    with pytest.raises(NotResponding, match="port free"):
+        PySerialPort(os.ttyname(far), 115200, SystemClock())
+    driver.close()
+    with pytest.raises(NotResponding, match="closed"):
+        driver.poll()
+    PySerialPort(os.ttyname(far), 57600, SystemClock()).close()
+    os.close(near)
+    os.close(far)
+
+
+def test_closing_ends_the_thread_that_waits_for_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial_port, "_READ_TIMEOUT_S", 60.0)
+    near, far = os.openpty()
+    port = PySerialPort(os.ttyname(far), 115200, SystemClock())
+    port.close()
+    assert not port._thread.is_alive()
+    os.close(near)
+    os.close(far)
 
 
 def test_a_port_that_is_not_there_is_named() -> None:

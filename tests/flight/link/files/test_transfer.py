@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from flight.link.files.transfer import (
     MOST_OPEN,
     NO_CHECKSUM,
     SATELLITE,
+    Entity,
     Ranges,
     add,
 )
@@ -290,6 +292,39 @@ def test_many_gaps_are_requested_in_order_and_a_bounded_number_at_a_time(tmp_pat
     gaps = [gap for nak in naks if isinstance(nak, Nak) for gap in nak.gaps]
     assert gaps[:-1] == [(2 * piece + 1, 2 * piece + 2) for piece in range(pieces - 1)]
     assert max(len(nak.gaps) for nak in naks if isinstance(nak, Nak)) < MOST_REQUESTS
+
+
+def _asked_at(end: Entity, seconds: Sequence[float]) -> list[float]:
+    """Return the times (s) at which an end requests missing data."""
+    return [
+        time
+        for time in seconds
+        for unit in iter(lambda: end.unit(round(time * 1e9)), None)  # noqa: B023 - used up at once
+        if isinstance(unpack(unit)[1], Nak)
+    ]
+
+
+def test_missing_data_are_requested_at_the_end_and_again_two_seconds_after_the_last_data(
+    tmp_path: Path,
+) -> None:
+    pair, transaction = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE)
+    end = pair.ends[SATELLITE]
+    end.take(pack(transaction, Metadata(40, "a", "a", CRC32)), 0)
+    end.take(pack(transaction, FileData(0, bytes(10))), 0)
+    end.take(pack(transaction, Eof(0, 1, 40)), 1_000_000_000)
+    assert _asked_at(end, [1.0, 1.5, 2.5]) == [1.0]
+    end.take(pack(transaction, FileData(10, bytes(10))), 2_500_000_000)
+    assert _asked_at(end, [3.0, 4.0, 4.4]) == [], "data arrived less than 2 s ago"
+    assert _asked_at(end, [4.5, 5.0, 6.4, 6.5]) == [4.5, 6.5]
+
+
+def test_without_an_end_missing_data_are_requested_ten_seconds_after_the_last_data(tmp_path: Path) -> None:
+    pair, transaction = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE)
+    end = pair.ends[SATELLITE]
+    end.take(pack(transaction, Metadata(40, "a", "a", CRC32)), 0)
+    end.take(pack(transaction, FileData(0, bytes(10))), 6_000_000_000)
+    assert _asked_at(end, [6.0, 10.0, 15.9]) == []
+    assert _asked_at(end, [16.0, 20.0, 25.9, 26.0]) == [16.0, 26.0]
 
 
 def _sliced(missing: set[int]) -> list[tuple[int, int]]:

@@ -174,6 +174,21 @@ def test_a_lost_schedule_is_reported_and_a_full_disk_refuses(
         Timetable(link.sky.folder).add(5, 1, 9, "ping 1")
 
 
+def test_a_due_command_that_cannot_be_removed_from_the_disk_is_reported_once_and_not_executed(
+    link: BothEnds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    due = send(link, Scheduled(in_seconds(link, 2), "ping 7"))
+    later = send(link, Scheduled(in_seconds(link, 600), "ping 8"))
+    monkeypatch.setattr(commanding, "overwrite", lambda *_: False)
+    link.turn(5.0)
+    assert link.obeyed == []
+    assert link.stages(due) == ["accepted", "completed", "failed"], "reported once"
+    assert texts(link, due)[-1].startswith("not executed, the schedule could not be stored: 1: ")
+    assert link.stages(later) == ["accepted", "completed"]
+    monkeypatch.undo()
+    assert texts(link, send(link, Listing()))[-1] == "1 scheduled"
+
+
 def test_words_are_read_by_the_table() -> None:
     assert command_of_words("slew -0.2") == Slew(-0.2)
     assert command_of_words("safe end of pass") == ChangeMode(Mode.SAFE, "end of pass")
