@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ from knightcube.reference.horizon import (
 )
 from knightcube.vision.camera.images import grey_stretch, read_image, write_picture
 from knightcube.vision.camera.lens import CameraModel, Pinhole
-from knightcube.vision.horizon.nadir import HorizonSolution, NadirMeasurement, find_nadir
+from knightcube.vision.horizon.nadir import HorizonSolution, HorizonStatus, NadirMeasurement, find_nadir
 from knightcube.vision.horizon.settings import (
     LEAST_ALTITUDE,
     EdgeSettings,
@@ -62,6 +62,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_picture(parser)
     add_field(parser, required=True)
+    parser.add_argument(
+        "--fov-error",
+        type=positive,
+        metavar="DEG",
+        help="standard deviation of --fov, which widens the uncertainties (default 0)",
+    )
     height = parser.add_mutually_exclusive_group()
     height.add_argument(
         "--altitude", type=positive, metavar="KM", help="altitude above the mean Earth radius"
@@ -100,7 +106,10 @@ def run(options: argparse.Namespace) -> int:
     response = None if options.log_response is None else LogarithmicResponse(*options.log_response)
     least, most = (1e3 * bound for bound in options.altitudes)
     settings = HorizonSettings(edges=EdgeSettings(response=response), altitudes=(least, most))
-    solution = find_nadir(pixels, camera, HorizonKnowledge(altitude=altitude), settings)
+    knowledge = HorizonKnowledge(altitude=altitude)
+    solution = find_nadir(pixels, camera, knowledge, settings)
+    if options.fov_error is not None:
+        solution = _widened(solution, options, pixels, knowledge, settings)
     if options.json:
         sys.stdout.write(json.dumps(_facts(solution, altitude is None), allow_nan=False) + "\n")
     else:
@@ -110,6 +119,38 @@ def run(options: argparse.Namespace) -> int:
         if not options.json:
             sys.stdout.write(f"picture:          {options.overlay}\n")
     return 0 if solution.nadir is not None else 1
+
+
+def _widened(
+    solution: HorizonSolution,
+    options: argparse.Namespace,
+    pixels: Image,
+    knowledge: HorizonKnowledge,
+    settings: HorizonSettings,
+) -> HorizonSolution:
+    """Return the solution with the uncertainties of nadir and altitude due to the error of the field of view.
+
+    The limb is searched again with the field of view larger and smaller by one standard deviation. Without a
+    limb in either search, the solution is refused.
+    """
+    nadir = solution.nadir
+    if nadir is None:
+        return solution
+    rows, columns = pixels.shape
+    others = []
+    for sign in (-1.0, 1.0):
+        field = math.radians(options.fov + sign * options.fov_error)
+        found = find_nadir(pixels, Pinhole.from_field_of_view(columns, rows, field), knowledge, settings)
+        others += [found.nadir] if found.nadir is not None else []
+    if not others:
+        reason = f"no limb is found with the field of view {options.fov_error:g} deg larger or smaller"
+        return replace(solution, status=HorizonStatus.REFUSED, reason=reason, nadir=None, candidates=(nadir,))
+    across = np.eye(3) - np.outer(nadir.direction, nadir.direction)
+    moved = np.array([each.direction - nadir.direction for each in others]) @ across
+    higher = np.array([each.altitude - nadir.altitude for each in others])
+    covariance = nadir.covariance + moved.T @ moved / len(others)
+    sigma = math.hypot(nadir.altitude_sigma, float(np.sqrt(np.mean(higher**2))))
+    return replace(solution, nadir=replace(nadir, covariance=covariance, altitude_sigma=sigma))
 
 
 def _camera(options: argparse.Namespace, pixels: Image) -> CameraModel:
@@ -229,6 +270,11 @@ class _PaperNadir:
 
 def _check_method(options: argparse.Namespace) -> None:
     """Raise UsageError for options that the chosen method does not have."""
+    error = options.fov_error
+    if error is not None and (options.fov is None or options.method != "default"):
+        raise UsageError(f"--fov-error {error:g}: only with --fov and --method default")
+    if error is not None and not (options.fov - error >= 1.0 and options.fov + error <= 150.0):
+        raise UsageError(f"--fov-error {error:g}: --fov {options.fov:g} must stay within 1 to 150 degrees")
     for name, method in (("second", "graphic or vector"), ("turned", "graphic"), ("nadir", "vector")):
         if getattr(options, name) is not None and options.method not in method.split(" or "):
             raise UsageError(f"--{name}: only with --method {method}")

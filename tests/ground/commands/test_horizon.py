@@ -164,3 +164,45 @@ def test_a_mistake_is_reported_with_exit_status_2(words: list[str], complaint: s
     assert done.returncode == 2
     assert complaint in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_an_uncertain_field_of_view_is_in_the_uncertainty(folder: Path) -> None:
+    """The nadir for a field of view that is 5 % wrong is within three standard deviations of the true one."""
+    facts = {}
+    for field, error in ((67.0, None), (67.0, 3.3), (70.3, 3.3)):
+        words = [] if error is None else ["--fov-error", str(error)]
+        done = command(
+            "horizon",
+            folder / "limb.png",
+            "--fov",
+            str(field),
+            *words,
+            *_response(),
+            "--altitude",
+            "600",
+            "--json",
+        )
+        assert done.returncode == 0, done.stderr
+        facts[field, error] = json.loads(done.stdout)
+    assert facts[67.0, 3.3]["nadir_camera"] == facts[67.0, None]["nadir_camera"]
+    assert facts[67.0, 3.3]["sigma_deg"] > 1.5 * facts[67.0, None]["sigma_deg"]
+    wrong = facts[70.3, 3.3]
+    off = np.array(wrong["nadir_camera"]) - facts[67.0, None]["nadir_camera"]
+    spread, axes = np.linalg.eigh(np.array(wrong["covariance_rad2"]))
+    assert np.all(np.abs(off @ axes[:, 1:]) < 3.0 * np.sqrt(spread[1:]))
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--fov", "67", "--fov-error", "70"], "--fov-error 70: --fov 67 must stay within"),
+        (
+            ["--fov", "67", "--fov-error", "1", "--method", "circle", "--altitude", "600"],
+            "only with --fov",
+        ),
+    ],
+)
+def test_a_field_error_that_does_not_apply_is_refused(folder: Path, words: list[str], complaint: str) -> None:
+    done = command("horizon", folder / "limb.png", *words)
+    assert done.returncode == 2
+    assert complaint in done.stderr
