@@ -203,6 +203,21 @@ def test_a_testbed_without_a_camera_says_none() -> None:
     assert reader.load(FOLDER / "testbed.yaml").camera is None
 
 
+def test_a_camera_is_read_from_a_configuration_or_from_a_file_of_its_own(tmp_path: Path) -> None:
+    whole, own = FOLDER / "orbit.yaml", tmp_path / "camera.yaml"
+    own.write_text("camera: {columns: 640, rows: 480, field_of_view_deg: 12.0}\n", encoding="utf-8")
+    assert reader.load_camera(whole) == reader.load(whole).camera
+    assert reader.load_camera(whole).columns == 512
+    camera = reader.load_camera(own)
+    assert (camera.columns, camera.rows, camera.field_of_view_deg) == (640, 480, 12.0)
+    own.write_text("camera: none\n", encoding="utf-8")
+    for path in (own, FOLDER / "testbed.yaml"):
+        with pytest.raises(ConfigError):
+            reader.load_camera(path)
+    with pytest.raises(ConfigError, match="`camera` is none: give a configuration with a camera"):
+        reader.load_camera(FOLDER / "testbed.yaml")
+
+
 def test_a_missing_file_and_a_list_are_clear_errors(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         reader.load(tmp_path / "nothing.yaml")

@@ -11,7 +11,15 @@ from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from ground.identification.fit import NAMES, MotionConstants, MotionNoise, first_guess, fit, innovations
+from ground.identification.fit import (
+    NAMES,
+    MotionConstants,
+    MotionNoise,
+    _Predictor,
+    first_guess,
+    fit,
+    innovations,
+)
 from ground.identification.record import IdentificationError, Record, Timeline
 from ground.identification.scale import noise_of
 from knightcube.astro.arrays import FloatArray
@@ -229,3 +237,35 @@ def test_the_timeline_keeps_the_charge_whatever_the_delay() -> None:
         lasts = np.clip(ends, 0.0, record.time[-1]) - np.clip(starts, 0.0, record.time[-1])
         assert timeline.span @ timeline.current == pytest.approx(record.current @ lasts, abs=1e-12)
         assert sorted(timeline.sample[timeline.sample >= 0]) == list(range(1, len(record.time)))
+
+
+def test_the_covariance_is_that_of_a_kalman_filter_with_matrices() -> None:
+    predictor = _Predictor(TRUE, MotionNoise(0.02, 2e-3, 1e-4), 0.025, with_gradient=False)
+    predictor.start(0.4, -0.03)
+    noise = np.diag([2e-3**2, 1e-4**2])
+    covariance, walk = noise.copy(), (TRUE.gain * 0.02) ** 2 * 0.025
+    state = np.array([0.4, -0.03 - TRUE.bias])
+    for angle, rate, span, current in (
+        (0.398, -0.031, 0.025, 0.05),
+        (0.399, -0.027, 0.1, -0.08),
+        (0.4, -0.03, 0.3, 0.02),
+    ):
+        acceleration = TRUE.gain * current * np.cos(state[0]) + TRUE.disturbance
+        acceleration -= TRUE.torsion * state[0] + TRUE.damping * state[1]
+        slope = -TRUE.gain * current * np.sin(state[0]) - TRUE.torsion
+        cosine = np.cos(state[0])
+        motion = np.array([[0.0, 1.0], [slope, -TRUE.damping]]) * span
+        flow = np.eye(2) + motion + motion @ motion / 2.0
+        spread = walk * cosine**2 * np.array([[span**3 / 3.0, span**2 / 2.0], [span**2 / 2.0, span]])
+        jerk = slope * state[1] - TRUE.damping * acceleration
+        state = state + span * np.array([state[1], acceleration])
+        state = state + span**2 / 2.0 * np.array([acceleration + span * jerk / 3.0, jerk])
+        covariance = flow @ covariance @ flow.T + spread
+        predictor.propagate(span, current, 1.0)
+        error, stated = predictor.update(angle, rate)
+        total = covariance + noise
+        expected = np.array([angle, rate - TRUE.bias]) - state
+        np.testing.assert_allclose(error, expected, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(np.reshape(stated, (2, 2)), total, rtol=1e-9)
+        gain = covariance @ np.linalg.inv(total)
+        state, covariance = state + gain @ expected, (np.eye(2) - gain) @ covariance

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from dataclasses import replace
 from functools import cache
@@ -31,7 +32,7 @@ from sim_hal.settings import (
     SkySection,
     Tumble,
 )
-from sim_hal.star_camera import StarCameraModel, expected_electrons
+from sim_hal.star_camera import SourceTrack, StarCameraModel, expected_electrons
 from sim_hal.star_camera.objects import (
     TRACK_ERROR,
     ResidentSpaceObject,
@@ -257,6 +258,34 @@ def test_a_track_that_cannot_be_is_refused() -> None:
         source_tracks(camera.orbit, [leader], EPOCH, 5999.9, 6000.1)
     with pytest.raises(OutOfRange, match="distance from the camera"):
         source_tracks(camera.orbit, [camera], EPOCH, 0.0, 0.5)
+
+
+def test_a_track_of_lists_moves_uniformly_between_its_samples() -> None:
+    track = SourceTrack([0, 2, 3], [[1, 0, 0], [0, 1, 0], [0, 0, 1]], 4.0)  # type: ignore[arg-type]
+    assert {track.times.dtype, track.directions.dtype} == {np.dtype(np.float64)}
+    root = math.sqrt(0.5)
+    expected = [[1, 0, 0], [root, root, 0], [0, 1, 0], [0, root, root], [0, 0, 1]]
+    assert track.directions_at(np.array([0.0, 1.0, 2.0, 2.5, 3.0])) == pytest.approx(np.array(expected))
+
+
+@pytest.mark.parametrize(
+    ("times", "directions", "magnitude", "complaint"),
+    [
+        ([0.0], [[1.0, 0, 0]], 4.0, "k of 2 or more"),
+        ([0.0, 1.0], [[1.0, 0, 0]], 4.0, "k of 2 or more"),
+        ([[0.0, 1.0]], [[1.0, 0, 0]], 4.0, "k of 2 or more"),
+        ([0.0, 0.0], [[1.0, 0, 0], [0, 1.0, 0]], 4.0, "must be finite and increase"),
+        ([0.0, math.inf], [[1.0, 0, 0], [0, 1.0, 0]], 4.0, "must be finite and increase"),
+        ([0.0, 1.0], [[1.0, 0, 0], [0, 1.1, 0]], 4.0, "finite unit vectors"),
+        ([0.0, 1.0], [[1.0, 0, 0], [0, math.nan, 0]], 4.0, "finite unit vectors"),
+        ([0.0, 1.0], [[1.0, 0, 0], [0, 1.0, 0]], math.nan, "magnitude nan must be finite"),
+    ],
+)
+def test_an_impossible_track_is_refused(
+    times: list[float], directions: list[list[float]], magnitude: float, complaint: str
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        SourceTrack(np.array(times), np.array(directions), magnitude)
 
 
 def test_the_thesis_scenario_has_the_orbits_of_table_4_3() -> None:

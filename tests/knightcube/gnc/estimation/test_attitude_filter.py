@@ -214,6 +214,23 @@ def test_when_attitudes_disagree_for_a_second_the_filter_restarts() -> None:
     assert filter_.refused == 40
 
 
+@pytest.mark.parametrize(("good", "needed"), [(0, 3), (2, 3), (3, 3), (5, 5), (11, 11), (39, 39), (45, 40)])
+def test_as_many_rejections_as_earlier_attitudes_restart_the_filter_but_3_to_40(
+    good: int, needed: int
+) -> None:
+    flight = fly(10, 100, False)
+    filter_ = begin(flight, False)
+    for cycle in range(1, 1 + good):
+        assert filter_.measure(flight.samples[cycle][0])
+    for cycle in range(1 + good, 1 + good + needed):
+        assert filter_.started
+        attitude, rate = flight.samples[cycle]
+        assert filter_.measure(rate)
+        turned = multiply(from_rotation_vector(np.array([2.0, 0.0, 0.0])), attitude.quaternion)
+        assert not filter_.measure(replace(attitude, quaternion=turned))
+    assert (filter_.started, filter_.restarts, filter_.refused) == (False, 1, needed)
+
+
 def test_a_start_on_a_sample_from_before_the_release_is_given_up_at_once() -> None:
     """A late line sends samples of the held body first; three rates that all disagree outweigh the first."""
     flight = fly(16, 40, True)

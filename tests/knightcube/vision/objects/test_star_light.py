@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.objects.star_light import (
     Patch,
+    _fit_line,
     brightest_left,
     fit_stars,
     spread_over,
@@ -68,6 +70,22 @@ def test_a_line_across_a_star_remains_with_its_ends() -> None:
     assert found is not None
     error = min(np.abs(found - truth).max() for truth in (ends, ends[::-1]))
     assert error < 0.5
+
+
+@pytest.mark.parametrize("start", [(0.0, 0.0, 0.0, 0.0), (2.5, -1.5, -2.0, 1.0), (-3.0, 0.5, 3.5, -1.0)])
+def test_the_fit_of_a_line_converges_from_a_guess_that_is_px_off(start: tuple[float, ...]) -> None:
+    ends = np.array([[230.2, 226.4], [255.7, 253.1]])
+    line = ends[0] + np.linspace(0, 1, 801)[:, None] * np.diff(ends, axis=0)
+    patch = _patch([], 0.0, line, 5)
+    found = _fit_line(patch, patch.signal, ends + np.reshape(start, (2, 2)))
+    np.testing.assert_allclose(found, ends, atol=0.25)
+
+
+def test_the_fit_of_a_point_converges_from_a_guess_that_is_px_off() -> None:
+    place = np.array([[245.4, 240.1]])
+    patch = _patch([], 0.0, place, 6)
+    found = _fit_line(patch, patch.signal, np.tile(place + np.array([1.5, -1.2]), (2, 1)))
+    np.testing.assert_allclose(found, np.tile(place, (2, 1)), atol=0.05)
 
 
 def test_pure_noise_contains_neither_star_nor_object() -> None:

@@ -6,8 +6,10 @@ Cubic Hermite interpolation against scipy's, and exact on cubics.
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.interpolate import CubicHermiteSpline
 
+from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import Pressures, shapes
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.gnc.guidance.three_axes.slew_model import (
@@ -15,6 +17,8 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
     SlewCraft,
     SlewDynamics,
     SlewEnvironment,
+    heat_matrix,
+    mean_squares,
     shown,
 )
 
@@ -81,3 +85,12 @@ def test_a_cubic_is_exact() -> None:
     curve = HermiteCubic(times, (times**3)[:, None], (3.0 * times**2)[:, None])
     np.testing.assert_allclose(curve(at)[:, 0], at**3, rtol=1e-13)
     np.testing.assert_allclose(curve.derivative(at)[:, 0], 3.0 * at**2, rtol=1e-13)
+
+
+@pytest.mark.parametrize("weights", [np.array([2.0, 3.0, 5.0]), np.eye(3) + 0.3])
+def test_the_mean_heat_of_linear_dipoles_is_that_of_many_samples(weights: FloatArray) -> None:
+    dipoles, matrix = np.random.default_rng(3).normal(size=(5, 3)), heat_matrix(weights)
+    share = (np.arange(2000) + 0.5)[:, None] / 2000
+    for k, mean in enumerate(mean_squares(dipoles, matrix)):
+        between = dipoles[k] + share * (dipoles[k + 1] - dipoles[k])
+        assert mean == pytest.approx(np.einsum("ni,ij,nj->n", between, matrix, between).mean(), rel=1e-6)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.startracker.detection.measurement import METHODS
-from knightcube.vision.startracker.detection.psf_fit import light
+from knightcube.vision.startracker.detection.measurement import METHODS, single_pixels
+from knightcube.vision.startracker.detection.psf_fit import cut, light
 
 PLACES = np.array([[0.0, 0.0], [0.3, -0.2], [-0.45, 0.4]])
 WIDTH = 0.9
@@ -57,3 +57,17 @@ def test_a_star_too_faint_for_a_parabola_keeps_its_centre_of_mass() -> None:
     places, slopes = METHODS["gaussian"](clean, np.full_like(clean, 100.0), start, WIDTH)
     assert np.array_equal(places, start[0])
     assert np.array_equal(slopes, start[1])
+
+
+@pytest.mark.parametrize("noise", [0.3, 1.0, 8.0])
+def test_only_sharp_pixels_well_above_the_noise_are_hot(noise: float) -> None:
+    star = np.array([[3.0, 12, 3], [12, 50, 12], [3, 12, 3]])
+    cores = [np.zeros((3, 3)) for _ in range(4)]
+    cores[0][1, 1], cores[1][1, 1], cores[2][1, 1:] = 11.0, 9.0, (50.0, 40.0)
+    cores[3] = star
+    pixels = np.zeros((9, 9 * len(cores)))
+    for k, core in enumerate(cores):
+        pixels[3:6, 9 * k + 3 : 9 * k + 6] = noise * core
+    middle = np.array([[9 * k + 4, 4] for k in range(len(cores))])
+    windows = cut(pixels, middle, 4, np.zeros(len(cores)), np.full(len(cores), noise), np.inf)
+    assert single_pixels(windows).tolist() == [True, False, True, False]

@@ -16,7 +16,13 @@ from knightcube.vision.frame import Background, are_hot
 from knightcube.vision.startracker.detection.detect import find_peaks
 from knightcube.vision.startracker.detection.measurement import centre_of_mass
 from knightcube.vision.startracker.detection.psf_fit import NoiseModel, cut, light, measure_noise, profile
-from knightcube.vision.startracker.detection.survey import Surface, find_areas, find_bright, measure_sky
+from knightcube.vision.startracker.detection.survey import (
+    Surface,
+    find_areas,
+    find_bright,
+    measure_sky,
+    share_one_rotation,
+)
 from tests.knightcube.vision.startracker.spoilt_scenes import (
     found_boresight,
     is_right,
@@ -159,3 +165,20 @@ def test_one_or_two_bright_pixels_are_hot_and_a_sharp_star_is_not() -> None:
     one, two, star = np.zeros(9), np.zeros(9), np.array([3.0, 12, 3, 12, 50, 12, 3, 12, 3])
     one[4], two[[4, 5]] = 50.0, (50.0, 40.0)
     assert are_hot(np.stack([one, two, star], axis=1), noise).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn"), [((1.0, 0.0), 0.0), ((0.0, 0.0), 1.0), ((0.5, -0.3), 2.0), ((3.0, 2.0), -1.0)]
+)
+def test_lines_along_the_flow_of_a_rotation_share_it_and_other_lines_do_not(
+    shift: tuple[float, float], turn: float
+) -> None:
+    rng = np.random.default_rng(6)
+    centre = rng.uniform(-1.0, 1.0, (30, 2))
+    flow = np.array(shift) + turn * np.stack([-centre[:, 1], centre[:, 0]], axis=1)
+    direction = np.arctan2(flow[:, 1], flow[:, 0]) + rng.choice([0.0, np.pi], 30)
+    pixels = 500.0 + 400.0 * centre
+    assert share_one_rotation(pixels, direction + 0.01 * rng.standard_normal(30))
+    assert not share_one_rotation(pixels, rng.permutation(direction) + 0.3 * rng.standard_normal(30))
+    diverging = np.arctan2(centre[:, 1], centre[:, 0])
+    assert not share_one_rotation(pixels, diverging)
