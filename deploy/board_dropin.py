@@ -152,7 +152,7 @@ def _bus(config: Config) -> list[str]:
 def check_single(path: Path) -> None:
     """Raise ConfigError for a configuration that extends another file, which its checksum does not cover."""
     if len(read_document(read_text(path), str(path)).chain) > 1:
-        problem = "its checksum covers one file: write it as one file by `flight check FILE --merged NEW`"
+        problem = "its checksum covers one file: write it as one file by `knightcube check FILE --merged NEW`"
         raise ConfigError(str(path), f"`extends` cannot be used on a board: {problem}")
 
 

@@ -1,6 +1,6 @@
 """Writer of a Yamcs 5.12 configuration, started by `python -m ground.yamcs FOLDER [--epoch UTC]`.
 
-Yamcs connects to `flight gateway`, which holds the keys and exchanges unprotected packets with Yamcs
+Yamcs connects to `knightcube gateway`, which holds the keys and exchanges unprotected packets with Yamcs
 (`ground.link.gateway`). Yamcs and the gateway listen on the loopback interface only. None of Yamcs's own data
 links can send the gateway's token when connecting. The folder therefore contains `GatewayLink.java`, the
 source of a data link that sends the token, which must be compiled once. Packets are archived by mission time
@@ -124,7 +124,7 @@ import org.yamcs.Spec;
 import org.yamcs.YConfiguration;
 import org.yamcs.tctm.TcpTcTmDataLink;
 
-/** Sends the token of `flight gateway` at the beginning of each connection. */
+/** Sends the token of `knightcube gateway` at the beginning of each connection. */
 public class GatewayLink extends TcpTcTmDataLink {
     private Path tokenFile;
 

@@ -114,7 +114,7 @@ def _parser() -> argparse.ArgumentParser:
         help="serve all devices of a configuration in real time",
         description="Serve the simulated hardware of a configuration in real time: the VN-100 on a "
         "pseudo-terminal, the I2C bus and the camera on a Unix socket. Prints a JSON object with their names "
-        "once they answer. `python -m flight run CONFIG --realtime` starts this by itself.",
+        "once they answer. `knightcube run CONFIG --realtime` starts this by itself.",
     )
     add = serve.add_argument
     text = f"YAML file with a simulation section, or one of {carried}"
@@ -122,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--folder", type=Path, required=True, metavar="DIR", help="folder for the log of the true state")
     add("--seed", type=int, metavar="N", help="random seed that replaces the seed of the configuration")
     add("--patience", type=float, metavar="S", help="end S seconds after the last client has disconnected")
-    add("--facts", type=Path, metavar="FILE", help="copy of the JSON object, for `flight run --devices`")
+    add("--facts", type=Path, metavar="FILE", help="copy of the JSON object, for `knightcube run --devices`")
     serve.set_defaults(command=_serve)
     return parser
 

@@ -138,7 +138,7 @@ def check_elements(request: SimulationRequest, config: Config) -> None:
     section = request.section()
     if section.free_body is None or not isinstance(config, OrbitConfig) or config.elements is None:
         return
-    cure = "`flight elements --config FILE` makes elements of the simulated orbit"
+    cure = "`knightcube elements --config FILE` makes elements of the simulated orbit"
     try:
         distance = distance_from(config.elements, section.free_body.orbit, section.utc)
     except UsageError as error:

@@ -277,7 +277,7 @@ def _open(judged: _Judged, stack: ExitStack) -> _Opened:
     patient = request.archive is not None
     loop, log = open_flight(config, rig, request.out, stack, patient=patient, earlier=earlier)
     if chosen.problem:
-        sys.stderr.write(f"flight: {chosen.problem}\n")
+        sys.stderr.write(f"knightcube: {chosen.problem}\n")
         loop.note(events.CONFIG_DAMAGED, chosen.problem)
     elif chosen.accepted and rig.realtime and (folder := service_folder(os.environ)) is not None:
         stack.callback(FlownConfig(judged.merged, folder).serve(rig.clock).stop)

@@ -111,7 +111,7 @@ class StartRetry:
         self._waited += pause
         self._problem = problem
         with suppress(OSError):
-            sys.stderr.write(f"flight: cannot begin yet: {problem}; tried again in {pause:g} s\n")
+            sys.stderr.write(f"knightcube: cannot begin yet: {problem}; tried again in {pause:g} s\n")
             sys.stderr.flush()
         self._overseer.status(f"waiting to begin, {self._failed} attempts: {problem}")
         until_ns = self._clock.now_ns() + round(pause * SECOND_NS)

@@ -169,7 +169,7 @@ class Vault:
         self._folder = folder
         self._witness = None if witness is None else _Witness(witness)
         if not folder.is_dir():
-            raise UsageError(f"{folder}: no such folder; `python -m ground keys` makes keys")
+            raise UsageError(f"{folder}: no such folder; `knightcube keys` makes keys")
         for path in folder.glob("spi-*"):
             if stat.S_IMODE(path.stat().st_mode) & 0o077:
                 raise UsageError(f"{path}: others may read this key: chmod 600, or make new keys")

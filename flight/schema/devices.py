@@ -212,7 +212,7 @@ class PowerMonitorSection(Section, frozen=True, kw_only=True):
 
 
 class CameraLens(Section, frozen=True, kw_only=True):
-    """The lens parameters that `python -m flight calibrate` reports.
+    """The lens parameters that `knightcube calibrate` reports.
 
     The focal length `focal_length` is in px, `centre` is the pixel (x, y) on the optical axis, and `k1` and
     `k2` are the coefficients of radial distortion.

@@ -206,7 +206,7 @@ class TargetStep(Aim, frozen=True, kw_only=True):
 
 
 class Requirements(Section, frozen=True, kw_only=True):
-    """Requirements that `flight report` checks for an orbit flight; an omitted requirement is not checked.
+    """Requirements that `knightcube report` checks for an orbit flight; omitted ones are not checked.
 
     Detumbling must end within `slow_within` s of the start, and the attitude must be fine within
     `fine_within` s after that. The value `knowledge_deg` limits the rms error of the attitude with star

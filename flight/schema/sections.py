@@ -182,9 +182,9 @@ class LinkCoding(Section, frozen=True, kw_only=True):
 
 
 class Link(Section, frozen=True, kw_only=True):
-    """The link process (`python -m flight link`), which exchanges protected frames with the ground.
+    """The link process (`knightcube link`), which exchanges protected frames with the ground.
 
-    The folder `keys` contains keys and counters (`python -m ground keys`), and `spacecraft` is the identifier
+    The folder `keys` contains keys and counters (`knightcube keys`), and `spacecraft` is the identifier
     in each frame. The addresses `udp` and `tcp` (HOST:PORT) accept frames only from the networks `peers`.
     Without `peers`, a loopback address accepts frames from this machine, any other address from its network
     of 256 addresses. The value `serial` describes the line of a radio. Telemetry is sent to authenticated

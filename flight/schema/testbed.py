@@ -74,7 +74,7 @@ class Control(Section, frozen=True, kw_only=True):
     The controllers `lq` and `thesis` use the weights of the Sease thesis, eqs. 5.30-5.32: Q = state_weight I
     and R = control_weight. The controllers `pid` and `adaptive` use `bandwidth`; `target_weight` belongs to
     `pid`, and `adaptation` and `reference_bandwidth` belong to `adaptive`. If `gains` are given, `pid` uses
-    them instead of the bandwidth. The controller `excitation` is used by `python -m flight identify`.
+    them instead of the bandwidth. The controller `excitation` is used by `knightcube identify`.
     """
 
     tracker: Literal["lq", "thesis", "pid", "adaptive", "excitation"] = "lq"
@@ -88,7 +88,7 @@ class Control(Section, frozen=True, kw_only=True):
 
 
 class Identification(Section, frozen=True, kw_only=True):
-    """Motion of the body during `python -m flight identify`.
+    """Motion of the body during `knightcube identify`.
 
     The coils use at most the fraction `current_share` of their current limit. The body stays within
     `largest_q2`, and each free oscillation lasts `swing` s.

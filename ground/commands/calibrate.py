@@ -1,4 +1,4 @@
-"""Command `flight calibrate`, which calibrates the lens of a camera from pictures of the night sky."""
+"""Command `knightcube calibrate`, which calibrates the lens of a camera from pictures of the night sky."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from knightcube.vision.lens_calibration import (
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight calibrate` to the parser."""
+    """Add the arguments of `knightcube calibrate` to the parser."""
     parser.description = (
         "Calibrate a camera from pictures of the night sky: focal length, optical axis and radial "
         "distortion, with their errors. All pictures must be of one camera at one focus; pictures that do "
@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "hundred without. A term that the stars do not determine is left out of the lens and named. The "
         f"camera file states the accuracy of the lens (`accuracy`); it needs at least {MIN_STARS} stars."
     )
-    parser.epilog = "example: python -m flight calibrate night*.tiff --fov 11.4 --out camera.yaml"
+    parser.epilog = "example: knightcube calibrate night*.tiff --fov 11.4 --out camera.yaml"
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
     parser.add_argument("--fov", type=positive, metavar="DEG", help="rough field of view across the columns")
     parser.add_argument("--out", type=Path, metavar="YAML", help="write the camera for --camera to this file")
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
         return 1
     write_new(options.out, _camera_section(lens))
     if not options.json:
-        sys.stdout.write(f"\nwritten: {options.out}, for --camera of `flight solve` and `flight rate`\n")
+        sys.stdout.write(f"\nwritten: {options.out}, for --camera of the commands `solve` and `rate`\n")
     return 0
 
 
@@ -183,7 +183,7 @@ def _camera_section(terms: DeterminedLens) -> str:
     lens, omitted = terms.calibration.lens, terms.omitted
     assumed = "      # the image centre: the stars do not determine it" if "centre" in omitted else ""
     lines = [
-        "# Made by `python -m flight calibrate`.",
+        "# Made by `knightcube calibrate`.",
         "camera:",
         f"  columns: {lens.columns}",
         f"  rows: {lens.rows}",

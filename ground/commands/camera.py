@@ -1,4 +1,4 @@
-"""Command `flight camera`, which takes frames from a configured camera without opening other devices."""
+"""Command `knightcube camera`, which takes frames from a configured camera without opening other devices."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ _MAX_EXPOSURES = 8
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight camera` to the parser."""
+    """Add the arguments of `knightcube camera` to the parser."""
     parser.description = (
         "Take frames from the camera of a configuration, real or simulated, one per trigger. Print the "
         "number of each frame, its delay after the end of the exposure, and its counts. --out writes the "
-        "counts as PNG, for `flight solve` and `flight rate`. Coils and inertial unit are not opened. A "
+        "counts as PNG, for the commands `solve` and `rate`. Coils and inertial unit are not opened. A "
         "simulated camera can be rotated: --rate makes streaks, and the truth of each picture is written "
         "beside it as JSON."
     )
@@ -49,9 +49,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = textwrap.fill(parser.description, 100)
     parser.epilog = (
         "examples:\n"
-        "  python -m flight camera --config /etc/knightcube/flight.yaml --out frame.png --count 5\n"
-        "  python -m flight camera --config step_demo --exposure 0.3 --rate 0.05 -0.02 0.01 --out turn.png\n"
-        "  python -m flight rate turn.png --camera step_demo --exposure 0.3 --prior 0.05 -0.02 0.01\n"
+        "  knightcube camera --config /etc/knightcube/flight.yaml --out frame.png --count 5\n"
+        "  knightcube camera --config step_demo --exposure 0.3 --rate 0.05 -0.02 0.01 --out turn.png\n"
+        "  knightcube rate turn.png --camera step_demo --exposure 0.3 --prior 0.05 -0.02 0.01\n"
     )
     parser.add_argument(
         "--config", type=config_path, required=True, metavar="CONFIG", help="file or installed name"
@@ -101,7 +101,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         sys.stdout.write(json.dumps({"frames": facts, "frozen": frozen}) + "\n")
     if frozen:
-        sys.stderr.write("flight: the camera's frame numbers do not increase: it is frozen\n")
+        sys.stderr.write("knightcube: the camera's frame numbers do not increase: it is frozen\n")
     return 1 if frozen else 0
 
 

@@ -1,4 +1,4 @@
-"""Command `flight elements`, which makes or reads two-line elements, or fits them to positions."""
+"""Command `knightcube elements`, which makes or reads two-line elements, or fits them to positions."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ORBIT = ("inclination", "eccentricity", "node", "local_time", "perigee", "anoma
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight elements` to the parser."""
+    """Add the arguments of `knightcube elements` to the parser."""
     parser.description = textwrap.fill(
         "Make two-line elements for the section `elements` of a satellite's configuration: of an orbit that "
         "is given by its altitude, of the simulated orbit of a configuration, or by a fit to "

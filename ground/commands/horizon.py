@@ -1,4 +1,4 @@
-"""Command `flight horizon`, which finds the direction to nadir from the Earth's limb in a picture."""
+"""Command `knightcube horizon`, which finds the direction to nadir from the Earth's limb in a picture."""
 
 from __future__ import annotations
 
@@ -50,16 +50,14 @@ from knightcube.vision.horizon.settings import (
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight horizon` to the parser."""
+    """Add the arguments of `knightcube horizon` to the parser."""
     parser.description = (
         "Find the Earth's limb in a picture and the direction to the Earth's centre in camera axes: z along "
         "the boresight, x to the right, y down. The picture is a PNG, TIFF, JPEG or FITS file, grey or "
         "colour. Without --altitude the altitude is fitted too, within --altitudes. The Earth is modelled "
         "as a sphere; the uncertainty includes the error of this model."
     )
-    parser.epilog = (
-        "example: python -m flight horizon limb.png --fov 67 --altitude 515 --overlay limb_found.png"
-    )
+    parser.epilog = "example: knightcube horizon limb.png --fov 67 --altitude 515 --overlay limb_found.png"
     add_picture(parser)
     add_field(parser, required=True)
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""Command `flight identify`, which estimates the constants of a body from a flight.
+"""Command `knightcube identify`, which estimates the constants of a body from a flight.
 
 For the testbed, the command flies pulses of a coil and fits the constants of the plant. The filter of a
 satellite learns inertia, coils and sensors in every flight. For a satellite, the command therefore only reads
@@ -81,7 +81,7 @@ class _Identified:
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight identify` to the parser."""
+    """Add the arguments of `knightcube identify` to the parser."""
     parser.description = (
         "Identify torque constant, thread stiffness and damping from a short flight with pulses of the "
         "coil on x and free swings, on the testbed or simulated, or from the folder of an earlier flight. "
@@ -91,9 +91,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "satellite, give the folder of a run: its filter has learned inertia, coils, sensors and residual "
         "dipole, which are compared with the configuration and written as a file that extends it."
     )
-    parser.epilog = (
-        "example: python -m flight identify config/testbed.yaml --out plant.yaml --picture fit.png"
-    )
+    parser.epilog = "example: knightcube identify config/testbed.yaml --out plant.yaml --picture fit.png"
     parser.add_argument(
         "source",
         type=config_path,
@@ -206,7 +204,7 @@ def _fly(options: argparse.Namespace) -> Path:
     """Fly the excitation and return the folder of the run."""
     if isinstance(configuration.load(options.source), OrbitConfig):
         raise UsageError(
-            f"{options.source}: a satellite is identified from a run: fly it with `python -m flight run`, "
+            f"{options.source}: a satellite is identified from a run: fly it with `knightcube run`, "
             "and give the folder of the run"
         )
     from flight.app.flight import fly  # noqa: PLC0415 - only a flight needs devices
@@ -223,9 +221,9 @@ def _fly(options: argparse.Namespace) -> Path:
     if with_line:
         sys.stderr.write("\r\x1b[K")
     if result.interrupted:
-        sys.stderr.write(f"flight: {result.reason}: the identification uses the part that was flown\n")
+        sys.stderr.write(f"knightcube: {result.reason}: the identification uses the part that was flown\n")
     if result.log_error:
-        sys.stderr.write(f"flight: {result.log_error}\n")
+        sys.stderr.write(f"knightcube: {result.log_error}\n")
     return result.folder
 
 

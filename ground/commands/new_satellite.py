@@ -1,4 +1,4 @@
-"""Command `flight new-satellite`, which writes the configuration of a satellite."""
+"""Command `knightcube new-satellite`, which writes the configuration of a satellite."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ _WEAK = 3.0
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight new-satellite` to the parser."""
+    """Add the arguments of `knightcube new-satellite` to the parser."""
     parser.description = textwrap.fill(
-        "Write the configuration of a satellite, which `flight check` and `flight run` accept. On a "
+        "Write the configuration of a satellite, which `knightcube check` and `knightcube run` accept. On a "
         "terminal, the values that are not given are asked for, and an empty answer takes the value in "
         "brackets. The inertia is that of a homogeneous cuboid, two-line elements are fitted to the orbit, "
         "and mountings and limits are computed. The file extends the configuration `orbit` and states the "
@@ -99,7 +99,7 @@ def run(options: argparse.Namespace) -> int:
         facts, text = _written(answers, options.force)
     except UsageError:
         if missing:
-            sys.stderr.write(f"flight: the answers as a command:\n  {answers.command()}\n")
+            sys.stderr.write(f"knightcube: the answers as a command:\n  {answers.command()}\n")
         raise
     sys.stdout.write(json.dumps(facts) + "\n" if options.json else text)
     return 0
@@ -189,7 +189,7 @@ class Answers:
                 else:
                     self._ask(question.text, question.default, self._taker(question))
         except KeyboardInterrupt:
-            sys.stderr.write(f"\nflight: nothing was written; to continue:\n  {self.command()}\n")
+            sys.stderr.write(f"\nknightcube: nothing was written; to continue:\n  {self.command()}\n")
             raise
         except EOFError:
             raise UsageError(f"the input has ended; to continue: {self.command()}") from None
@@ -294,7 +294,7 @@ def satellite_of(values: Values) -> Satellite:
 
 
 def _check(text: str, path: Path) -> None:
-    """Check a configuration text as `flight check` does, without flying it. Raises UsageError."""
+    """Check a configuration text as `knightcube check` does, without flying it. Raises UsageError."""
     try:
         config = configuration.parse(text, str(path))
         check_settings(config)

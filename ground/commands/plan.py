@@ -1,4 +1,4 @@
-"""Command `flight plan`, which plans one slew of the testbed, or with --orbit a slew in three axes."""
+"""Command `knightcube plan`, which plans one slew of the testbed, or with --orbit a slew in three axes."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ _ORBIT_ONLY = ("at", "within", "longest", "window", "least_time", *(f"{name}_con
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight plan` to the parser."""
+    """Add the arguments of `knightcube plan` to the parser."""
     parser.description = (
         "Plan the least-energy slew between two attitudes, of the testbed by virtual motion camouflage, or "
         "with --orbit of a satellite in three axes; print it or draw it. A horizon that is too short is "
         "stretched to the shortest feasible one."
     )
     parser.epilog = (
-        "example: python -m flight plan --from 0.4 --from-rate 0.015 --to -0.3 --picture path.png; in orbit: "
-        "python -m flight plan --orbit orbit --from nadir --to sun --at 2026-03-01T12:00:00 --within 600"
+        "example: knightcube plan --from 0.4 --from-rate 0.015 --to -0.3 --picture path.png; in orbit: "
+        "knightcube plan --orbit orbit --from nadir --to sun --at 2026-03-01T12:00:00 --within 600"
     )
     parser.add_argument(
         "--from", dest="start", required=True, metavar="Q2", help="q2 at the start; with --orbit a target"
@@ -65,7 +65,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the optional arguments of `flight plan`."""
+    """Add the optional arguments of `knightcube plan`."""
     parser.add_argument("--horizon", type=finite, metavar="S", help="seconds (default: the configuration's)")
     parser.add_argument(
         "--time-price",

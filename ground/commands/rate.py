@@ -1,4 +1,4 @@
-"""Command `flight rate`, which estimates the body rate and moving objects from a picture of star streaks."""
+"""Command `knightcube rate`, which estimates the body rate and moving objects from a picture of streaks."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ _SHUTTER = (
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight rate` to the parser."""
+    """Add the arguments of `knightcube rate` to the parser."""
     parser.description = (
         "Estimate the mean body rate over one exposure from the star streaks in a picture: PNG, TIFF, "
         "JPEG or FITS of 8 or 16 bits. The rate is of the camera, in its frame: boresight +z, x right, y "
         "down. "
         "One picture leaves the sign of the rate open: --prior gives the approximate rate."
     )
-    parser.epilog = "example: python -m flight rate frame.png --fov 20 --exposure 0.2 --overlay found.png"
+    parser.epilog = "example: knightcube rate frame.png --fov 20 --exposure 0.2 --overlay found.png"
     add_picture(parser)
     add_field(parser)
     parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time")

@@ -1,4 +1,4 @@
-"""Command `flight renewal`: keys, signatures and commands of a renewal in orbit (docs/fly/renewal.md)."""
+"""Command `knightcube renewal`: keys, signatures and commands of a renewal in orbit (docs/fly/renewal.md)."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _TIMEOUT_S = 60.0
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight renewal` to the parser."""
+    """Add the arguments of `knightcube renewal` to the parser."""
     parser.description = (
         "Renew a satellite in orbit: make signing keys, sign a configuration, elements, a sky index or a "
         "release, and activate, confirm or withdraw it over the link."

@@ -1,4 +1,4 @@
-"""Commands that evaluate a run: `flight report`, `flight export` and `flight orbit`."""
+"""Commands that evaluate a run: `knightcube report`, `knightcube export` and `knightcube orbit`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from knightcube.errors import UsageError
 
 
 def configure_report(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight report` to the parser."""
+    """Add the arguments of `knightcube report` to the parser."""
     parser.description = (
         "Print the performance of a run and the limits of the thesis (Table 5.3), and draw its figures. The "
         "run is judged on the truth of the simulation if it has one, otherwise on the estimate. With a "
@@ -59,7 +59,7 @@ def run_report(options: argparse.Namespace) -> int:
         paths = reporting.draw(run, options.figures or options.run / "figures")
     except UsageError as error:
         # The numbers have been printed, so missing figures are not a failure of the report.
-        sys.stderr.write(f"flight: {error}\n")
+        sys.stderr.write(f"knightcube: {error}\n")
         return 0 if options.figures is None else 2
     if not options.json:
         sys.stdout.write("\npictures:\n" + "".join(f"  {path}\n" for path in paths))
@@ -80,12 +80,12 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def configure_export(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight export` to the parser."""
+    """Add the arguments of `knightcube export` to the parser."""
     parser.description = (
         "Write one CSV or Parquet file (extra `parquet`) per packet type, or one SQLite file with a table "
         "per packet type. Units and meanings are in the table or file `fields`, in Parquet the metadata."
     )
-    parser.epilog = "example: python -m flight export runs/demo --format sqlite"
+    parser.epilog = "example: knightcube export runs/demo --format sqlite"
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--format", choices=FORMATS, default="csv", help="default: csv")
     places = ", ".join(f"RUN/{place}" for place in FORMATS.values())
@@ -133,13 +133,13 @@ _POSITION, _VELOCITY = slice(0, 3), slice(3, 6)
 
 
 def configure_orbit(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight orbit` to the parser."""
+    """Add the arguments of `knightcube orbit` to the parser."""
     parser.description = (
         "Determine a first orbit of each object that a flight tracked, from directions alone, with its "
         "covariance; if the arc is too short, print why. Exit status 0 if every object has an orbit, 1 if "
         "one has none."
     )
-    parser.epilog = "example: python -m flight orbit runs/object --opm orbits"
+    parser.epilog = "example: knightcube orbit runs/object --opm orbits"
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument(
         "--opm", type=Path, metavar="FOLDER", help="write each orbit as a CCSDS Orbit Parameter Message"

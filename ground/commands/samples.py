@@ -1,4 +1,4 @@
-"""Commands `flight samples` (pictures for trying other commands) and `flight index` (sky index)."""
+"""Commands `knightcube samples` (pictures for trying other commands) and `knightcube index` (sky index)."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from knightcube.vision.startracker.index.sky_index import save
 
 
 def configure_samples(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight samples` to the parser."""
+    """Add the arguments of `knightcube samples` to the parser."""
     parser.description = (
         "Render sample pictures: a field of stars, streaks with a satellite among them, the Earth's limb, "
         "and a few night skies for a calibration. The file truth.json has the true values of each; the "
         "commands to try are printed."
     )
-    parser.epilog = "example: python -m flight samples --out samples"
+    parser.epilog = "example: knightcube samples --out samples"
     parser.add_argument("--out", type=Path, default=Path("samples"), metavar="DIR", help="default: samples")
     parser.add_argument("--seed", type=seed_number, default=1, metavar="N", help="of the noise (default 1)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -71,13 +71,13 @@ def _progress(name: str) -> None:
 
 
 def configure_index(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight index` to the parser."""
+    """Add the arguments of `knightcube index` to the parser."""
     parser.description = (
         "Make the sky index of one camera: triangles that fit into its field of view, of stars down to its "
         "faintest, with merged pairs that its pixels do not resolve. The configuration's "
-        "camera.star_tracker.index, or --index of `flight solve`, names the file."
+        "camera.star_tracker.index, or --index of `knightcube solve`, names the file."
     )
-    parser.epilog = "example: python -m flight index --camera flight.yaml --faintest 6.5 --out mission.index"
+    parser.epilog = "example: knightcube index --camera flight.yaml --faintest 6.5 --out mission.index"
     add_field(parser, required=True)
     parser.add_argument(
         "--faintest",

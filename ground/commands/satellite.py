@@ -1,4 +1,4 @@
-"""Commands to a flight: `flight command`, `flight parameters` and `flight files`."""
+"""Commands to a flight: `knightcube command`, `knightcube parameters` and `knightcube files`."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def _add_spi(parser: argparse.ArgumentParser) -> None:
 
 
 def configure_command(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight command` to the parser."""
+    """Add the arguments of `knightcube command` to the parser."""
     parser.description = (
         "Send a command to a flight that accepts commands (`commands` in its configuration) and print its "
         "answer. Exit status 0 if the flight obeyed, 1 if it refused or did not answer."
@@ -334,13 +334,13 @@ class ParameterTable:
 
 
 def configure_parameters(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight parameters` to the parser."""
+    """Add the arguments of `knightcube parameters` to the parser."""
     parser.description = (
         "Show the table of parameters that a flight uses. With NAME=VALUE or --load, load another table: the "
         "flight accepts or refuses it as a whole, and only if its table has not changed meanwhile. It keeps "
         "the new table for its next starts. Exit status 0 if done, 1 if the flight refused or did not answer."
     )
-    parser.epilog = "example: python -m flight parameters --to runs/socket modes.tumble_rate=0.3"
+    parser.epilog = "example: knightcube parameters --to runs/socket modes.tumble_rate=0.3"
     _add_way(parser, 4.0)
     parser.add_argument("--load", type=Path, metavar="FILE", help="YAML file of --save with all parameters")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the table in use to this file")
@@ -443,7 +443,7 @@ def _show(table: ParameterTable, before: ParameterTable, refused: str, as_json: 
     loads = f"{table.loads} loads so far"
     sys.stdout.write(f"table {table.crc:08x}, from the {table.origin}, {loads}; {kept}\n")
     if refused:
-        sys.stderr.write(f"flight: refused: {refused}\n")
+        sys.stderr.write(f"knightcube: refused: {refused}\n")
 
 
 def _change(text: str) -> tuple[str, float]:
@@ -477,7 +477,7 @@ def _parameters_in(path: Path) -> dict[str, float]:
 
 
 def configure_files(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight files` to the parser."""
+    """Add the arguments of `knightcube files` to the parser."""
     parser.description = (
         "List the files of a satellite, get files from it and put files on it over its link. Received data "
         "is kept after Ctrl-C, and the same command later continues. Exit status 1 if a file is incomplete."
@@ -550,7 +550,7 @@ def run_files(options: argparse.Namespace) -> int:
 
 
 class _FileWork:
-    """Runner of one `flight files` command over a link session."""
+    """Runner of one `knightcube files` command over a link session."""
 
     def __init__(
         self, session: FileSession, terminal: Terminal, patience_s: float, ended: Callable[[], bool]
@@ -657,4 +657,4 @@ class _FileWork:
             self._shown_s = now_ns * 1e-9
             for one in self._session.entity.transfers():
                 part = f"{one.done} of {one.size} bytes" if one.size else "started"
-                sys.stderr.write(f"flight: {one.name or name}: {part}\n")
+                sys.stderr.write(f"knightcube: {one.name or name}: {part}\n")

@@ -1,4 +1,4 @@
-"""Questions of the command `flight new-satellite`, and functions that read and check the answers."""
+"""Questions of the command `knightcube new-satellite`, and functions that read and check the answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Command `flight solve`, which finds the attitude, the stars and the rate in a picture of the sky."""
+"""Command `knightcube solve`, which finds the attitude, the stars and the rate in a picture of the sky."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ IMAGE = "image"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight solve` to the parser."""
+    """Add the arguments of `knightcube solve` to the parser."""
     parser.description = (
         "Determine where a picture of the sky points: right ascension, declination and roll (the position "
         "angle of up, from north through east), ICRS; which stars it shows; and, from star streaks, "
         "how the camera turned. PNG, TIFF, JPEG, BMP or FITS. Without --fov or --camera all fields from "
         f"{UNKNOWN_FOV_DEG[0]:g} to {UNKNOWN_FOV_DEG[1]:g} deg are searched."
     )
-    parser.epilog = "example: python -m flight solve night.jpg --fov 11.4 --overlay solved.png"
+    parser.epilog = "example: knightcube solve night.jpg --fov 11.4 --overlay solved.png"
     add_picture(parser)
     add_field(parser)
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""Commands of a ground station: `flight keys`, `flight gateway`, `flight watch` and `flight console`."""
+"""Commands of a ground station: `keys`, `gateway`, `watch` and `console`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _PING_S = 2.0
 
 
 def configure_keys(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight keys` to the parser."""
+    """Add the arguments of `knightcube keys` to the parser."""
     parser.description = (
         "Make new keys: FOLDER/satellite for the board, FOLDER/ground for the ground, readable by their "
         "owner only. Existing keys are never overwritten."
@@ -65,7 +65,7 @@ def run_keys(options: argparse.Namespace) -> int:
 
 
 def configure_gateway(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight gateway` to the parser."""
+    """Add the arguments of `knightcube gateway` to the parser."""
     parser.description = (
         "Connect a satellite's link to a ground station without keys, such as Yamcs: a connection to the "
         "address receives every telemetry packet and may send command packets, which are sent up in "
@@ -84,7 +84,7 @@ def run_gateway(options: argparse.Namespace) -> int:
     token = new_token()
     with contextlib.closing(terminal_of(options)) as terminal:
         gateway = Gateway(
-            terminal, options.serve, token, lambda text: sys.stderr.write(f"flight: gateway: {text}\n")
+            terminal, options.serve, token, lambda text: sys.stderr.write(f"knightcube: gateway: {text}\n")
         )
         path = token_path(options.keys, gateway.port)
         with contextlib.closing(gateway), EndingSignals() as signals, token_file(path, token):
@@ -96,7 +96,7 @@ def run_gateway(options: argparse.Namespace) -> int:
 
 
 def configure_watch(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight watch` to the parser."""
+    """Add the arguments of `knightcube watch` to the parser."""
     parser.description = (
         "Show a flight in the terminal from its log: mode, attitude, coil currents, devices and events, "
         "while the log grows or up to its end. A terminal with rich (extra `watch`) shows a panel, "
@@ -104,7 +104,7 @@ def configure_watch(parser: argparse.ArgumentParser) -> None:
         "requests its state, which is printed as plain lines. Ctrl-C ends. Exit status 0 if the flight has "
         "ended or after Ctrl-C, 1 if the log stopped growing."
     )
-    parser.epilog = "example: python -m flight watch runs/demo"
+    parser.epilog = "example: knightcube watch runs/demo"
     parser.add_argument(
         "flight", metavar="RUN|SOCKET", help="folder of a run or of an archive, a socket, or HOST:PORT"
     )
@@ -137,7 +137,7 @@ def run_watch(options: argparse.Namespace) -> int:
             while not (state.ended or tail.silence > options.patience or ended.wait(_READ_S)):
                 refresh()
     if not state.ended and not ended.is_set():
-        sys.stderr.write(f"flight: no new packet for {tail.silence:.0f} s and no stop event in the log\n")
+        sys.stderr.write(f"knightcube: no new packet for {tail.silence:.0f} s and no stop event in the log\n")
         return 1
     return 0
 
@@ -178,7 +178,7 @@ def _panel(state: FlightState, tail: LogTail) -> contextlib.AbstractContextManag
 
         from ground.watch_panel import panel  # noqa: PLC0415
     except ModuleNotFoundError:
-        sys.stderr.write("flight: a panel needs rich: pip install 'knightcube-flight[watch]'\n")
+        sys.stderr.write("knightcube: a panel needs rich: pip install 'knightcube-flight[watch]'\n")
         return None
 
     @contextlib.contextmanager
@@ -233,12 +233,12 @@ def _watch_socket(options: argparse.Namespace) -> int:
             if once or ended.wait(_PING_S):
                 return 0
         if not ended.is_set():
-            sys.stderr.write(f"flight: {options.flight}: {'no further' if answered else 'no'} answer\n")
+            sys.stderr.write(f"knightcube: {options.flight}: {'no further' if answered else 'no'} answer\n")
     return 0 if ended.is_set() else 1
 
 
 def configure_console(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `flight console` to the parser."""
+    """Add the arguments of `knightcube console` to the parser."""
     parser.description = (
         "Show a flight in the browser: attitude in 3-D, plots with history, mode and health, events, the "
         "orbit on a map, and forms for commands. A flight in progress is shown live, from its log or over "
@@ -247,9 +247,9 @@ def configure_console(parser: argparse.ArgumentParser) -> None:
         "extra `ground`. Ctrl-C ends."
     )
     parser.epilog = (
-        "examples: python -m flight console runs/demo; "
-        "python -m flight console --fly config/step_demo.yaml runs/live; "
-        "python -m flight console --link 192.0.2.7:5010 --keys keys/ground --config orbit.yaml"
+        "examples: knightcube console runs/demo; "
+        "knightcube console --fly config/step_demo.yaml runs/live; "
+        "knightcube console --link 192.0.2.7:5010 --keys keys/ground --config orbit.yaml"
     )
     parser.add_argument(
         "run",
@@ -268,7 +268,7 @@ def configure_console(parser: argparse.ArgumentParser) -> None:
         "--frames",
         metavar="FOLDER",
         type=Path,
-        help="kept frames of the camera (default those of RUN; with --link as received by `flight files`)",
+        help="kept frames of the camera (default those of RUN; with --link as received by `files`)",
     )
     text = "port of the page, 0 for any (default %(default)s)"
     parser.add_argument("--port", type=int, default=PORT, metavar="N", help=text)

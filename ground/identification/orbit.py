@@ -148,7 +148,7 @@ def fragment(found: LearnedDescription, folder: Path, extends: str) -> str:
     """
     sections = [_craft(found), _coils(found), _inertial_unit(found), _camera(found)]
     lines = [
-        f"# Made by `python -m flight identify` from {str(folder)!a} at {found.time:.0f} s; +- is 1 sigma.",
+        f"# Made by `knightcube identify` from {str(folder)!a} at {found.time:.0f} s; +- is 1 sigma.",
         f"extends: {json.dumps(extends)}",
     ]
     return "\n".join([*lines, *itertools.chain.from_iterable(sections)]) + "\n"

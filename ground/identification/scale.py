@@ -220,7 +220,7 @@ def plant_text(plant: AbsolutePlant, coil_turns: int, origin: str) -> str:
     """Return the section `plant` as YAML text with uncertainties and sources; `origin` names the flight."""
     section, sources = plant_section(plant, coil_turns), plant.sources()
     area = replace(plant.dipole, sigma=plant.dipole.sigma / coil_turns)
-    text = [f"# Made by `python -m flight identify` from {origin}; +- is 1 sigma.", "plant:"]
+    text = [f"# Made by `knightcube identify` from {origin}; +- is 1 sigma.", "plant:"]
     for name, found, unit, source in (
         ("inertia", plant.inertia, "kg m^2", sources["inertia"]),
         ("coil_turns", None, "", ""),

@@ -131,7 +131,7 @@ def terminal_of(options: argparse.Namespace) -> Terminal:
     Raises UsageError for invalid options, and FlightError if the link cannot be opened.
     """
     if options.keys is None:
-        raise UsageError("--link needs --keys, the ground's folder of `python -m ground keys`")
+        raise UsageError("--link needs --keys, the ground's folder of `knightcube keys`")
     section = DEFAULTS if options.config is None else load(options.config).link
     if section is None:
         raise UsageError(f"{options.config}: has no section `link`")

@@ -1,4 +1,4 @@
-"""Attitude and rate from one frame, by the decision tree of the vision worker and of `flight solve`.
+"""Attitude and rate from one frame, by the decision tree of the vision worker and of `knightcube solve`.
 
 1. In flight, the motion over the exposure is estimated for every frame, because each frame reports a rate.
    For any other image, the motion is only estimated if a fast survey of the bright areas shows streaks. If

@@ -21,10 +21,10 @@ RUNNABLE = {block.page for block in blocks() if block.commands and not block.mar
 
 def shortened(line: str) -> str:
     """Return the command to run for a line: a short flight with early faults, a report without pictures."""
-    if line.startswith("python -m flight run ") and "--help" not in line:
+    if line.startswith("knightcube run ") and "--help" not in line:
         early = re.sub(r"@ \d+", "@ 0.3", re.sub(r" for \d+", " for 0.3", line))
         return re.sub(r" --duration \d+", "", early) + f" {SHORT}"
-    if line.startswith("python -m flight report") and "--json" not in line:
+    if line.startswith("knightcube report") and "--json" not in line:
         return f"{line} --no-figures"
     return line
 
@@ -37,7 +37,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).symlink_to(ROOT / name)
     (folder / "docs").mkdir()
     (folder / "docs" / "examples").symlink_to(ROOT / "docs" / "examples")
-    run(f"python -m flight run config/step_demo.yaml --out runs/demo {SHORT}", folder)
+    run(f"knightcube run config/step_demo.yaml --out runs/demo {SHORT}", folder)
     return folder
 
 
@@ -63,7 +63,7 @@ def test_the_command_lines_of_a_page_work(page: str, home: Path) -> None:
     for block in blocks():
         if block.page == page and not block.mark:
             for line in block.commands:
-                if line != "python -m flight run config/step_demo.yaml --out runs/demo":
+                if line != "knightcube run config/step_demo.yaml --out runs/demo":
                     run(shortened(line), home)
 
 

@@ -46,7 +46,7 @@ def test_the_described_coils_are_flown(tmp_path: Path) -> None:
 
 
 def test_the_commands_of_two_line_elements_print_the_same_section() -> None:
-    lines = block("python -m flight elements").splitlines()
+    lines = block("knightcube elements").splitlines()
     assert len(lines) == 2
     first, second = (command(*line.split()[3:]) for line in lines)
     assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr

@@ -1,4 +1,4 @@
-"""`flight watch`: a log that is over, one that grows, one that stands still, and a flight that listens."""
+"""`knightcube watch`: a log that is over, one that grows, one that stands still, and a listening flight."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def test_a_flight_that_listens_is_asked_for_its_mode(tmp_path: Path) -> None:
     assert (facts["attitude"], facts["currents_a"], facts["events"]) == (None, None, [])
     listener.will_say(b"nonsense")
     done = command("watch", tmp_path / "socket", "--patience", "0.1")
-    assert (done.returncode, done.stderr) == (1, f"flight: {tmp_path / 'socket'}: no answer\n")
+    assert (done.returncode, done.stderr) == (1, f"knightcube: {tmp_path / 'socket'}: no answer\n")
 
 
 def test_the_state_and_events_of_an_answer_are_shown_and_each_event_once(

@@ -16,7 +16,6 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 from flight import __version__
@@ -86,8 +85,8 @@ COMMANDS = {
 ENTRY_POINTS = "knightcube.commands"
 """Name of the entry points, each of which is a table of the commands that a package adds."""
 
-PROGRAM = "knightcube" if Path(sys.argv[0]).name == "knightcube" else "python -m flight"
-"""Name by which the program was started: its console script or the module."""
+PROGRAM = "knightcube"
+"""Name of the program in help, errors and examples; `python -m flight` is the same program."""
 
 _EXAMPLES = f"""\
 examples:
@@ -202,5 +201,5 @@ def _available(words: Sequence[str]) -> dict[str, tuple[str, str, str]]:
 def _complain(message: str, status: int) -> int:
     """Print an error message, in which control characters cannot control a terminal."""
     lines = map(shown, message.split("\n"))
-    sys.stderr.write("flight: " + "\n".join(lines) + "\n")
+    sys.stderr.write("knightcube: " + "\n".join(lines) + "\n")
     return status

@@ -1,4 +1,4 @@
-"""The command `flight check`, which checks whether a configuration can be flown at present.
+"""The command `knightcube check`, which checks whether a configuration can be flown at present.
 
 The function `probe` looks for the real devices that a configuration names. No device is configured, and no
 coil is driven. A device that does not answer is reported together with the cure. The serial port and the
@@ -124,14 +124,14 @@ def _listen(device: str, baud_rate: int, stack: ExitStack) -> str:
 
 def _open_camera(camera: Camera | WideCamera, stack: ExitStack) -> str:
     linux_camera(camera, SystemClock(), stack)
-    return "opens; `flight camera` shows its images"
+    return "opens; `knightcube camera` shows its images"
 
 
 def _files(config: Config) -> Iterator[Probed]:
     tracker = config.camera.star_tracker if config.camera is not None else None
     if tracker is not None and tracker.index is not None:
         there = Path(tracker.index).is_file()
-        cure = "no such file: make it with `flight index --camera CONFIG --out FILE`"
+        cure = "no such file: make it with `knightcube index --camera CONFIG --out FILE`"
         yield Probed("camera.star_tracker.index", tracker.index, there, "is there" if there else cure)
     if config.commands.socket is not None:
         there = Path(config.commands.socket).parent.is_dir()
@@ -207,7 +207,7 @@ def _check_position(config: Config) -> None:
     """
     if isinstance(config, OrbitConfig) and config.gps is None and config.elements is None:
         target = config.targets[0].point
-        cure = "add `gps`, or `elements`, which `flight elements` makes"
+        cure = "add `gps`, or `elements`, which `knightcube elements` makes"
         raise ConfigError("targets[0].point", f"is {target}: pointing needs the position: {cure}")
 
 

@@ -1,4 +1,4 @@
-"""The command `flight link`, which runs the link process between a flight and its ground station."""
+"""The command `knightcube link`, which runs the link process between a flight and its ground station."""
 
 from __future__ import annotations
 
@@ -261,5 +261,5 @@ def self_test() -> None:
 def _say(text: str) -> None:
     """Write a line to standard error; a full disk does not end the link."""
     with suppress(OSError):
-        sys.stderr.write(f"flight: {text}\n")
+        sys.stderr.write(f"knightcube: {text}\n")
         sys.stderr.flush()

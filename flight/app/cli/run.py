@@ -1,4 +1,4 @@
-"""The command `flight run`, which flies a configuration and prints a summary of the flight."""
+"""The command `knightcube run`, which flies a configuration and prints a summary of the flight."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         result = fly(request, progress)
     except StoppedError as error:  # a signal ended the start of the service
-        sys.stderr.write(f"flight: {error}\n")
+        sys.stderr.write(f"knightcube: {error}\n")
         return 0
     except OSError as error:
         if options.archive is None:
@@ -158,7 +158,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         sys.stdout.write(summary_text(result, elapsed))
     for problem in filter(None, (result.log_error, result.restart)):
-        sys.stderr.write(f"flight: {problem}\n")
+        sys.stderr.write(f"knightcube: {problem}\n")
     # The exit status 1 makes a service manager restart the service.
     return 1 if result.log_error or result.restart else 0
 

@@ -71,7 +71,7 @@ def test_what_may_pass_is_waited_for_and_reported(
     assert attempts.open == 0
     assert clock.now_ns() == pytest.approx(3e9)
     assert retry.summary() == "begun at attempt 5 after 3.0 s: commands.udp: not up yet"
-    assert capsys.readouterr().err.count("flight: cannot begin yet: ") == 4
+    assert capsys.readouterr().err.count("knightcube: cannot begin yet: ") == 4
 
 
 @pytest.mark.parametrize("error", [ConfigError("flight.yaml:3", "`coils` is wrong"), ZeroDivisionError()])

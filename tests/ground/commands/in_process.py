@@ -1,4 +1,4 @@
-"""A command line typed in this process: what `python -m flight` does with it, modules and sky loaded once.
+"""A command line typed in this process: what `knightcube` does with it, modules and sky loaded once.
 
 That the same comes of a process of its own is what `test_commands.py` looks at.
 """

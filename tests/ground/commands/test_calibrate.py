@@ -1,4 +1,4 @@
-"""`flight calibrate`: pictures of the sky in, the lens and a camera file for `flight solve` out."""
+"""`knightcube calibrate`: pictures of the sky in, the lens and a camera file for `knightcube solve` out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m flight camera`, and the camera section of a configuration, as a user meets them."""
+"""`knightcube camera`, and the camera section of a configuration, as a user meets them."""
 
 from __future__ import annotations
 

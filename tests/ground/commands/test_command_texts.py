@@ -1,4 +1,4 @@
-"""What `flight camera` and `flight rate` print, from hand-made frames and motions."""
+"""What `knightcube camera` and `knightcube rate` print, from hand-made frames and motions."""
 
 from __future__ import annotations
 

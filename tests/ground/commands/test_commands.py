@@ -23,7 +23,7 @@ from tests.support.places import DEMO, ROOT
 
 
 def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run `python -m flight` in the repository."""
+    """Run `knightcube` in the repository."""
     words = [sys.executable, "-m", "flight", *map(str, arguments)]
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=100)
 
@@ -42,20 +42,20 @@ def obeyed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[
 def test_the_program_shows_its_help() -> None:
     done = command("--help")
     assert done.returncode == 0
-    assert "usage: python -m flight" in done.stdout
+    assert "usage: knightcube" in done.stdout
 
 
 @pytest.mark.parametrize("words", [["run"], ["report"], ["export"], ["plan"]])
 def test_help_is_everywhere(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     status, output, _ = obeyed(capsys, *words, "--help")
     assert status == 0
-    assert "usage: python -m flight" in output
+    assert "usage: knightcube" in output
 
 
 def test_a_short_flight_says_what_it_did_and_what_to_do_next(tmp_path: Path) -> None:
     done = command("run", DEMO, "--duration", "3", "--out", tmp_path / "run", "--seed", "4")
     assert done.returncode == 0
-    assert "python -m flight report" in done.stdout
+    assert "knightcube report" in done.stdout
     assert done.stderr == "", "no progress line where there is no terminal"
     assert (tmp_path / "run" / "config.yaml").read_text() == DEMO.read_text()
 
@@ -163,7 +163,7 @@ def test_plan_shows_a_stretched_horizon_and_draws_it(tmp_path: Path) -> None:
 def test_plan_refuses_what_no_coil_can_reach(capsys: pytest.CaptureFixture[str]) -> None:
     status, _, error = obeyed(capsys, "plan", "--from", "0.9", "--to", "0.0")
     assert status == 2
-    assert error == "flight: --from 0.9: must be -0.68 to 0.68\n"
+    assert error == "knightcube: --from 0.9: must be -0.68 to 0.68\n"
 
 
 def test_export_writes_a_table_for_each_kind_of_packet(

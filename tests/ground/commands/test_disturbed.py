@@ -37,7 +37,7 @@ def test_a_reader_that_is_gone_does_not_count_as_a_failure(ending: str, run_fold
 @pytest.mark.parametrize("words", ["--help", "report RUN --no-figures"])
 def test_output_that_does_not_fit_the_disk_is_one_line(words: str, run_folder: Path) -> None:
     done = shell(f"FLIGHT {words} > /dev/full".replace("RUN", str(run_folder)))
-    assert (done.returncode, done.stderr) == (1, "flight: No space left on device\n")
+    assert (done.returncode, done.stderr) == (1, "knightcube: No space left on device\n")
 
 
 def test_ctrl_c_ends_a_command_by_the_signal_itself_from_its_first_import_on() -> None:
@@ -101,7 +101,7 @@ def test_a_picture_too_small_to_show_anything_is_refused(
     name, *options = words.split()
     done = command(name, path, *options)
     assert done.returncode == 2
-    assert done.stderr == f"flight: {path}: {shape[1]} x {shape[0]} pixels: give 16 or more each way\n"
+    assert done.stderr == f"knightcube: {path}: {shape[1]} x {shape[0]} pixels: give 16 or more each way\n"
 
 
 @pytest.mark.parametrize("method", ["likelihood", "harris"])

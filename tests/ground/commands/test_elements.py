@@ -1,4 +1,4 @@
-"""`flight elements` makes elements that `flight check` accepts, and fits them to fixes."""
+"""`knightcube elements` makes elements that `knightcube check` accepts, and fits them to fixes."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_check_refuses_elements_that_do_not_fit_and_accepts_those_that_are_made(
     assert "orbit.yaml:" in done.stderr
     assert "`elements` are up to " in done.stderr
     assert "km from the first revolution of `simulation.free_body.orbit`" in done.stderr
-    assert "must be within 100 km: `flight elements --config FILE` makes" in done.stderr
+    assert "must be within 100 km: `knightcube elements --config FILE` makes" in done.stderr
     made = command("elements", "--config", path)
     assert made.returncode == 0, made.stderr
     path.write_text(f"{path.read_text(encoding='utf-8')}{made.stdout}", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""`flight horizon`: from a picture file to the way down, in numbers and in a picture."""
+"""`knightcube horizon`: from a picture file to the way down, in numbers and in a picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`flight identify`: flies, fits, writes a piece of configuration; a mistake is one line."""
+"""`knightcube identify`: flies, fits, writes a piece of configuration; a mistake is one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`flight identify` of a satellite: the next flight begins nearer to the truth."""
+"""`knightcube identify` of a satellite: the next flight begins nearer to the truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`flight index`: an index for a mission's camera."""
+"""`knightcube index`: an index for a mission's camera."""
 
 from __future__ import annotations
 

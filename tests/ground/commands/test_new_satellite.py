@@ -1,4 +1,4 @@
-"""`flight new-satellite` writes a configuration that is checked, commented and true to its options."""
+"""`knightcube new-satellite` writes a configuration that is checked, commented and true to its options."""
 
 from __future__ import annotations
 
@@ -266,10 +266,7 @@ def test_the_answers_are_shown_when_the_file_cannot_be_written(
     done = command("new-satellite", "--out", tmp_path / "absent" / "mine.yaml")
     assert done.returncode == 2
     assert "mine.yaml: cannot be written: No such file or directory" in done.stderr
-    assert (
-        "the answers as a command:\n  python -m flight new-satellite --name my_satellite --mass 4"
-        in done.stderr
-    )
+    assert "the answers as a command:\n  knightcube new-satellite --name my_satellite --mass 4" in done.stderr
 
 
 def test_every_question_has_an_option_with_help() -> None:
@@ -303,5 +300,5 @@ def test_ctrl_c_shows_the_command_that_continues(tmp_path: Path) -> None:
         rest = process.stderr.read()
     os.close(main)
     assert process.returncode == 130
-    assert "nothing was written; to continue:\n  python -m flight new-satellite --mass 4\n" in rest
+    assert "nothing was written; to continue:\n  knightcube new-satellite --mass 4\n" in rest
     assert list(tmp_path.iterdir()) == []

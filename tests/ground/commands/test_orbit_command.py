@@ -1,4 +1,4 @@
-"""`flight orbit` from packets to words, JSON and messages that say the same; a short arc is refused."""
+"""`knightcube orbit` from packets to words, JSON and messages that say the same; a short arc is refused."""
 
 from __future__ import annotations
 

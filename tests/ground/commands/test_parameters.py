@@ -1,4 +1,4 @@
-"""`flight parameters` with a flight's task of parameters at the other end of its socket."""
+"""`knightcube parameters` with a flight's task of parameters at the other end of its socket."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`flight plan --orbit`: one slew in three axes as JSON, text and picture, and what it refuses."""
+"""`knightcube plan --orbit`: one slew in three axes as JSON, text and picture, and what it refuses."""
 
 from __future__ import annotations
 

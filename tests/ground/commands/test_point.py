@@ -1,4 +1,4 @@
-"""The words of `flight command ... point` go through the packet and end in the attitude that they name."""
+"""The words of `knightcube command ... point` go through the packet and end in the attitude they name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`flight rate`: from a picture file to a rate, its covariance, its streaks, and a picture of them."""
+"""`knightcube rate`: from a picture file to a rate, its covariance, its streaks, and a picture of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`flight renewal` makes keys and bundles that a board accepts."""
+"""`knightcube renewal` makes keys and bundles that a board accepts."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def test_pictures_that_cannot_be_drawn_fail_only_if_their_folder_was_given(
     monkeypatch.setattr("ground.commands.runs.reporting.draw", draw)
     for words, status in (((), 0), (("--figures", tmp_path), 2)):
         done = command("report", flown, *words)
-        assert (done.returncode, done.stderr) == (status, "flight: no matplotlib\n")
+        assert (done.returncode, done.stderr) == (status, "knightcube: no matplotlib\n")
 
 
 def test_two_runs_are_compared_and_drawn_into_a_given_folder(

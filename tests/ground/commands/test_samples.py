@@ -1,4 +1,4 @@
-"""`flight samples` and `flight camera --rate`: what the commands find in the pictures is their truth."""
+"""`knightcube samples` and `knightcube camera --rate`: what the commands find in pictures is their truth."""
 
 from __future__ import annotations
 

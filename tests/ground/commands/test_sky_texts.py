@@ -1,4 +1,4 @@
-"""What `flight solve` and `flight calibrate` print of a solution, compared with the solution and a record."""
+"""What `knightcube solve` and `knightcube calibrate` print, compared with the solution and a record."""
 
 from __future__ import annotations
 

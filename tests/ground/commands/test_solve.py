@@ -1,4 +1,4 @@
-"""`flight solve`: from a picture file to a place in the sky, its stars, and a picture of them."""
+"""`knightcube solve`: from a picture file to a place in the sky, its stars, and a picture of them."""
 
 from __future__ import annotations
 

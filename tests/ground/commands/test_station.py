@@ -151,7 +151,7 @@ def test_a_gateway_serves_until_a_signal(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setattr(station, "terminal_of", lambda _: terminal)
     done = command("gateway", "--link", "127.0.0.1:9", "--keys", tmp_path, "--serve", "127.0.0.1:0")
     assert done.stdout.endswith("7 frames accepted\n")
-    assert (done.returncode, done.stderr) == (0, "flight: gateway: hello\n")
+    assert (done.returncode, done.stderr) == (0, "knightcube: gateway: hello\n")
     assert "127.0.0.1:4321" in done.stdout
     assert made[0][0] == "127.0.0.1:0"
     assert closed == ["gateway", "terminal"]

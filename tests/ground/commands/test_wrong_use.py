@@ -97,5 +97,5 @@ def test_a_bad_configuration_is_one_line_with_its_place_and_what_is_permitted(
     path.write_text(text.replace(right, wrong, 1), encoding="utf-8")
     done = command("run", path, "--duration", "0.1", "--out", tmp_path / "run")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-    assert done.stderr.startswith(f"flight: {path}"), done.stderr
+    assert done.stderr.startswith(f"knightcube: {path}"), done.stderr
     assert complaint in done.stderr

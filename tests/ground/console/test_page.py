@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def serving(folder: Path, port: int = 0) -> Iterator[str]:
-    """Run `flight console` on a run, and yield the address that it prints."""
+    """Run `knightcube console` on a run, and yield the address that it prints."""
     words = [sys.executable, "-m", "flight", "console", str(folder), "--port", str(port)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as server:
         try:

@@ -204,7 +204,7 @@ def test_the_file_with_the_token_is_its_users_alone_and_goes_with_the_gateway(tm
 
 @dataclass
 class Opened:
-    """The command `flight gateway` in a process of its own, and the frames that it sends up."""
+    """The command `knightcube gateway` in a process of its own, and the frames that it sends up."""
 
     process: subprocess.Popen[str]
     port: int
@@ -261,7 +261,7 @@ def test_the_command_obeys_whoever_has_read_its_file_and_nobody_else(opened: Ope
     opened.process.terminate()
     assert opened.process.wait(PATIENCE_S) == 0
     reason = "connection closed: its first bytes are not the token (closed so far: 1)"
-    assert opened.errors.read_text() == f"flight: gateway: {reason}\n"
+    assert opened.errors.read_text() == f"knightcube: gateway: {reason}\n"
     assert not path.exists()
 
 

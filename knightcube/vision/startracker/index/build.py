@@ -2,7 +2,7 @@
 
 The default index is built at its first use, which takes some seconds, and is stored in the cache folder
 $XDG_CACHE_HOME/knightcube or ~/.cache/knightcube. On board, the installer builds the index, and the
-configuration names its path. `python -m flight index --camera CONFIG` builds the index for a mission's
+configuration names its path. `knightcube index --camera CONFIG` builds the index for a mission's
 camera.
 """
 

@@ -1,4 +1,4 @@
-"""`flight check`: ready or not, with each missing device and its cure, before anything is flown."""
+"""`knightcube check`: ready or not, with each missing device and its cure, before anything is flown."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def test_devices_that_are_missing_are_named_with_the_cure_and_one_that_is_there_
         "coils": "no such bus",
         "power_monitor": "no such bus",
         "camera": "no-camera",
-        "camera.star_tracker.index": "flight index",
+        "camera.star_tracker.index": "knightcube index",
         "commands.socket": "no such folder",
     }.items():
         assert cure in devices[name]["text"] + devices[name]["place"], name

@@ -1,4 +1,4 @@
-"""`flight files` over a real line: list, get, put, use, delete, each as the page has it."""
+"""`knightcube files` over a real line: list, get, put, use, delete, each as the page has it."""
 
 from __future__ import annotations
 

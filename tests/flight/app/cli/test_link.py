@@ -1,4 +1,4 @@
-"""`flight link` and `flight command --link` over real lines, and the keys that both need."""
+"""`knightcube link` and `knightcube command --link` over real lines, and the keys that both need."""
 
 from __future__ import annotations
 

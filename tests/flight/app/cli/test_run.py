@@ -1,4 +1,4 @@
-"""`flight run`: the summary of a flight, its elapsed time, its progress and its seed."""
+"""`knightcube run`: the summary of a flight, its elapsed time, its progress and its seed."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_elapsed_time_is_that_of_the_flight_and_a_failure_is_status_1(
     assert options.command(options) == status
     printed = capsys.readouterr()
     assert json.loads(printed.out)["elapsed_s"] == 2.5
-    assert printed.err == (f"flight: {complaint}\n" if complaint else "")
+    assert printed.err == (f"knightcube: {complaint}\n" if complaint else "")
     (request,) = requests
     assert (request.seed, request.duration, request.out) == (7, 3.0, Path("runs/mine"))
     assert (request.faults, request.accepted, request.realtime) == (("imu: silent",), True, False)
