@@ -33,7 +33,7 @@ from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.gnc.guidance.three_axes.slew_model import Cone, shown
+from knightcube.gnc.guidance.three_axes.slew_model import Cone, heat_matrix, shown
 from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder, SlewStatus
 
 SPIN_MARGIN = 0.2
@@ -310,7 +310,8 @@ def slew_figure(made: OrderedSlew, order: SlewOrder) -> Figure:
         panels.level(dipole, limit, "limit")
     panels.style(dipole, "dipole, mA m²", f"Dipole; the limit is {limit:.3g} mA m²", "")
     _slew_torque(torque, made, times)
-    power = made.plan.path.dipoles(times) ** 2 @ made.task.craft.weights
+    moments = made.plan.path.dipoles(times)
+    power = np.sum(moments @ heat_matrix(made.task.craft.weights) * moments, axis=1)
     heat = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(times) * (power[1:] + power[:-1]))])
     energy.fill_between(times, heat, color=panels.BLUE, alpha=0.35, linewidth=0)
     energy.set_ylim(bottom=0.0)
