@@ -26,7 +26,7 @@ from flight.schema.values import (
     Vector,
 )
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.control.coil_map import CoilMap, missing_direction
+from knightcube.gnc.control.coil_map import LEAST_SPREAD, CoilMap, missing_direction
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
 
@@ -151,10 +151,10 @@ class Coils(Section, frozen=True, kw_only=True):
         channels.
         """
         axes = np.array([coil.direction() for coil in self.windings]).T
-        normal = missing_direction(axes)
-        if normal is None:
+        if np.linalg.matrix_rank(axes, LEAST_SPREAD) == 3:
             return self.windings
-        if len(self.windings) == 2:
+        normal = missing_direction(axes)
+        if normal is None or len(self.windings) == 2:
             normal = np.cross(axes[:, 0], axes[:, 1])
         x, y, z = normal.tolist()
         used = {channel for k, coil in enumerate(self.windings) for channel in coil.pins(k)}
