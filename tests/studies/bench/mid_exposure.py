@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import show
 from knightcube.astro.arrays import FloatArray, Image, cross_matrices
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.vision.camera.lens import EXACT, Pinhole
@@ -31,7 +32,6 @@ from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns import streaks as campaign
-from tests.studies.campaigns.campaign import show
 from tests.support.attitude_errors import attitude_error, error_in_pixels
 from tests.support.scenes import FIELD, Scene, noise_floor, slew
 from tests.support.streak_bound import star_information

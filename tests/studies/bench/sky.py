@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import show
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.images import read_image
 from tests.knightcube.vision.startracker.frames import SkyFrame, sky_frame
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import Answer, peer_answers
-from tests.studies.campaigns.campaign import show
 from tests.support.photographs import (
     _HIGHEST_DEG,
     _LOWEST_DEG,

@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from ground.campaigns.runner import show
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.solvers import SOLVERS
 from knightcube.astro.quaternion import conjugate, multiply, normalise, to_rotation_vector
@@ -24,7 +25,6 @@ from knightcube.vision.startracker.detection.survey import CENTROIDS, Method
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings, solve_points
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.campaign import show
 from tests.support.scenes import YEAR, exposed
 
 _SEED = 41_207

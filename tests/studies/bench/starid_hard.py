@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import show
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.startracker.attitude_fit import StarMatch
 from knightcube.vision.startracker.index.build import default_index
@@ -26,7 +27,6 @@ from knightcube.vision.startracker.index.sky_index import GuideStars, SkyIndex
 from knightcube.vision.startracker.lost_in_space import identify
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import ARCSECONDS, Answer, peer_answers, pointing_error
-from tests.studies.campaigns.campaign import show
 from tests.support.star_lists import PIXELS, ListKind, StarList, believed_field, draw, draw_random
 
 _SEED = 314_159

@@ -8,8 +8,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from ground.campaigns import CampaignError
+from ground.campaigns.runner import Campaign, fly
 from knightcube.errors import UsageError
-from tests.studies.campaigns.campaign import Campaign, CampaignError, fly
 from tests.studies.campaigns.registry import CAMPAIGNS
 
 

@@ -18,11 +18,11 @@ import numpy as np
 
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, as_orbit
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from ground.report.orbit import COARSE, FINE, camera_errors
 from ground.report.signals import seconds
 from ground.telemetry import Run
 from sim_hal.settings import Simulation
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.flights import CONFIG, fly
 
 ORBIT = CONFIG.parent / "orbit.yaml"

@@ -21,13 +21,13 @@ from flight.link import events
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Config, Modes
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from ground.telemetry import Run
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.flights import demo_config, demo_world, fly
 
 DURATION = 20.0

@@ -29,7 +29,7 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.testbed import PidGains, TestbedConfig
 from ground import report
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from tests.support.flights import demo_config, demo_world, fly, thesis_config
 from tests.support.ideal_power import clairvoyant_power
 

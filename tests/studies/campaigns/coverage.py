@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.almanac import apparent_sun
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, normalise
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.orbit_geometry import (
     SUITES,
     Pass,

@@ -23,10 +23,10 @@ from flight.link.process.commanding import Timetable
 from flight.link.regular_files import to_record
 from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Association, Gate, Vault, new_key
 from flight.loop.state import StateStore, StoredState, note_boot
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from hal.interfaces.guardian import CoilReach
 from tests.deploy.boards import FakeBoard
 from tests.flight.link.vaults import gate
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 FLIPS = 25
 """Flips on one board."""

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import FieldAhead
@@ -35,7 +36,6 @@ from sim_hal.description_errors import NO_ERRORS, DescriptionErrors
 from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds.free_body import CRAFTS, DRAG_COEFFICIENT, SOLAR_PRESSURE
 from sim_hal.worlds.orbit import air_flow
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.free_flight import (
     CRAFT,
     FIX_SIGMA,

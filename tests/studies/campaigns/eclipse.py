@@ -20,6 +20,7 @@ import numpy as np
 from flight.bodies.orbit.body import filter_settings
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from ground.report.orbit import camera_errors, dipole_errors
 from ground.report.signals import seconds
 from ground.telemetry import Run
@@ -32,7 +33,6 @@ from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 from knightcube.gnc.estimation.free_filter import ATTITUDE, FreeFilter
 from sim_hal.settings import FaultEntry, FreeBodySection, Simulation, TipOff
 from sim_hal.worlds.free_body import FreeBody
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, PAUSE, STAR_SIGMA, PointingFlight
 from tests.support.flights import CONFIG, fly
 

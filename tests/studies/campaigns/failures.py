@@ -24,13 +24,13 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import EXACT
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.scenes import FIELD, RandomSlew, Scene, usable
 
 WRONG_SIGMAS = 6.0

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import Image
 from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.horizon.nadir import find_nadir
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, nadir, render
 from tests.sim_hal.earth_camera.scenes import random_scene
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.limbless import MAKERS, photographed
 from tests.support.earth_truth import ideal_counts, limb_truth, radiance_of, sun_point
 from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings

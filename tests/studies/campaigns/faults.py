@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from flight.schema import reader as configuration
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.fault_judgement import judge
 from tests.studies.campaigns.fault_table import OWN, part_of
 from tests.support.flights import DURATION, config_for, demo_config, demo_world, fly

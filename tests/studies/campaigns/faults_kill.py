@@ -26,12 +26,12 @@ import yaml
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import LONGEST_PACKET
 from flight.loop.state import StateStore, StoredState
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from ground.telemetry import Run, read_run
 from knightcube.errors import UsageError
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import LiveFlight, devices_running, write_config
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 START_S = 1.5
 """s, assumed from exec to READY until the first start was measured."""

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.first_orbit import ArcError, Bearings, first_orbit
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.short_arcs import LIGHT, circular, flown_states
 
 SIGMA = float(0.1 * np.radians(20.0) / 1024)

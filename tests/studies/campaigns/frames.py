@@ -21,9 +21,9 @@ import numpy as np
 from flight.link.commands import CommandPacker, Ping, unpack
 from flight.link.frames import close_frame
 from flight.link.security import HIGHEST_COUNTER, Refusal
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.vaults import frame_with
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 FRAMES, PORTION, GENUINE, LAST = 1000, 50, 30, 9999
 EDGES = (0, 2**31, 2**32, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1, 2**64, 2**95, 2**96 - 1)

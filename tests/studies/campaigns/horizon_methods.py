@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
@@ -37,7 +38,6 @@ from knightcube.vision.horizon.nadir import find_nadir, nadir_of_cameras
 from knightcube.vision.horizon.settings import HorizonKnowledge, SensedDirection
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.sim_hal.earth_camera.scenes import DAY, NIGHT, pointing, random_direction
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.nadir import WRONG_DEG
 from tests.support.earth_truth import limb_truth
 from tests.support.limb_frames import (

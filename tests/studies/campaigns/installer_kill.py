@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from tests.deploy.boards import FakeBoard
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 KILLS = 10
 """Of a board; then its update comes to its end."""

@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.reference.star_identification import METHODS, StarMotion, identify_by_rate
 from knightcube.reference.star_tables import KnownSky, angles
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.index.build import default_index
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.star_lists import PIXELS, ListKind, StarList, draw
 
 NOMINAL: dict[str, float] = {

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.quaternion import (
     attitude_matrix,
@@ -30,7 +31,6 @@ from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
 from tests.support.scenes import FIELD, catalogue, noise_floor
 from tests.support.supersampled import Attitudes, Sky, light

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir
 from sim_hal.earth_camera import nadir, render
 from tests.sim_hal.earth_camera.scenes import random_scene
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings, random_air
 
 VIEWS = ("sunlit", "terminator")

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array, lil_array
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.object_chase import FASTEST, FIELD, GAP, NEAREST, SIGHTING, ObjectChase
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE
 

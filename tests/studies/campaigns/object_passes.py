@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.quaternion import (
     attitude_matrix,
@@ -39,7 +40,6 @@ from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveS
 from knightcube.vision.streaks.geometry import CameraMotion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.object_passes import Pass, a_pass
 from tests.support.scenes import catalogue
 from tests.support.streak_bound import star_information

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from flight.schema.reader import replace
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.geomagnetism import field as believed_field
 from knightcube.astro.quaternion import conjugate, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
 from knightcube.gnc.estimation.estimate import ATTITUDE, BIAS, Estimate
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, DeterminationSettings
 from tests.support import orbit_world
 from tests.support.consistency_worlds import band

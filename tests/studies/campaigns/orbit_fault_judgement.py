@@ -9,13 +9,13 @@ import numpy as np
 from flight.link.events import EVENTS, EventKind, Severity
 from flight.link.modes import POINTING, Mode
 from flight.link.telemetry.packets import to_text
+from ground.campaigns.runner import Result
 from ground.report.orbit import FINE, LOST, attitude_errors
 from ground.report.signals import seconds
 from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.faults.bench import FaultKind
-from tests.studies.campaigns.campaign import Result
 from tests.studies.campaigns.fault_judgement import GAIN_ERROR, OFF_SURELY
 from tests.studies.campaigns.fault_table import OWN, own_events, part_of
 from tests.studies.campaigns.orbit_fault_flights import DURATION

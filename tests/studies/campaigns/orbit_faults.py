@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.orbit_fault_flights import DURATION, MODES, config_for, world_for
 from tests.studies.campaigns.orbit_fault_judgement import judge
 from tests.support.flights import fly

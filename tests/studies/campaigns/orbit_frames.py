@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.attitude.solvers import VectorObservation
 from knightcube.astro.earth.geomagnetism import field as believed_field
@@ -38,7 +39,6 @@ from knightcube.vision.solar_cells import CoarseSun, SolarStringModel, coarse_su
 from knightcube.vision.sun import SunOfCameras, SunSettings, sun_of_cameras
 from sim_hal.earth_camera import EarthScene, render
 from sim_hal.emulators.solar_cells import SolarCellsModel
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, Report, begin
 from tests.studies.campaigns.orbit_attitude import SECOND, errors_of, settings_of
 from tests.support import orbit_world

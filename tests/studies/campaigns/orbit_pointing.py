@@ -22,11 +22,11 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.estimation.rigid_body import BodyErrors
 from sim_hal.description_errors import DescriptionErrors
 from sim_hal.worlds.free_body import CRAFTS
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.detumble import description
 from tests.studies.campaigns.free_flight import WATTS
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, TARGETS, PointingFlight

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.orbit_slews_flight import FIRST, HORIZON, SlewFlight
 
 SHARES = (0.1, 0.3, 1.0)

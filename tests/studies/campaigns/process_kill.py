@@ -25,13 +25,13 @@ from pathlib import Path
 import numpy as np
 
 from flight.link import events
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from ground.telemetry import read_run
 from hal.buses import linux_process
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import LiveFlight
 from tests.studies.bench.executive import Load, full_load, members
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.faults_kill import Board, watch_coils
 from tests.support.process_watch import answering, below, command
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from ground.campaigns.runner import Campaign
 from tests.studies.campaigns.acquisition import ACQUISITION
-from tests.studies.campaigns.campaign import Campaign
 from tests.studies.campaigns.coil_faults import COIL_FAULTS
 from tests.studies.campaigns.controllers import CONTROLLERS_CAMPAIGN
 from tests.studies.campaigns.coverage import COVERAGE

@@ -23,9 +23,9 @@ import numpy as np
 
 from flight.link.process.commanding import Stage
 from flight.link.process.directives import KINDS, Confirm
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from tests.deploy.renewed_board import RenewedBoard
 from tests.deploy.renewed_ends import RenewedEnds, linked_text
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 FLAWS = {
     "configuration": ("", "", "byte", "cut", "foreign key", "bounds", "body", "world", "keys", "reacts"),

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import (
     attitude_matrix,
@@ -32,7 +33,6 @@ from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
 from tests.studies.campaigns.mismatch import WRONG_SIGMAS, detected
 from tests.support.scenes import FIELD, catalogue

@@ -28,8 +28,8 @@ from flight.link.security import (
     Vault,
     new_key,
 )
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from tests.flight.link.vaults import Ground, gate
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 STEPS = 60
 _SPIS = (*COMMAND_SPIS, *TELEMETRY_SPIS)

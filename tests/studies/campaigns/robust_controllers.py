@@ -25,11 +25,11 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
 from ground import report
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from ground.report.steps import STEADY_STATE_S
 from ground.telemetry import Run
 from sim_hal.emulators.serial_line import LineFaults
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.controllers import CONTROLLERS
 from tests.support.flights import Rigged, demo_world, event_names, fly
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Result
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from knightcube.reference.corner_streaks.settings import StreakSettings
@@ -17,7 +18,6 @@ from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
-from tests.studies.campaigns.campaign import Result
 from tests.support.scenes import SAMPLES, catalogue
 
 EXPOSURE = 0.5

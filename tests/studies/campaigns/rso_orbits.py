@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.vision.objects.detect import ObjectReport
 from sim_hal.star_camera import StarCameraModel, render
 from sim_hal.star_camera.objects import source_tracks
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.rso import (
     EXPOSURE,
     MATCH_PX,

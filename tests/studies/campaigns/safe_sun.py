@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
@@ -25,7 +26,6 @@ from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 from sim_hal.emulators.solar_cells import SolarCellsModel
 from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds.orbit import sun_position
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.detumble import SAMPLES_NS, hash_of
 from tests.studies.campaigns.free_flight import CRAFT, GYRO_NOISE, ORBITS, SECOND, FreeFlight
 

@@ -22,9 +22,9 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Telemetry
 from flight.schema.testbed import Step, TestbedConfig
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from ground.telemetry import Run
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.faults import faults
 from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
 

@@ -31,9 +31,9 @@ from itertools import zip_longest
 from pathlib import Path
 
 from flight.app.service import FlownConfig, sum_file
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.errors import UsageError
 from tests.hal.guardian.live_flight import ROOT, devices_running, write_config
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 CALLS = ("open", "openat", "read", "getdents64", "fsync", "rename", "bind", "ioctl")
 ERRORS = ("EIO", "ENOSPC", "ENOENT", "EACCES")

@@ -7,7 +7,7 @@ stated and not.
 
 from __future__ import annotations
 
-from tests.studies.campaigns.campaign import Campaign, Case, Result
+from ground.campaigns.runner import Campaign, Case, Result
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
 from tests.studies.campaigns.resting import look_at, summarise
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import FlightError
 from knightcube.reference.corner_streaks.rate import estimate_rate
@@ -25,7 +26,6 @@ from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.attitude_errors import attitude_error, error_in_pixels
 from tests.support.scenes import FIELD, Scene, noise_floor, slew, usable
 from tests.support.streak_bound import rate_bound

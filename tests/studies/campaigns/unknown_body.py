@@ -27,6 +27,7 @@ from flight.link import events
 from flight.link.modes import POINTING, Mode
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from ground.report.orbit import (
     FINE,
     WITH_STARS_S,
@@ -41,7 +42,6 @@ from ground.report.star_camera import star_camera
 from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from sim_hal.settings import Simulation
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.flights import fly
 from tests.support.unlike_body import configured
 

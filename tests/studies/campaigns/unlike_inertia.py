@@ -29,8 +29,8 @@ import numpy as np
 from flight.link.modes import Mode
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from sim_hal.settings import Simulation
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.flights import fly
 from tests.support.unlike_body import coil_judgement, configured, with_fault, without_cameras
 

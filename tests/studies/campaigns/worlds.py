@@ -16,9 +16,9 @@ from unittest import mock
 
 import numpy as np
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from sim_hal.worlds.basilisk.world import BasiliskWorld
 from tests.studies.campaigns import detumble, free_flight, orbit_pointing
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 WORLDS = ("free_body", "basilisk")
 LAWS = ("magnetometer", "attitude")

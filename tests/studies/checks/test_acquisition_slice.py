@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from ground.campaigns.runner import Case
 from tests.studies.campaigns import acquisition
-from tests.studies.campaigns.campaign import Case
 
 
 def test_a_flight_is_judged_by_when_it_knew_its_attitude_and_how_well(tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns.runner import Campaign, Case, Result, Summary, fly, fly_here
 from knightcube.errors import UsageError
 from tests.hal.guardian.states import state, wait_until
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, fly, fly_here
 
 
 def cases(runs: int, seed: int) -> list[Case]:

@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns import CampaignError
 from ground.campaigns import cluster as cluster_code
+from ground.campaigns.runner import Campaign, Case, Result, Summary, fly, fly_here
 from knightcube.errors import UsageError
-from tests.studies.campaigns.campaign import Campaign, CampaignError, Case, Result, Summary, fly, fly_here
 
 distributed = pytest.importorskip("distributed", reason="Dask is an optional extra and not installed")
 

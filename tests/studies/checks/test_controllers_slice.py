@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from flight.schema import reader as configuration
+from ground.campaigns.runner import Case
 from sim_hal.settings import Thread
 from tests.studies.campaigns import controllers, robust_controllers
-from tests.studies.campaigns.campaign import Case
 from tests.support.flights import demo_config, demo_world
 from tests.support.ideal_power import clairvoyant_power
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns.runner import Case
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from tests.studies.campaigns import eclipse
-from tests.studies.campaigns.campaign import Case
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE
 
 LIT, BLIND, SECONDS = 90.0, 40.0, 130.0

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns.runner import Result, fly_here
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns import failures
-from tests.studies.campaigns.campaign import Result, fly_here
 from tests.support.scenes import FIELD, LEAST_USABLE, RandomSlew, Scene, slew, usable
 
 _SEED = 20_261_121

@@ -10,9 +10,9 @@ import msgspec
 import pytest
 
 from flight.loop.state import COPIES, StateStore, StoredState, begin_boot
+from ground.campaigns.runner import fly_here
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.studies.campaigns import faults_kill
-from tests.studies.campaigns.campaign import fly_here
 from tests.studies.campaigns.faults_kill import KILLS, Board, cases, summarise
 
 

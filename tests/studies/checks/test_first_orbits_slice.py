@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns.runner import Case
 from knightcube.gnc.first_orbit import ArcError, Bearings, first_orbit
-from tests.studies.campaigns.campaign import Case
 from tests.studies.campaigns.first_orbits import FIRST_ORBITS, run
 
 SEED = 16

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ground.campaigns.runner import Case
 from tests.studies.campaigns import detumble, orbit_pointing
-from tests.studies.campaigns.campaign import Case
 
 CASE = {"craft": "knightcube", "orbit": "sso"}
 

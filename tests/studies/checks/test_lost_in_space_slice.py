@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns.runner import Case, Result
 from knightcube.reference.star_identification import METHODS
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarMatch
 from knightcube.vision.startracker.verification import nothing
 from tests.studies.campaigns import lost_in_space
-from tests.studies.campaigns.campaign import Case, Result
 from tests.support.star_lists import ListKind, draw
 
 LISTS = 6

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns.runner import Case, Result
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import EXACT, Pinhole
 from tests.studies.campaigns import mismatch
-from tests.studies.campaigns.campaign import Case, Result
 from tests.studies.campaigns.imperfections import IMPERFECTIONS
 from tests.support.supersampled import Optics, Sky, coma, disc, gaussian, halo, light, moffat, through_lens
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.studies.campaigns.campaign import Result, fly_here
+from ground.campaigns.runner import Result, fly_here
 from tests.studies.campaigns.nadir import NADIR, summarise
 
 

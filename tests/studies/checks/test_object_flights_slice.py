@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.studies.campaigns.campaign import Case
+from ground.campaigns.runner import Case
 from tests.studies.campaigns.object_flights import OBJECT_FLIGHTS, cases, least_deviation, run
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.studies.campaigns.campaign import Case
+from ground.campaigns.runner import Case
 from tests.studies.campaigns.object_passes import OBJECT_PASSES, run
 
 SEED = 16

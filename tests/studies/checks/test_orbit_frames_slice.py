@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.studies.campaigns.campaign import Case
+from ground.campaigns.runner import Case
 from tests.studies.campaigns.orbit_frames import ORBIT_FRAMES, VARIANTS, run
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from ground.campaigns.runner import Case
 from tests.studies.campaigns import orbit_slews
-from tests.studies.campaigns.campaign import Case
 
 
 def flown(run: tuple[int, int], **parameters: Any) -> dict[str, Any]:

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns.runner import Case, Result
 from knightcube.astro.quaternion import attitude_matrix
 from tests.studies.campaigns import coverage, orbit_attitude
-from tests.studies.campaigns.campaign import Case, Result
 from tests.support import orbit_world
 from tests.support.consistency_worlds import band
 from tests.support.orbit_geometry import limb, limb_in_daylight, revolution, suite

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.studies.campaigns.campaign import Case, fly_here
+from ground.campaigns.runner import Case, fly_here
 from tests.studies.campaigns.rate_change import RATE_CHANGE, run
 
 # A turn that goes back nearly as far as it came: its streaks are fitted well as those of a motion from rest,

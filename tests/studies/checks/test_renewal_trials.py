@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from tests.studies.campaigns.campaign import Case
+from ground.campaigns.runner import Case
 from tests.studies.campaigns.renewal_trials import FLAWS, cases, run
 
 pytestmark = [

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ground.campaigns.runner import Case
 from knightcube.astro.chi_square import bound
-from tests.studies.campaigns.campaign import Case
 from tests.studies.campaigns.resting import RESTING, TRAILS, run
 
 SEED = 17

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.studies.campaigns.campaign import fly_here
+from ground.campaigns.runner import fly_here
 from tests.studies.campaigns.rolling_shutter import ALONE, PRIOR, ROLLING_SHUTTER
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.studies.campaigns.campaign import Case
+from ground.campaigns.runner import Case
 from tests.studies.campaigns.rso import by_magnitude, ends_error
 from tests.studies.campaigns.rso_orbits import (
     MAGNITUDES,

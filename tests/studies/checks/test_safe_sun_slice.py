@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns.runner import Case
 from tests.studies.campaigns import safe_sun
-from tests.studies.campaigns.campaign import Case
 
 
 def test_a_knightcube_finds_the_sun_by_strings_and_gyro_and_holds_it(tmp_path: Path) -> None:

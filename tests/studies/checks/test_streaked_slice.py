@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.studies.campaigns.campaign import Case
+from ground.campaigns.runner import Case
 from tests.studies.campaigns.streaked import STREAKED, STREAKS, run
 
 SEED = 18

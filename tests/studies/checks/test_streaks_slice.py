@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ground.campaigns.runner import Case, Result
 from tests.studies.campaigns import streaks
-from tests.studies.campaigns.campaign import Case, Result
 
 FRAMES = 5
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from ground.campaigns.runner import Case
 from tests.studies.campaigns import unknown_body
-from tests.studies.campaigns.campaign import Case
 
 ROWS = ("orbit", "orbit-tumble", "orbit_3u", "orbit_3u-tumble")
 

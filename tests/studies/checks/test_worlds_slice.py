@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground.campaigns.runner import Case
 from sim_hal.worlds.free_body import FreeBody
 from tests.studies.campaigns import worlds
-from tests.studies.campaigns.campaign import Case
 
 SHORT = {"speed": np.radians(0.6), "seconds": 240.0}
 
