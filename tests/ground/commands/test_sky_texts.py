@@ -232,7 +232,9 @@ def test_a_camera_is_written_only_from_enough_stars(
     terms = lens()
     calibration = replace(terms.calibration, undetermined=undetermined)
     found = SimpleNamespace(
-        determined=replace(terms, calibration=calibration), images=[one for _, one in pictures()]
+        mirrored=False,
+        determined=replace(terms, calibration=calibration),
+        images=[one for _, one in pictures()],
     )
     monkeypatch.setattr(type(calibration), "stars", property(lambda _: stars), raising=False)
     monkeypatch.setattr(calibrate, "calibrate_lens", lambda *_, **__: found)
@@ -244,7 +246,7 @@ def test_a_camera_is_written_only_from_enough_stars(
 
 
 def test_pictures_that_are_not_solved_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = SimpleNamespace(determined=None, images=[one for _, one in pictures()])
+    found = SimpleNamespace(determined=None, mirrored=False, images=[one for _, one in pictures()])
     monkeypatch.setattr(calibrate, "calibrate_lens", lambda *_, **__: found)
     monkeypatch.setattr(calibrate, "_read", lambda paths: [(path, np.zeros((4, 4))) for path in paths])
     done = command("calibrate", "a", "b", "c")
