@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from flight.schema.reader import parse
 from flight.schema.testbed import as_testbed
+from ground import report
+from ground.commands import identify
 from tests.ground.commands.in_process import command
 from tests.support.places import DEMO
 
@@ -87,3 +91,39 @@ def test_a_flight_too_short_to_fit_is_one_line_and_exit_status_1(tmp_path: Path)
     assert "the flight is too short" in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("json_asked", [False, True], ids=["text", "json"])
+@pytest.mark.parametrize("drawn", [False, True], ids=["plain", "picture"])
+@pytest.mark.parametrize("written", [False, True], ids=["shown", "written"])
+def test_the_output_names_the_files_unless_it_is_one_json_object(
+    json_asked: bool,
+    drawn: bool,
+    written: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    made = SimpleNamespace(fragment="plant: {}\n", record="the record", found="the fit")
+    pictures: list[tuple[object, ...]] = []
+    monkeypatch.setattr(identify, "_fly", lambda _: tmp_path)
+    monkeypatch.setattr(identify, "_identify", lambda _: made)
+    monkeypatch.setattr(identify, "_facts", lambda _: {"gain": 0.3})
+    monkeypatch.setattr(identify, "_text", lambda _: "a table\n")
+    monkeypatch.setattr(report, "draw_fit", lambda *words: pictures.append(words))
+    out, picture = tmp_path / "plant.yaml", tmp_path / "fit.png"
+    options = argparse.Namespace(
+        source=str(tmp_path / "testbed.yaml"),
+        out=out if written else None,
+        json=json_asked,
+        picture=picture if drawn else None,
+    )
+    assert identify.run(options) == 0
+    assert pictures == ([("the record", "the fit", picture)] if drawn else [])
+    assert (out.read_text(encoding="utf-8") if out.exists() else "") == (made.fragment if written else "")
+    shown = capsys.readouterr().out
+    if json_asked:
+        assert json.loads(shown) == {"gain": 0.3}
+        return
+    expected = "a table\n\n" + (f"written: {out}\n" if written else made.fragment)
+    assert shown == expected + (f"picture: {picture}\n" if drawn else "")

@@ -21,6 +21,16 @@ def test_a_slew_begins_in_its_start_and_ends_in_its_target_whose_length_is_mende
     assert (facts["status"], facts["horizon_s"]) == ("optimal", 120.0)
     wanted = np.array([0.1, 0.2, 0.3, 0.9]) / np.sqrt(0.95)
     assert abs(wanted @ facts["quaternion"][-1]) == pytest.approx(1.0, abs=1e-6)
+    path, rates, times = (np.array(facts[name]) for name in ("quaternion", "rate_rad_s", "time_s"))
+    angle = 2.0 * np.arccos(abs(path[0] @ path[-1]))
+    assert facts["turn_deg"] == pytest.approx(np.degrees(angle), rel=1e-6)
+    assert facts["way_round"] == ("short" if path[0] @ path[-1] >= 0.0 else "long")
+    speed = np.linalg.norm(rates, axis=1)
+    assert facts["peak_rate_deg_s"] == pytest.approx(np.degrees(speed.max()))
+    swept = (0.5 * (speed[1:] + speed[:-1]) * np.diff(times)).sum()
+    assert facts["way_deg"] == pytest.approx(np.degrees(swept))
+    assert facts["way_deg"] >= facts["turn_deg"]
+    assert facts["mean_heat_W"] == pytest.approx(facts["energy_J"] / 120.0)
     # Nadir turns once a revolution of 5,677 s.
     assert np.linalg.norm(facts["rate_rad_s"][0]) == pytest.approx(2.0 * np.pi / 5677.0, rel=0.01)
     assert np.abs(facts["dipole_A_m2"]).max() == pytest.approx(
