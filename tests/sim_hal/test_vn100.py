@@ -214,6 +214,14 @@ def test_a_flood_without_a_line_end_overflows_its_buffer() -> None:
     assert bench.exchange(b"\r\n" + build("RRG", 1))[0].command == "RRG"
 
 
+def test_the_receive_buffer_holds_256_bytes() -> None:
+    bench = Bench().quiet()
+    question = build("RRG", 1)
+    assert bench.exchange(b"A" * (256 - len(question) + 1) + question[:-1], 0.1) == []
+    assert bench.exchange(question[-1:])[0].command == "RRG"
+    assert [s.fields for s in bench.exchange(b"A" * 257, 0.1)] == [("02",)]
+
+
 numbers = map(str, range(0, 101, 5))
 field = st.sampled_from([*numbers, "8", "44", "75", "01", "FFFF", "-1", "1e9", "nan", "", "é"])
 command = st.sampled_from(

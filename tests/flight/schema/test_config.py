@@ -162,6 +162,19 @@ def test_a_mistake_in_a_satellite_s_targets_gets_one_line(right: str, wrong: str
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("length", "valid"), [(0.9991, True), (1.0009, True), (0.9989, False), (1.0011, False)]
+)
+def test_a_target_s_quaternion_may_be_rounded_to_a_thousandth(length: float, valid: bool) -> None:
+    quaternion = [0.6 * length, 0.0, 0.0, 0.8 * length]
+    text = ORBIT.replace("point: sun}", f"point: inertial, quaternion: {quaternion}}}", 1)
+    if valid:
+        reader.parse(text, "orbit.yaml")
+        return
+    with pytest.raises(ConfigError, match=f"has length {length:.6g}: a quaternion must have length 1"):
+        reader.parse(text, "orbit.yaml")
+
+
 def test_a_time_line_points_a_satellite_and_never_the_testbed() -> None:
     line = "commands: {timeline: [{at: 9.0, point: ground, latitude_deg: 45, longitude_deg: 9}]}\nduration:"
     step = reader.parse(ORBIT.replace("duration:", line, 1), "orbit.yaml").commands.timeline[0]

@@ -128,3 +128,11 @@ def test_impossible_pid_settings_are_refused_by_name(
 def test_an_input_that_is_not_finite_is_refused() -> None:
     with pytest.raises(UsageError, match="not finite"):
         placed(1.0).command(PathSample(0.1, 0.0, 0.0), math.nan, 0.0)
+
+
+@pytest.mark.parametrize(("cosine", "commands"), [(0.06, True), (-0.06, True), (0.04, False), (-0.04, False)])
+def test_no_current_is_commanded_where_the_field_gives_no_torque(cosine: float, commands: bool) -> None:
+    controller = AdaptiveController(BELIEVED, PERIOD, replace(SETTINGS, reference_bandwidth=None))
+    angle = math.acos(cosine)
+    made = controller.command(held(angle + 0.1)(0.0), angle, 0.0, 0.0)
+    assert (made.current != 0.0) is commands

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import re
+import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import Future
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from unittest.mock import Mock, call
 
 import numpy as np
+import pytest
 
 from flight.app.devices import open_gps, open_strings
 from flight.schema import reader
 from hal.interfaces.devices import Frame, GpsReading
 from hal.interfaces.wires import SECOND_NS, Rig
+from sim_hal import __main__
 from sim_hal.rig import started_server
 from sim_hal.serving.server import DeviceServer
 
@@ -90,3 +95,49 @@ def test_receiver_strings_and_wide_cameras_answer_in_real_time_with_their_faults
     assert not frames[1].pixels.any()
     assert reading is not None
     assert np.all(reading.currents < 1.0)
+
+
+@pytest.mark.parametrize("patience", [None, 2.5])
+def test_the_facts_are_written_before_the_devices_are_served(
+    patience: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The parent process waits for the line, so it must not remain in a buffer."""
+    calls = Mock()
+    calls.server.serial_device, calls.server.gps_device = "/dev/pts/7", None
+    calls.server.socket_path = tmp_path / "devices"
+    calls.server.hardware.utc_offset_ns = 5
+    made: list[Any] = []
+
+    def served(*words: Any) -> Mock:
+        made.append(words)
+        return cast(Mock, calls.server)
+
+    monkeypatch.setattr(__main__, "DeviceServer", served)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(sys, "stdout", calls.stdout)
+    words = [
+        "serve",
+        "config/step_demo.yaml",
+        "--folder",
+        str(tmp_path),
+        "--facts",
+        str(tmp_path / "facts"),
+        "--seed",
+        "9",
+    ]
+    calls.server.serve.side_effect = RuntimeError
+    with pytest.raises(RuntimeError):
+        __main__.main([*words, *([] if patience is None else ["--patience", str(patience)])])
+    (written,) = calls.stdout.write.call_args.args
+    assert calls.mock_calls == [
+        call.stdout.write(written),
+        call.stdout.flush(),
+        call.server.serve(None if patience is None else 2_500_000_000),
+        call.server.close(),
+    ]
+    facts = json.loads(written)
+    assert json.loads((tmp_path / "facts").read_text(encoding="utf-8")) == facts
+    assert (facts["serial"], facts["camera"], facts["gps"], facts["wide"]) == ("/dev/pts/7", True, None, 0)
+    ((config, section, folder),) = made
+    assert (section.seed, folder) == (9, tmp_path)
+    assert facts["baud_rate"] == config.inertial_unit.baud_rate

@@ -6,13 +6,17 @@ Tests of the attitude error at mid-exposure if the body accelerates or vibrates.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.wahba import AttitudeFix
 from knightcube.astro.quaternion import (
     angle_between,
     conjugate,
@@ -24,7 +28,7 @@ from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.star_tracker import StarTracker
-from knightcube.vision.startracker.detection import FrameKind
+from knightcube.vision.startracker.detection import Detections, DetectionSettings, FrameKind
 from knightcube.vision.startracker.sky_map import ASPECT
 from knightcube.vision.startracker.solve import (
     ENDS,
@@ -37,6 +41,8 @@ from knightcube.vision.startracker.solve import (
     SolveSettings,
     SolveStatus,
     Weighting,
+    _agrees,
+    _shape_unknown,
     middle_covariance,
     solve_places,
     weighting_of,
@@ -302,3 +308,45 @@ def test_a_distorted_photograph_is_solved_within_its_claim_or_refused(
         assert found.frame.bend[ASPECT:].tolist() == pytest.approx([aspect, shear], abs=0.001)
         expected = plain.field_of_view * (1.0 + aspect)
         assert found.field_of_view == pytest.approx(expected, abs=4.0 * found.field_of_view_sigma + 2e-4)
+
+
+@pytest.mark.parametrize(
+    ("widths", "given", "doubt_px"),
+    [
+        ([1.2, 1.6, 1.4, np.nan], 1.0, 0.02),
+        ([0.7, 0.8, 0.9], 1.0, 0.01),
+        ([1.0, 1.0], 1.0, 0.0),
+        ([np.nan, np.nan], 1.0, 0.0),
+        ([], 1.0, 0.0),
+        ([2.0, 2.0], None, 0.0),
+    ],
+)
+def test_stars_wider_than_the_given_spread_widen_the_attitude_across_the_boresight(
+    widths: list[float], given: float | None, doubt_px: float
+) -> None:
+    covariance = np.diag([4e-12, 9e-12, 25e-10])
+    fix = AttitudeFix(np.array([0.0, 0.0, 0.0, 1.0]), covariance, 0.0)
+    solved = FrameSolution(SolveStatus.SOLVED, "", FrameKind.POINTS, NARROW.pinhole, fix=fix)
+    settings = SolveSettings(detection=DetectionSettings(psf_sigma=given))
+    found = cast(Detections, SimpleNamespace(width=np.array(widths)))
+    wider = _shape_unknown(solved, found, settings).fix
+    assert wider is not None
+    added = (doubt_px / NARROW.pinhole.focal_length) ** 2
+    np.testing.assert_allclose(wider.covariance, covariance + np.diag([added, added, 0.0]), rtol=1e-9)
+    assert _shape_unknown(replace(solved, fix=None), found, settings).fix is None
+
+
+@pytest.mark.parametrize(("sigmas", "agrees"), [(0.0, True), (4.0, True), (10.0, False)])
+@pytest.mark.parametrize("axis", range(3))
+def test_an_attitude_agrees_with_a_prior_within_the_errors_of_both(
+    sigmas: float, agrees: bool, axis: int
+) -> None:
+    covariance = np.diag([1e-6, 4e-6, 9e-6])
+    known = np.sqrt(covariance[axis, axis] + 4e-6)
+    off = from_rotation_vector(sigmas * known * np.eye(3)[axis])
+    held = from_rotation_vector(np.array([0.4, -1.0, 0.3]))
+    solved = FrameSolution(SolveStatus.SOLVED, "", FrameKind.POINTS, NARROW.pinhole)
+    prior = AttitudePrior(held, 2e-3)
+    assert _agrees(solved, prior), "without an attitude"
+    fix = AttitudeFix(multiply(off, held), covariance, 0.0)
+    assert _agrees(replace(solved, fix=fix), prior) is agrees
