@@ -1,16 +1,16 @@
 """Checks a signed bundle of a renewal, and prepares its content for installation.
 
 The program renewal.py runs `open_bundle.py TRUSTED ROOT BUNDLE KIND FOLDER PRESENT KEPT` as root with the
-Python of a release. A bundle is a compressed tar archive of TUF metadata and of one artefact, whose target
-path is its kind. The metadata are checked by python-tuf against the metadata in the folder TRUSTED, whose
-versions never decrease, and against the first root metadata in the file ROOT. The "network" of python-tuf is
-the folder of the unpacked bundle.
+Python of a release. A bundle is a compressed tar archive of TUF metadata and of one artefact, whose kind is
+its TUF target path. Python-tuf checks the metadata against the metadata in the folder TRUSTED, whose versions
+never decrease, and against the first root metadata in the file ROOT. Python-tuf reads the unpacked bundle
+instead of downloading files.
 
 The program writes the artefact to FOLDER/artefact. For a configuration, it also writes FOLDER/set with the
-configuration and the drop-ins of its units. Elements and a catalogue become a configuration by replacing one
-value in the configuration PRESENT; KEPT is the folder that will contain the catalogue. The program prints
-version, permission to go back and SHA-256 as one JSON object. A refused bundle gives one line and exit
-status 1.
+configuration and the drop-ins of its units. For orbital elements or a star catalogue, this configuration is a
+copy of the configuration PRESENT with one value replaced. KEPT is the folder that will contain the catalogue.
+The program prints the version, the permission to replace a newer version, and the SHA-256 as one JSON object.
+For a refused bundle, it prints one line, and the exit status is 1.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LARGEST_METADATA, LARGEST_TARGET, MOST_MEMBERS = 1 << 19, 1 << 28, 300
 """Maximum sizes (bytes) of a metadata file and of an artefact, and maximum number of files in a bundle."""
 _METADATA = re.compile(r"metadata/(\d{1,6}\.root|timestamp|snapshot|targets)\.json")
 _VALUES = {"elements": ("elements",), "catalogue": ("camera", "star_tracker", "index")}
-"""Path of the configuration value that each kind of artefact replaces."""
+"""Key path of the configuration value that an artefact replaces, for each such kind."""
 
 
 class Refused(Exception):
@@ -49,7 +49,7 @@ class Refused(Exception):
 
 
 class FolderFetcher(FetcherInterface):  # type: ignore[misc]  # the package may be missing where types are checked
-    """Reads the files of an unpacked bundle instead of downloads."""
+    """TUF fetcher that reads an unpacked bundle instead of downloading files."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -63,7 +63,7 @@ class FolderFetcher(FetcherInterface):  # type: ignore[misc]  # the package may 
 
 
 def unpack(bundle: Path, kind: str, folder: Path) -> None:
-    """Unpack the metadata and the artefact of one kind into a folder. Raises Refused."""
+    """Unpack the metadata and the artefact of a bundle into a folder. Raises Refused for other content."""
     (folder / "metadata").mkdir(parents=True)
     (folder / "targets").mkdir()
     try:
@@ -120,12 +120,12 @@ def replaced(text: str, path: Sequence[str], value: str) -> str:
         node = next((child for key, child in pairs if key.value == name), None)
     if node is None:
         raise Refused(f"the present configuration has no `{'.'.join(path)}` that could be replaced")
-    # A block sequence may begin in the column of its key, in which a value in brackets may not begin.
+    # A space precedes the value, because a flow sequence must not begin in the column of its key.
     return f"{text[: node.start_mark.index]} {value}{text[_end(node) :]}"
 
 
 def _end(node: yaml.Node) -> int:
-    """Return the index after a node. The end mark of a block collection lies behind later comments."""
+    """Return the index of the end of a node, before comments that follow a block collection."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)

@@ -26,21 +26,21 @@ UNCLEAN = 3
 """Number of starts after which an unproven release is no longer chosen."""
 MANIFEST, TRIALS = "manifest", "releases.json"
 DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
-"""Exceptions that reading a damaged JSON record can raise."""
+"""Exceptions that a damaged JSON record can cause."""
 LARGEST_RECORD, LARGEST_MANIFEST = 1 << 16, 1 << 24
 """Maximum sizes (bytes) of a record and of a manifest."""
 _OURS = re.compile(r"(?!venv/)|venv/lib/python[^/]*/site-packages/(flight|hal|knightcube|sim_hal)/")
 
 
 def files_of(release: Path) -> Iterator[Path]:
-    """Yield the files of a release without its manifest and without a linked virtual environment."""
+    """Yield the files of a release, except its manifest and a virtual environment behind a symbolic link."""
     for folder, folders, names in os.walk(release):
         folders.sort()
         yield from (Path(folder, name) for name in sorted(names) if Path(folder, name) != release / MANIFEST)
 
 
 def manifest_text(release: Path) -> str:
-    """Return the manifest: the SHA-256 of the lines below it, then SHA-256, size and path of each file."""
+    """Return the manifest: SHA-256 of all further lines, then SHA-256, size and path of each file."""
     lines = [
         f"{_sum(path)} {path.stat().st_size} {path.relative_to(release).as_posix()}\n"
         for path in files_of(release)
@@ -91,7 +91,7 @@ def _text(path: Path, largest: int) -> str:
 
 
 def record(line: str) -> str:
-    """Return a line and its CRC-32, as flight/link/regular_files.py, which is not imported here, does."""
+    """Return a line and its CRC-32, in the format of flight/link/regular_files.py."""
     crc = zlib.crc32(f"{line}\n".encode())
     return f"{line}\n{crc:08x}\n"
 
@@ -104,7 +104,7 @@ def _line_of(text: str) -> str:
 
 
 def linked(prefix: Path, link: str) -> Path | None:
-    """Return the release to which a link points, or None unless this release is complete."""
+    """Return the release to which a symbolic link points, or None if the release is incomplete."""
     try:
         release = prefix / "releases" / Path(os.readlink(prefix / link)).name
     except OSError:
@@ -113,13 +113,13 @@ def linked(prefix: Path, link: str) -> Path | None:
 
 
 class Trials:
-    """Numbers of starts of unproven releases, in a file of the state folder that the flight also writes."""
+    """Number of starts of each unproven release, stored in a file that the flight also writes."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / TRIALS
         self.starts: dict[str, int] = {}
         self.proven: list[str] = []
-        # A damaged file is ignored, so that the flight starts in any case.
+        # A damaged file is ignored, so that the flight can start.
         with suppress(OSError, *DAMAGED):
             kept = json.loads(_line_of(_text(self._path, LARGEST_RECORD)))
             starts = {str(name): int(count) for name, count in kept["starts"].items()}
@@ -137,7 +137,7 @@ class Trials:
         self.starts[release.name] = min(self.starts.get(release.name, 0) + 1, UNCLEAN)
         with suppress(OSError):
             beside = self._path.with_suffix(".part")
-            beside.unlink(missing_ok=True)  # a FIFO of this name would block the next line
+            beside.unlink(missing_ok=True)  # opening a FIFO of this name would block
             with beside.open("w", encoding="utf-8") as file:
                 file.write(record(json.dumps({"starts": self.starts, "proven": self.proven})))
                 file.flush()
@@ -146,7 +146,7 @@ class Trials:
 
 
 def choose(prefix: Path, trials: Trials) -> tuple[Path | None, str]:
-    """Return the release to fly, and the reason if the current release is not flown or is damaged."""
+    """Return the release to fly, and the reason for a change from the current release or its damage."""
     current, previous = linked(prefix, "current"), linked(prefix, "previous")
     found = [release for release in (current, previous) if release is not None]
     if not found:

@@ -6,9 +6,9 @@ executes at most one request of the link, judges the open trial, advances the co
 state and ends. The state is stored before a step is executed, and each step may be executed again, so that a
 kill at any moment leaves the old or the new version, and the next run continues (docs/fly/renewal.md).
 
-The link is not trusted. Its requests are regular files of limited size; no symbolic link is followed. The
-program `open_bundle.py` checks signatures and content of an artefact before anything is installed. Times are
-measured with power only, by a clock that no command and no time server can set.
+The link is not trusted. Its requests must be regular files of limited size, and no symbolic link is followed.
+The program `open_bundle.py` checks signatures and content of an artefact before anything is installed. Time
+is counted only while the board has power, by a clock that no command and no time server can set.
 
 Any Python interpreter can run this program, which needs only the standard library.
 """
@@ -36,18 +36,18 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 DOWN_S = 180.0
-"""Longest time (s) in a trial during which flight or link may be down."""
+"""Maximum continuous time (s) during which flight or link may be down in a trial."""
 FIRST_CONTACT_S = 60.0
 """Time (s) that a flight must last before its note about a renewal is deleted."""
 MOST_TRIES = 3
-"""Maximum number of attempts to build a release, each of which a kill or a power loss may have ended."""
+"""Maximum number of attempts to build a release, because a kill or a power loss may end an attempt."""
 LARGEST_RECORD, LARGEST_BUNDLE = 1 << 16, 64 << 20
-"""Maximum sizes (bytes) of a request or state and of a bundle."""
+"""Maximum sizes (bytes) of a record (request or state) and of a bundle."""
 KEPT_REPORTS, KEPT_REQUESTS = 16, 64
 MOST_HOURS = 2400.0
 KINDS = ("configuration", "elements", "catalogue", "release")
 STEPS = ("release", "configuration", "ground")
-"""Steps of the command-loss timer."""
+"""Versions to which the command-loss timer returns, one after the other."""
 FLIGHT, LINK, SAFE = "knightcube.service", "knightcube-link.service", "knightcube-safe.service"
 RESTARTS = {
     "flight": (["reset-failed", FLIGHT], ["--no-block", "restart", FLIGHT]),
@@ -57,7 +57,7 @@ RESTARTS = {
 """Arguments of systemctl for each part that can be restarted by command."""
 CONFIGURATION, RESTART = "flight.yaml", "restart"
 GROUND = "ground"
-"""Name of the kept configuration that install.sh accepted."""
+"""Name of the stored configuration that install.sh accepted on the ground."""
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,63}")
 _REQUEST = re.compile(r"\d{1,5}-\d{1,30}-\d{1,5}-\d{1,5}")
 _DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
@@ -72,20 +72,20 @@ class Trial:
     """Trial of a renewal.
 
     Attributes:
-        what: exchanged version, `configuration` or `release`.
-        kind: kind of the artefact.
+        what: part of the software that is renewed, `configuration` or `release`.
+        kind: kind of the signed artefact, one of `KINDS`.
         version: signed version of the artefact.
         request: name of the request that began the trial.
         old: name of the previous kept configuration or release.
-        new: name of the new one; empty until a release is built.
-        stage: `install`, `fly` or `revert`.
+        new: name of the new configuration or release; empty until a release is built.
+        stage: stage of the trial: `install`, `fly` or `revert`.
         left_s: time (s) with power within which the ground must confirm.
-        despite_faults: whether a reaction to SAFE does not end the trial.
-        before: previous release before the trial.
-        session: session of the link at the installation, whose reports are ignored.
-        down_s: time (s) since flight and link were both up.
+        despite_faults: whether the trial continues after the flight has changed to SAFE.
+        before: release to which the link `previous` pointed before the trial.
+        session: identifier of the link process at the installation; its reports of SAFE are ignored.
+        down_s: time (s) since the flight and the link process were last both active.
         tries: number of attempts to install.
-        problem: reason of the reversion.
+        problem: reason for the return to the previous version.
     """
 
     what: str
@@ -109,22 +109,22 @@ class State:
     """Stored state of the renewal.
 
     Attributes:
-        number: number of this record, by which the newer copy is recognised.
+        number: number of this record; the copy with the higher number is used.
         handled: names of the newest executed requests.
-        versions: highest confirmed version of each kind.
+        versions: highest confirmed version of each kind of artefact.
         previous: name of the configuration that flew before the present one.
-        bad: releases that failed a trial.
+        bad: names of the releases that failed a trial.
         trial: open trial.
-        returning: kind, name and replaced version of a return that has begun, and its report.
-        reports: number, request, result, name and text of the newest reports.
-        note: text that the flight reports as an event at its start.
+        returning: kind, target, replaced version and report of an unfinished return to an earlier version.
+        reports: newest reports, each a list of number, request, result, name and text.
+        note: text that the flight reports as an event at its next start.
         note_s: time (s) that the flight has been up since the note was made.
-        boot: identification of the boot at the last run.
-        at: time (s) since boot of the last run.
-        frames: authentic frames in the link's last record.
-        limit_s: command-loss time (s), 0 for none.
+        boot: the kernel's boot identifier at the last run.
+        at: time (s) of the last run, since boot.
+        frames: number of authentic frames in the link's last record.
+        limit_s: interval (s) of the command-loss timer; 0 disables the timer.
         silent_s: time (s) with power since the last authentic frame.
-        steps: executed steps of the command-loss timer.
+        steps: number of executed steps of the command-loss timer.
     """
 
     number: int = 0
@@ -146,7 +146,7 @@ class State:
 
 
 def encoded(values: object) -> bytes:
-    """Return values as a line of JSON and the CRC-32 of this line."""
+    """Return a record: values as a line of JSON, and the CRC-32 of this line."""
     line = json.dumps(values, sort_keys=True).encode() + b"\n"
     return line + b"%08x\n" % zlib.crc32(line)
 
@@ -160,7 +160,7 @@ def decoded(data: bytes) -> Any:
 
 
 def state_of(values: dict[str, Any]) -> State:
-    """Return the state in the values of a record. Raises one of the exceptions `_DAMAGED`."""
+    """Return the state from the values of a record. Raises one of `_DAMAGED` for other values."""
     state = State(**{**values, "trial": None})
     if values["trial"] is not None:
         state.trial = Trial(**values["trial"])
@@ -187,7 +187,7 @@ def open_beneath(folder: Path, parts: Sequence[str], most: int) -> BinaryIO:
 
 
 def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
-    """Write a file by one rename and sync it to disk. Raises OSError."""
+    """Replace a file atomically and sync it to disk. Raises OSError."""
     beside = path.with_name(f".{path.name}.part")
     beside.unlink(missing_ok=True)
     with open(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
@@ -200,7 +200,7 @@ def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync the names of a folder to disk. Raises OSError."""
+    """Sync the file names in a folder to disk. Raises OSError."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
@@ -212,11 +212,11 @@ class Board:
     """Files and services of a board.
 
     Attributes:
-        root: folder of all files.
-        prefix: folder of the software.
+        root: root folder of the board's file system.
+        prefix: folder of the installed software.
         link: state folder of the link.
         own: state folder of this program.
-        kept: folder of the kept configurations and catalogues.
+        kept: folder of the stored copies of configurations and catalogues.
     """
 
     def __init__(self, root: Path) -> None:
@@ -229,7 +229,7 @@ class Board:
         self.kept = self.own / "kept"
 
     def configuration(self) -> Path:
-        """Return the path of the flown configuration."""
+        """Return the path of the configuration that the flight reads."""
         return self._settings / CONFIGURATION
 
     def roots(self) -> list[Path]:
@@ -238,7 +238,7 @@ class Board:
         return [path for path in copies if path.is_file()]
 
     def _set(self) -> dict[str, Path]:
-        """Return the installed path of each file of a kept configuration; the configuration is the last."""
+        """Return the installed path of each file of a stored configuration, `CONFIGURATION` last."""
         conf = {
             f"{unit}.conf": self._units / f"{unit}.service.d/board.conf"
             for unit in ("knightcube", "knightcube-safe", "knightcube-link")
@@ -247,9 +247,9 @@ class Board:
         return {**conf, **digest, CONFIGURATION: self.configuration()}
 
     def keep(self, name: str, folder: Path | None = None) -> str:
-        """Keep the installed configuration, or the one in a folder; return its name. Raises OSError.
+        """Store a copy of the installed configuration, or of the configuration in `folder`. Raises OSError.
 
-        An empty name stands for the SHA-256 of the configuration.
+        Returns the name of the copy: `name` or, if it is empty, the SHA-256 of the configuration.
         """
         files = {one: (path if folder is None else folder / one) for one, path in self._set().items()}
         contents = {one: path.read_bytes() for one, path in files.items() if path.is_file()}
@@ -269,7 +269,7 @@ class Board:
 
     @staticmethod
     def _read_set(place: Path) -> dict[str, bytes] | None:
-        """Return the files of a kept configuration, or None unless all of them are undamaged."""
+        """Return the files of a stored configuration, or None if a file is missing or damaged."""
         with suppress(OSError, *_DAMAGED):
             sums = decoded((place / "sums").read_bytes())
             contents = {one: (place / one).read_bytes() for one in sums}
@@ -278,7 +278,7 @@ class Board:
         return None
 
     def install(self, name: str) -> None:
-        """Install a kept configuration. Raises Refused if it is damaged, and OSError."""
+        """Install a stored configuration. Raises OSError, and Refused if the stored copy is damaged."""
         contents = self._read_set(self.kept / name)
         if contents is None:
             raise Refused(f"the kept configuration {name[:12]} is missing or damaged")
@@ -289,7 +289,7 @@ class Board:
                     replace_file(path, contents[one])
 
     def release(self, link: str) -> str:
-        """Return the name of the release behind the link `current` or `previous`, or an empty text."""
+        """Return the name of the release to which the symbolic link `link` points, or an empty text."""
         with suppress(OSError):
             name = Path(os.readlink(self.prefix / link)).name
             if (self.prefix / "releases" / name / "manifest").is_file():
@@ -297,7 +297,7 @@ class Board:
         return ""
 
     def point(self, link: str, name: str) -> None:
-        """Let a link name a release. Raises OSError."""
+        """Let the symbolic link `link` point to a release. Raises OSError."""
         path = self.prefix / link
         beside = path.with_name(f".{link}.part")
         beside.unlink(missing_ok=True)
@@ -310,7 +310,7 @@ class Board:
         return self.prefix / "releases" / release / "venv/bin/python"
 
     def builder(self, release: str) -> str:
-        """Return the Python with which a release was built."""
+        """Return the Python interpreter with which a release was built."""
         with suppress(OSError, UnicodeDecodeError):
             settings = (self.prefix / "releases" / release / "venv/pyvenv.cfg").read_text(encoding="utf-8")
             for line in settings.splitlines():
@@ -335,11 +335,11 @@ class Board:
             return subprocess.CompletedProcess(command, 127, "", f"{type(error).__name__}: {error}")
 
     def restart(self, *parts: str) -> None:
-        """Let the unit of this program restart parts after this run, flight and link by default."""
+        """Request restarts after this run; the default parts are flight and link. Raises OSError."""
         replace_file(self.own / RESTART, " ".join(parts or ("flight", "link")).encode())
 
     def restart_parts(self) -> None:
-        """Restart the parts that a run has asked for. Raises OSError."""
+        """Restart the parts whose restart a run has requested. Raises OSError."""
         path = self.own / RESTART
         parts = path.read_text(encoding="ascii").split() if path.exists() else []
         path.unlink(missing_ok=True)
@@ -349,7 +349,7 @@ class Board:
             self.run(["systemctl", *words], 60.0)
 
     def active(self, unit: str) -> bool:
-        """Return whether a unit is active."""
+        """Return whether a systemd unit is active."""
         return self.run(["systemctl", "is-active", "--quiet", unit], 60.0).returncode == 0
 
     def flown_release(self) -> str:
@@ -372,7 +372,7 @@ class Renewal:
         Args:
             board: files and services of the board.
             now: time since boot, s.
-            boot: identification of this boot.
+            boot: the kernel's identifier of this boot.
         """
         self._board = board
         self._state = self._read()
@@ -419,7 +419,7 @@ class Renewal:
         sys.stderr.write(f"renewal: {name} {result}: {text}\n")
 
     def _read_contact(self) -> dict[str, Any]:
-        """Return what the link has recorded, or nothing if its record is missing or damaged."""
+        """Return the link's record of its contact with the ground, empty if it is missing or damaged."""
         with (
             suppress(OSError, *_DAMAGED),
             open_beneath(self._board.link, ["renewal", "contact"], LARGEST_RECORD) as file,
@@ -450,7 +450,7 @@ class Renewal:
         self._save()
 
     def _requests(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the oldest request that was not executed yet, and remove the executed ones."""
+        """Yield the first request that was not executed yet, and delete executed requests before it."""
         try:
             names = sorted(
                 name for name in os.listdir(self._board.link / "renewal") if _REQUEST.fullmatch(name)
@@ -551,11 +551,11 @@ class Renewal:
             raise Refused(f"{name} is not the file that was activated: its SHA-256 is {digest.hexdigest()}")
 
     def _opened(self, kind: str, staging: Path) -> dict[str, Any]:
-        """Return what `open_bundle.py` says about a bundle. Raises Refused."""
+        """Return the result of `open_bundle.py` for the bundle. Raises Refused if no attempt succeeds."""
         board, problems = self._board, list[str]()
         program = Path(__file__).resolve().with_name("open_bundle.py")
         kept = "/" / board.kept.relative_to(board.root)
-        # Either of the two root metadata and of the two releases may be damaged.
+        # One copy of the root metadata and one release may be damaged, so all combinations are tried.
         releases = filter(None, (board.release("current"), board.release("previous")))
         for release, root in itertools.product(releases, board.roots()):
             for left in ("unpacked", "set"):
@@ -569,7 +569,7 @@ class Renewal:
         raise Refused(problems[0] if problems else "no release or no root.json is installed")
 
     def _confirm(self, name: str, kind: str) -> None:
-        """End the trial in favour of the new version. Raises Refused."""
+        """End the trial and keep the new version. Raises Refused."""
         state, trial = self._state, self._state.trial
         if trial is None or trial.stage != "fly" or trial.kind != kind:
             raise Refused(f"no {kind} is on trial")
@@ -587,7 +587,10 @@ class Renewal:
         self._tidy()
 
     def _withdraw(self, name: str, kind: str) -> None:
-        """Return to the version before the trial, or without a trial to the previous one. Raises Refused."""
+        """End the trial and return to the old version; without a trial, return to the previous version.
+
+        Raises Refused.
+        """
         trial = self._state.trial
         if trial is None:
             what = "release" if kind == "release" else "configuration"
@@ -600,7 +603,7 @@ class Renewal:
         self._report(name, "completed", "withdraw", f"{kind} {trial.version} is withdrawn")
 
     def _continue(self) -> None:
-        """Execute the stage of the trial, which an earlier run may have begun."""
+        """Execute the present stage of the trial, which an interrupted run may have begun."""
         trial = self._state.trial
         assert trial is not None
         try:
@@ -611,11 +614,11 @@ class Renewal:
         except (Refused, OSError) as error:
             if trial.stage == "install":
                 self._begin_revert(f"it cannot be installed: {error}")
-            else:  # what is installed stays; a later run tries again
+            else:  # the new version stays installed until a later run succeeds
                 sys.stderr.write(f"renewal: cannot revert yet: {error}\n")
 
     def _install(self, trial: Trial) -> None:
-        """Install the new version and restart. Raises Refused and OSError."""
+        """Install the new version and request a restart. Raises Refused and OSError."""
         board = self._board
         if trial.what == "configuration":
             board.install(trial.new)
@@ -663,7 +666,10 @@ class Renewal:
         self._continue()
 
     def _revert(self, trial: Trial) -> None:
-        """Install the version before the trial, restart and end the trial. Raises Refused and OSError."""
+        """Install the version before the trial, request a restart and end the trial.
+
+        Raises Refused and OSError.
+        """
         state, board = self._state, self._board
         if trial.what == "configuration":
             try:
@@ -685,7 +691,7 @@ class Renewal:
         self._save()
 
     def _judge(self) -> None:
-        """End the trial if its version fails, or if the ground has not confirmed it in time."""
+        """End the trial if the new version fails, or if the ground has not confirmed it in time."""
         trial, board, contact = self._state.trial, self._board, self._contact
         assert trial is not None
         up = board.active(FLIGHT) and board.active(LINK)
@@ -704,7 +710,7 @@ class Renewal:
             self._begin_revert("the ground did not confirm it")
 
     def _go_back(self, what: str, request: str, word: str, text: str) -> bool:
-        """Return to the previous release or configuration, or return False if there is none."""
+        """Return to the previous release or configuration. The result is False if there is none."""
         state, board = self._state, self._board
         if what == "release":
             current, name = board.release("current"), board.release("previous")
@@ -721,7 +727,7 @@ class Renewal:
         return True
 
     def _return(self) -> None:
-        """Execute the stored return to an earlier version, which an earlier run may have begun."""
+        """Execute the stored return to an earlier version, which an interrupted run may have begun."""
         state, board = self._state, self._board
         what, name, current, request, word, text = state.returning
         try:
@@ -741,7 +747,7 @@ class Renewal:
         state.returning = []
 
     def _same(self, name: str) -> bool:
-        """Return whether a kept configuration is the installed one, or is missing."""
+        """Return whether a stored configuration is missing or equals the installed configuration."""
         with suppress(OSError):
             return (
                 self._board.kept / name / CONFIGURATION
@@ -749,7 +755,7 @@ class Renewal:
         return True
 
     def _count_silence(self) -> None:
-        """Count the time without an authentic frame, and take the next step after each limit."""
+        """Count the time without an authentic frame, and return to an earlier version after each interval."""
         state, contact = self._state, self._contact
         heard = f"{contact.get('session')} {contact.get('frames')}"
         if contact:
@@ -769,15 +775,15 @@ class Renewal:
             text = f"no authentic frame for {state.silent_s:.0f} s: the {what} flies"
             if self._go_back(step, "", "command-loss", text):
                 return
-            # Without something to return to, the next step follows at once.
+            # If this earlier version does not exist, the next step follows at once.
             state.silent_s = max(state.silent_s, state.limit_s * (state.steps + 1))
 
     def _note(self, text: str) -> None:
-        """Let the flight report an event at its start."""
+        """Store a text that the flight reports as an event at its next start."""
         self._state.note, self._state.note_s = text, 0.0
 
     def _age_note(self) -> None:
-        """Delete the note for the flight when a flight has lasted long enough to report it."""
+        """Delete the note for the flight once the flight has been active long enough to report it."""
         state = self._state
         if state.note:
             state.note_s = state.note_s + self._elapsed if self._board.active(FLIGHT) else 0.0
@@ -848,7 +854,7 @@ def main(words: Sequence[str]) -> int:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | (0 if options.accepted else fcntl.LOCK_NB))
         except OSError:
-            return 0  # the run before this one builds a release
+            return 0  # an earlier run is still building a release
         now = time.clock_gettime(time.CLOCK_BOOTTIME) if options.now is None else options.now
         try:
             if options.restart:

@@ -1,7 +1,7 @@
 """Passes of a satellite over ground stations, and its eclipses, predicted from two-line elements.
 
-Skyfield propagates the elements (SGP4) and finds rise, culmination and set; the Sun, the Earth's shadow and
-the uncertainty of the elements are those of `knightcube.astro.earth`.
+Skyfield propagates the elements (SGP4) and finds rise, culmination and set. The package
+`knightcube.astro.earth` provides the Sun, the Earth's shadow and the uncertainty of the elements.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from knightcube.astro.earth.sun import DAY, earth_from_sun, julian_date, sunlit_
 from knightcube.errors import UsageError
 
 _SEARCH_S = 3600.0
-"""Time (s) searched before and after the span, so that a pass in progress at its ends is found whole."""
+"""Time (s) by which the search extends beyond the span, so that a pass at its edge is complete."""
 _STEP_S = 10.0
-"""Interval (s) of the positions between which the begin and the end of an eclipse are interpolated."""
+"""Interval (s) between computed positions; begin and end of an eclipse are interpolated."""
 _SPEED = 7.6e3
-"""Speed (m/s) of a satellite in a low orbit, which converts an error along the track to one in time."""
+"""Typical speed (m/s) in a low orbit, which converts an along-track error to a timing error."""
 _RISE, _CULMINATION, _SET = range(3)
-"""Numbers of the events that Skyfield reports."""
+"""Codes of the events of `EarthSatellite.find_events`."""
 
 
 class Station(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Ground station.
 
     Attributes:
-        name: name in tables and pictures.
+        name: name of the station in tables and plots.
         latitude_deg: geodetic latitude, degrees.
         longitude_deg: longitude, degrees, positive to the east.
         height: height above the WGS 84 ellipsoid, m.
-        mask_deg: elevation, degrees, from which the station sees the satellite.
+        mask_deg: minimum elevation for contact with a satellite, degrees.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=40)]
@@ -64,18 +64,18 @@ class _Stations(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """Pass of a satellite over a ground station, from the mask of the station to the mask.
+    """Pass of a satellite over a ground station, while the satellite is above the minimum elevation.
 
     Attributes:
         station: the ground station.
-        rise: UTC at which the satellite rises above the mask.
+        rise: UTC at which the satellite rises above the minimum elevation.
         top: UTC of the highest elevation.
-        set: UTC at which the satellite sets below the mask.
-        azimuths_deg: azimuths at rise, top and set, degrees, from north to east.
+        set: UTC at which the satellite sets below the minimum elevation.
+        azimuths_deg: azimuths at rise, highest elevation and set, degrees, from north to east.
         elevation_deg: highest elevation, degrees.
-        range: distance at the highest elevation, m.
+        range: distance of the satellite at the highest elevation, m.
         sunlit: visible fraction of the Sun's disc at the satellite at the highest elevation.
-        sun_elevation_deg: elevation of the Sun at the station at that time, degrees.
+        sun_elevation_deg: elevation of the Sun at the station at the satellite's highest elevation, degrees.
     """
 
     station: Station
@@ -143,11 +143,11 @@ class OrbitPrediction:
 
     @property
     def timing_error_s(self) -> float:
-        """Standard deviation of the predicted times, s, at the end of the span, by the elements' age."""
+        """Standard deviation (s) of predicted times at the end of the span, due to the elements' age."""
         return self._elements.at(julian_date(self.end)).sigma / _SPEED
 
     def passes(self, stations: Sequence[Station]) -> list[Pass]:
-        """Return the passes over all stations that lie at least in part in the span, in order of rise."""
+        """Return the passes over all stations that overlap the span, in order of rise."""
         found = [one for station in stations for one in self._over(station)]
         return sorted(found, key=lambda one: (one.rise, one.station.name))
 
@@ -160,13 +160,13 @@ class OrbitPrediction:
         for time, event in zip(times, events, strict=True):
             at = time.utc_datetime()
             own = [at] if event == _RISE else [*own, at]
-            if event != _SET or len(own) < 3:  # a pass that was in progress before the search began
+            if event != _SET or len(own) < 3:  # the pass began before the search interval
                 continue
             if own[-1] > self.begin and own[0] < self.end:
                 yield self._described(station, place, own)
 
     def _described(self, station: Station, place: GeographicPosition, own: list[datetime]) -> Pass:
-        """Return the pass with rise, culminations and set at the times `own`."""
+        """Return the pass whose times `own` are those of rise, culminations and set."""
         elevations, azimuths, ranges = self._seen_from(place, own)
         top = 1 + int(np.argmax(elevations[1:-1]))
         sun = -earth_from_sun(float(terrestrial_time(julian_date(own[top]))))[0]
@@ -194,17 +194,17 @@ class OrbitPrediction:
     def _seen_from(
         self, place: GeographicPosition, at: Sequence[datetime]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return elevations, azimuths (n,), degrees, and distances (n,), m, seen from a place."""
+        """Return elevations, azimuths (n,), degrees, and distances (n,), m, of the satellite."""
         times = self._scale.from_datetimes(list(at))
         elevation, azimuth, distance = (self._satellite - place).at(times).altaz()
         return np.asarray(elevation.degrees), np.asarray(azimuth.degrees), np.asarray(distance.m)
 
     def elevations(self, station: Station) -> tuple[list[datetime], FloatArray]:
-        """Return times of the span, and the satellite's elevations above the station at them, degrees."""
+        """Return times within the span, and the satellite's elevation (n,), degrees, at each time."""
         return self._at, self._seen_from(station.on_earth(), self._at)[0]
 
     def eclipses(self) -> list[tuple[datetime, datetime]]:
-        """Return begin and end of the eclipses in the span, at which half of the Sun's disc is visible."""
+        """Return begin and end of each eclipse in the span, defined by half of the Sun's disc visible."""
         dates = np.array([julian_date(at) for at in self._at])
         # The Sun's direction changes slowly, so that 25 ephemeris values a day are sufficient.
         knots = np.linspace(dates[0], dates[-1], 2 + math.ceil(24.0 * (dates[-1] - dates[0])))

@@ -5,10 +5,10 @@ virtual fill, then a pseudo-randomiser, then the attached sync marker. Telecomma
 pseudo-randomiser, the BCH code (63,56) and the communications link transmission unit (CLTU), which carries
 one frame. A terminal node controller (TNC) is connected by KISS, with or without the header of AX.25 frames.
 
-A code encodes a frame as a unit, which is carried by one datagram or KISS frame. In a byte stream (serial
-line, TCP) a marker precedes each unit. Both ends need the same settings, which are in the section
-`link.coding` of the configuration. The radio must deliver whole bytes, because units are not searched for at
-other bit offsets.
+One datagram or KISS frame carries one coded frame (codeblock or CLTU). In a byte stream (serial line, TCP), a
+marker precedes each coded frame. Satellite and ground need the same settings, which are in the section
+`link.coding` of the configuration. The radio must deliver whole bytes, because coded frames are not searched
+for at other bit offsets.
 
 The library reedsolo computes in the Galois field and corrects erroneous codewords. Encoding, and the check
 that a received codeword has no errors, use a table of parity symbols, because both are done for every frame.
@@ -47,7 +47,7 @@ _LONGEST_UNIT = 2048 + 5 * 32
 
 @cache
 def pseudo_random(kind: str) -> bytes:
-    """Return the beginning of a pseudo-random sequence, at least as long as the longest unit.
+    """Return the beginning of a pseudo-random sequence, at least as long as the longest codeblock.
 
     The sequence "short" (x^8 + x^7 + x^5 + x^3 + 1) or "long" (x^17 + x^14 + 1) is that of CCSDS 131.0-B-5,
     section 10.4. The sequence "command" (x^8 + x^6 + x^4 + x^3 + x^2 + x + 1) is that of CCSDS 231.0-B-4.
@@ -166,16 +166,16 @@ class Code(Protocol):
     """Code of one direction of the link."""
 
     def encode(self, frame: bytes) -> bytes:
-        """Return the unit that carries a frame."""
+        """Return the coded frame (codeblock or CLTU)."""
 
     def decode(self, unit: bytes) -> bytes:
-        """Return the frame in a unit. The CRC of the frame is wrong if the unit is damaged beyond repair."""
+        """Decode a coded frame. The CRC of the result is wrong if too many bits were damaged."""
 
     def marked(self, frame: bytes) -> bytes:
-        """Return the unit of a frame for a byte stream, after the marker that precedes it."""
+        """Return the sync marker and the coded frame, for a byte stream."""
 
     def stream(self) -> FrameDecoder:
-        """Return a decoder of the units in a byte stream."""
+        """Return a decoder of the coded frames in a byte stream."""
 
 
 _WRONG_MARKER_BITS = 3
@@ -231,13 +231,13 @@ _FILL = b"\x55"
 _GENERATOR = 0b1000101 << 1
 """Generator polynomial x^7 + x^6 + x^2 + 1 without its highest term, aligned to the left of a byte."""
 _INVERTED = 0xFE
-"""Parity bits of a codeblock, which are sent inverted, before the fill bit."""
+"""Mask of the seven parity bits in the last byte of a codeblock, which are sent inverted."""
 LONGEST_CLTU = len(_CLTU_START) + _BLOCK * -(-LONGEST_FRAME // _BLOCK_DATA) + len(_CLTU_TAIL)
 
 
 @cache
 def _remainders() -> list[int]:
-    """Return the remainder of each byte value by the generator polynomial, aligned to the left."""
+    """Return the remainder of each byte value after division by the generator polynomial."""
     table = []
     for value in range(256):
         rest = value
@@ -257,20 +257,20 @@ def _bch_parity(data: bytes) -> int:
 
 @cache
 def _wrong_bits() -> dict[int, int]:
-    """Return the wrong bit, as a mask of the 64 bits of a codeblock, for each syndrome of one wrong bit."""
+    """Return a mask of the wrong bit among the 64 bits of a codeblock, by the syndrome of this bit error."""
     valid = int.from_bytes(bytes(_BLOCK_DATA) + bytes([_INVERTED]), "big")
-    masks = (1 << bit for bit in range(1, 8 * _BLOCK))  # bit 0 is the fill bit
+    masks = (1 << bit for bit in range(1, 8 * _BLOCK))  # without bit 0, the fill bit
     return {_syndrome((valid ^ mask).to_bytes(_BLOCK, "big")): mask for mask in masks}
 
 
 def _syndrome(block: bytes) -> int:
-    """Return 0 for a codeblock without errors, without regard to its fill bit."""
+    """Return the syndrome of a codeblock, which is 0 without errors. The fill bit is ignored."""
     return _bch_parity(block[:_BLOCK_DATA]) ^ (~block[_BLOCK_DATA] & _INVERTED)
 
 
 @cache
 def _starts() -> re.Pattern[bytes]:
-    """Return a pattern of the start sequence with at most one wrong bit."""
+    """Return a regular expression for the start sequence with at most one wrong bit."""
     start = int.from_bytes(_CLTU_START, "big")
     forms = [start, *(start ^ 1 << bit for bit in range(16))]
     return re.compile(b"|".join(re.escape(form.to_bytes(2, "big")) for form in forms), re.DOTALL)
@@ -352,13 +352,13 @@ class CommandCode:
     """
 
     def __init__(self, cltu_kind: str | None) -> None:
-        """Encode frames in CLTUs that are "plain" or "randomised". For None, frames are not encoded."""
+        """Encode frames in CLTUs of the kind "plain" or "randomised", or not at all for None."""
         self._coded = cltu_kind is not None
         self._kind = "command" if cltu_kind == "randomised" else None
         self.corrected = 0
 
     def encode(self, frame: bytes) -> bytes:
-        """Return the CLTU of a frame, or the frame."""
+        """Return the CLTU of a frame, or the frame itself without coding."""
         return cltu(randomised(frame, self._kind)) if self._coded else frame
 
     def decode(self, unit: bytes) -> bytes:
@@ -366,11 +366,11 @@ class CommandCode:
         return next(iter(self.stream().add(unit)), b"") if self._coded else unit
 
     def marked(self, frame: bytes) -> bytes:
-        """Return the CLTU of a frame, or the frame after the sync marker."""
+        """Return the CLTU of a frame or, without coding, the sync marker and the frame."""
         return self.encode(frame) if self._coded else SYNC + frame
 
     def stream(self) -> FrameDecoder:
-        """Return a decoder of CLTUs, or of frames after sync markers."""
+        """Return a decoder of CLTUs or, without coding, of frames that follow sync markers."""
         return CltuStream(self._kind, self._add) if self._coded else telecommand_stream()
 
     def _add(self, corrected: int) -> None:
@@ -380,7 +380,7 @@ class CommandCode:
 _FRAME_END, _ESCAPE = b"\xc0", b"\xdb"
 _ESCAPED_END, _ESCAPED_ESCAPE = _ESCAPE + b"\xdc", _ESCAPE + b"\xdd"
 _DATA_FRAME = b"\x00"
-_UI_NO_LAYER_3 = b"\x03\xf0"  # control field and protocol identifier
+_UI_NO_LAYER_3 = b"\x03\xf0"  # control field and protocol identifier of a UI frame without layer 3
 _ADDRESS_BYTES = 7
 _MOST_KISS_BYTES = 1 << 14
 
@@ -396,10 +396,10 @@ def ax25_header(to: str, source: str) -> bytes:
 
 
 class KissStream:
-    """Decoder of units in KISS frames (Chepponis and Karn, 1987), which may contain AX.25 frames."""
+    """Decoder of coded frames in KISS frames (Chepponis and Karn, 1987), with or without AX.25 headers."""
 
     def __init__(self, decode: Callable[[bytes], bytes], ax25: bool) -> None:
-        """Decode units by the function `decode`, after the AX.25 header if `ax25`."""
+        """Decode frames by the function `decode`; `ax25` states whether each has an AX.25 header."""
         self._decode = decode
         self._ax25 = ax25
         self._data = b""
@@ -412,7 +412,7 @@ class KissStream:
         return [self._decode(unit) for unit in units]
 
     def _unit(self, kiss: bytes) -> bytes:
-        """Return the unit in a KISS data frame, or empty bytes for another KISS frame."""
+        """Return the coded frame in a KISS data frame, or empty bytes for a KISS command frame."""
         if not kiss or kiss[0] & 0x0F:
             return b""
         content = kiss[1:].replace(_ESCAPED_END, _FRAME_END).replace(_ESCAPED_ESCAPE, _ESCAPE)
@@ -431,7 +431,7 @@ def kiss_frame(content: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Framing:
-    """Form of frames in a byte stream, as a function that encodes a frame and one that makes a decoder."""
+    """Framing in a byte stream: function that encodes a frame, and function that creates a decoder."""
 
     wrap: Callable[[bytes], bytes]
     stream: Callable[[], FrameDecoder]
@@ -453,17 +453,17 @@ class LinkCodes:
         cltu_kind: str | None = None,
         call_signs: tuple[str, str] | None = None,
     ) -> None:
-        """Create the codes of the section `link` of a configuration. Without arguments, nothing is coded."""
+        """Create the codes of the section `link` of a configuration; by default, frames are not coded."""
         self.telemetry = TelemetryCode(frame_bytes, randomiser, reed_solomon)
         self.commands = CommandCode(cltu_kind)
         self._call_signs = call_signs
 
     def on_board(self, kiss: bool = False) -> Framing:
-        """Return the form of a byte stream at the satellite."""
+        """Return the framing of the byte stream on the satellite, for a TNC if `kiss`."""
         return _framing(self.telemetry, self.commands, self._call_signs, kiss)
 
     def on_ground(self, kiss: bool = False) -> Framing:
-        """Return the form of a byte stream at the ground."""
+        """Return the framing of the byte stream on the ground, for a TNC if `kiss`."""
         reverse = None if self._call_signs is None else (self._call_signs[1], self._call_signs[0])
         return _framing(self.commands, self.telemetry, reverse, kiss)
 

@@ -65,7 +65,7 @@ PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
 _SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)[:, None]
 _SHORTED_SLACK = 0.04
 _OUTLIERS = 0.15
-"""Fraction of the readings that a hypothesis may leave unexplained, because the fault began within them."""
+"""Largest fraction of readings that may contradict a hypothesis, because they precede the fault."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Bounds:
     """Error bounds of a predicted supply current.
 
     Attributes:
-        full_current: current (A) of each coil when it is fully on.
+        full_current: current (A) of each coil at a duty cycle of one.
         uncertainty: error bound (A) of the current of each driven coil.
         gain: relative error bound that is common to all readings.
         noise: error bound (A) of the current monitor.
@@ -141,8 +141,8 @@ def predict(
 def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
     """Return the supply currents (n, v, k), A, of n bridges in v variants for the commands (n, k), A.
 
-    The current of each coil that is fully on is `full` (n, 1), A. Shorts are not
-    modelled: the result for a shorted coil is the current of a healthy coil.
+    The current of each coil at a duty cycle of one is `full` (n, 1), A. Short circuits are not modelled: for
+    the variant of a shorted coil, the current of a healthy coil is returned.
     """
     forward, backward = np.maximum(commands, 0.0), np.maximum(-commands, 0.0)
     drawn = np.empty((len(commands), len(_VARIANTS), commands.shape[1]))
@@ -162,7 +162,7 @@ def fits(
     axis: int | None = None,
     fault: CoilFault | None = None,
 ) -> bool:
-    """Return whether `fault` on `axis`, together with the known faults, explains nearly all readings."""
+    """Return whether a hypothetical `fault` on `axis`, besides the known faults, fits nearly all readings."""
     variants: list[CoilFault | None] = [known.get(number) for number in range(len(bounds.full_current))]
     if axis is not None:
         variants[axis] = fault
@@ -171,7 +171,7 @@ def fits(
     chops = np.array([one.chopped for one in evidence])
     mean, own, chopped, own_chopped = np.zeros((4, len(evidence)))
     slack: FloatArray = np.full(len(evidence), bounds.noise)
-    free = 0.0  # largest current (A) that axes in an unknown state may add
+    free = 0.0  # largest current (A) of the axes whose current is not predicted
     for number, variant in enumerate(variants):
         if variant is CoilFault.UNCERTAIN or (variant is CoilFault.SHORTED and number != axis):
             free += bounds.full_current[number]
@@ -196,5 +196,5 @@ def fits(
 
 @cache
 def _scales(gain: float) -> FloatArray:
-    """Return nine factors (9, 1, 1) that cover the range of the gain error."""
+    """Return nine factors (9, 1, 1) between the bounds of the gain error."""
     return np.linspace(1.0 - gain, 1.0 + gain, 9)[:, None, None]

@@ -668,7 +668,7 @@ class CoilCorrection:
         return ""
 
     def confirm(self, axis: int) -> None:
-        """End the review of a coil, because the motion of the slow body shows its torque."""
+        """Accept the changed sign of a coil, because the motion of the slowly rotating body confirms it."""
         self._unreviewed.discard(axis)
 
     def text(self, axis: int) -> str:

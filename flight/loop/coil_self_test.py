@@ -1,12 +1,13 @@
 """Self-test of coils that are hardly used, by short currents to which the motion of the body responds.
 
 While a satellite points, currents of a few mA show neither an open nor a reversed coil. A coil about which
-the motion has shown nothing for an interval is therefore driven alone by a known current with the signs
-+, -, -, + in four equal quarters. After these four quarters, neither the rate nor the attitude has changed.
-Duration and current of a test follow from the gyro's noise, so that the gain of a healthy coil is `_SHOWN`
-standard deviations. The largest rotation during a test is the angular acceleration times the square of the
-duration of a quarter. `CoilResponse` judges the response, with the errors of the inertia as nuisance
-parameters. The current monitor compares the supply current with the command, as at any other time.
+the motion has shown nothing for an interval is therefore driven alone by a known current with the signs +, -,
+-, + in four equal quarters. After these four quarters, neither the rate nor the attitude has changed.
+Duration and current of a test follow from the gyro's noise, so that a test measures the gain of a healthy
+coil with a standard deviation of 1/`_SHOWN`. The largest rotation during a test is the angular acceleration
+times the square of the duration of a quarter. `CoilResponse` judges the response, with the errors of the
+inertia as nuisance parameters. The current monitor compares the supply current with the command, as at any
+other time.
 """
 
 from __future__ import annotations
@@ -35,22 +36,22 @@ class SelfTestSettings:
 
 
 _SHOWN = 8.0
-"""Gain of a healthy coil in a self-test, in standard deviations of the gain."""
+"""Gain of a healthy coil divided by the standard deviation with which a self-test measures the gain."""
 _EFFICIENCY = 0.7
-"""Fraction of a test's information that remains after the fit of a constant torque."""
+"""Standard deviation of a gain without, divided by that with an estimated constant torque."""
 _GYRO_HZ = 40.0
 _SHORTEST_QUARTER, _LONGEST_QUARTER = 1.0, 4.0
-"""Range of the quarter of a test (s). A coil that would need a longer test is nearly along the field."""
+"""Minimum and maximum duration (s) of each of the four quarters of a test."""
 _GAP_NS = 400_000_000
-"""Time (ns) with zero current before a test, in which the field is measured."""
+"""Time (ns) with zero current before a test, during which the magnetic field is measured."""
 _CALM_NS = 10_000_000_000
 """Time (ns) for which the commands must be small before a test."""
 _QUIET = 0.25
 """Largest current that is commanded around a test, as a fraction of the largest current of the test."""
 _REPORT_NS = 5_000_000_000
-"""Time (ns) from the last test to its report, in which the fits of the motion follow."""
+"""Time (ns) between the last test and the report, during which the motion is evaluated."""
 _NEAR_FIELD_NS = 60_000_000_000
-"""Time (ns) after which the test of a coil nearly along the field is tried again."""
+"""Time (ns) after which a coil that was nearly parallel to the magnetic field is tested again."""
 
 
 class SelfTest:
@@ -63,14 +64,14 @@ class SelfTest:
         self._shown_ns: list[int | None] = [None] * len(settings.limits)
         self._running: tuple[int, int, int, float] | None = None
         self._loud_ns = 0
-        self._tested: dict[int, int] = {}  # axes whose test is not reported, and end of the test (ns)
+        self._tested: dict[int, int] = {}  # end (ns) of each test without a report, by axis
 
     def request(self) -> None:
         """Test all coils as soon as possible, because the body does not move as commanded."""
         self._shown_ns = [-self._settings.interval_ns] * len(self._shown_ns)
 
     def stop(self) -> None:
-        """End the tests, because a coil is suspected or its correction has changed."""
+        """End the tests, because a coil is suspected or the correction of a coil has changed."""
         self._running = None
         self._tested.clear()
 

@@ -74,7 +74,7 @@ COMMANDS = {
     Mode.SUN: Trigger.COMMAND_SUN,
     Mode.POINT: Trigger.COMMAND_POINT,
 }
-"""Trigger for a command of each mode; the modes BOOT and ACQUIRE cannot be commanded."""
+"""State machine trigger for each mode that an operator can command (all except BOOT and ACQUIRE)."""
 
 KNOWN = {Mode.SUN: Trigger.KNOWN_SUN, Mode.POINT: Trigger.KNOWN_POINT}
 """Trigger that ends the attitude acquisition, for each mode that may follow."""

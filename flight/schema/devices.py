@@ -144,10 +144,10 @@ class Coils(Section, frozen=True, kw_only=True):
 
     @property
     def slots(self) -> tuple[Winding, ...]:
-        """The coils as the flight application numbers them, where the last coil may not be fitted.
+        """The coils in the order of the flight application; the last coil may be fictitious.
 
-        Coils in a plane are followed by a coil along the normal that is not fitted. This coil has half the
-        dipole moment of the weakest one, so that plans are careful about this axis, and two free PWM
+        If the coils lie in a plane, a fictitious coil along the normal of the plane is appended. This coil
+        has half the dipole moment of the weakest coil, so that plans use it little, and two free PWM
         channels.
         """
         axes = np.array([coil.direction() for coil in self.windings]).T

@@ -290,8 +290,8 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def dipole_weight(self) -> float:
         """Return the dipole (A m^2) whose cost equals that of an attitude error of `pointing.turn`.
 
-        Unless it is configured, it is proportional to the square root of the mean moment of inertia, as tuned
-        for a 1U and a 3U CubeSat, and at most a fiftieth of the mean dipole limit.
+        The default is proportional to the square root of the mean moment of inertia, tuned for a 1U and a 3U
+        CubeSat, and at most a fiftieth of the mean dipole limit.
         """
         if self.pointing.dipole is not None:
             return self.pointing.dipole

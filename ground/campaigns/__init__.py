@@ -1,7 +1,7 @@
-"""Monte Carlo campaigns: many flights with drawn values, on all cores or on a cluster, resumable."""
+"""Resumable Monte Carlo campaigns: many flights with drawn values, on all cores or on a cluster."""
 
 from knightcube.errors import FlightError
 
 
 class CampaignError(FlightError):
-    """Error that ends a campaign. The results until then are kept."""
+    """Error that ends a campaign. The results of completed cases are kept."""

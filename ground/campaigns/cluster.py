@@ -26,7 +26,7 @@ _ROOT = Path(__file__).parents[2]
 _PLUGIN = "knightcube-code"
 _SENT = (".py", ".npz", ".npy", ".yaml", ".yml", ".json", ".csv", ".txt", ".c", ".png")
 CONNECT_S = 15.0
-"""Longest time (s) until the scheduler answers, and until the first worker is connected."""
+"""Maximum time (s) to wait for the scheduler's answer, and for the first worker."""
 
 _one_case = threading.Lock()
 
@@ -42,7 +42,7 @@ class ShippedCode:
         self.version = hashlib.sha256(archive).hexdigest()[:16]
 
     def setup(self, worker: Any) -> None:
-        """Unpack the packages, and unload modules of other packages that were sent before."""
+        """Unpack the packages, and unload the modules of packages that were sent earlier."""
         folder = Path(worker.local_directory) / f"{_PLUGIN}-{self.version}"
         if not folder.is_dir():
             beside = folder.with_name(f"{folder.name}-{os.getpid()}")
@@ -50,7 +50,7 @@ class ShippedCode:
                 archive.extractall(beside)
             try:
                 beside.rename(folder)
-            except OSError:  # another worker in the same folder was faster
+            except OSError:  # another worker has already unpacked the packages into this folder
                 shutil.rmtree(beside)
         sys.path[:] = [str(folder), *(place for place in sys.path if _PLUGIN not in place)]
         for name in [name for name in sys.modules if name.split(".")[0] in PACKAGES]:
@@ -59,11 +59,11 @@ class ShippedCode:
         os.environ["KNIGHTCUBE_CODE"] = self.version
 
     def teardown(self, worker: Any) -> None:
-        """Keep the files, because the worker removes its own folder."""
+        """Do nothing: the worker itself deletes its folder with the unpacked packages."""
 
 
 def carry_out(version: str, module: str, function: str, case: dict[str, Any]) -> Any:
-    """Run a case on a worker with the packages that were sent; return None if others have replaced them."""
+    """Run a case with the packages of `version`. Return None if the worker has another version."""
     if os.environ.get("KNIGHTCUBE_CODE") != version:
         return None
     sent = importlib.import_module("ground.campaigns.cluster")
@@ -78,7 +78,7 @@ def run_alone(module: str, function: str, case: dict[str, Any]) -> Any:
 
 
 def archive_of(root: Path) -> bytes:
-    """Return the packages below a folder as a zip file, which is identical for identical files."""
+    """Return the packages below a folder as a zip file, with identical bytes for identical files."""
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
         for top in FOLDERS:
@@ -99,7 +99,7 @@ def finished(
     """Run cases on the cluster of the scheduler at `address`, and yield key and result of each case.
 
     If a worker dies, other workers run its cases. Raises UsageError if no cluster is found at the start, and
-    CampaignError if the scheduler is lost or a case ends its workers.
+    CampaignError if the scheduler is lost or a case kills every worker that runs it.
 
     Args:
         address: address of the scheduler.
@@ -110,7 +110,7 @@ def finished(
     distributed, cloudpickle = map(importlib.import_module, ("distributed", "cloudpickle"))
 
     def carried(*words: Any) -> Any:
-        """Call `carry_out`; an inner function is pickled by value together with the functions it calls."""
+        """Call `carry_out`. This inner function is pickled by value, with the functions that it calls."""
         return carry_out(*words)
 
     here = sys.modules[__name__]

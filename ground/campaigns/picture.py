@@ -1,4 +1,4 @@
-"""Picture of a campaign: each figure of its flights over each drawn value."""
+"""Plot of a campaign: each performance figure of the flights against each drawn value."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ground.campaigns.varied import figures_of, numbers_drawn
 from ground.report import drawing
 
 _LABEL = 22
-"""Number of characters in a line of a label."""
+"""Maximum number of characters in a line of an axis label."""
 _MOST = 6
-"""Maximum number of rows and of columns in the picture."""
+"""Maximum number of rows and of columns of panels in the plot."""
 
 
 def draw_campaign(results: Sequence[Result], file: Path) -> bool:
-    """Draw the figures of all flights over the drawn numbers as a PNG, and return whether there were any.
+    """Plot the performance figures of all flights against the drawn numbers, as a PNG.
 
-    The first six figures are drawn over the first six drawn numbers. A flight beyond the limit is a cross,
-    and a flight whose figure is infinite is a cross at the upper edge. Raises UsageError if matplotlib is not
-    installed or the file cannot be written.
+    Returns False, without a file, if there are no figures or no drawn numbers. At most six figures are
+    plotted against six drawn numbers. Crosses mark flights beyond the limit; infinite figures are at the
+    upper edge. Raises UsageError if matplotlib is not installed or the file cannot be written.
     """
     drawn = list(numbers_drawn(results).items())[:_MOST]
     figures = [one for one in figures_of(results).items() if np.any(np.isfinite(one[1][2]))][:_MOST]

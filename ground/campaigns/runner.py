@@ -79,7 +79,7 @@ Results = Generator[tuple[str, Result], None, None]
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Case of a campaign with its unique `key` and the `seed` of its random generator."""
+    """Case of a campaign, with a unique `key` and the `seed` of the case's random generator."""
 
     key: str
     seed: tuple[int, ...]
@@ -95,7 +95,7 @@ class Summary:
 
 
 def summary(facts: dict[str, Any]) -> Summary:
-    """Return a summary whose text has a table for each list or dictionary of rows, and a line per value."""
+    """Return a summary whose text shows each list or dictionary of rows as a table."""
     lines: list[str] = []
     for name, value in facts.items():
         rows = value
@@ -114,7 +114,7 @@ def show(facts: dict[str, Any], as_json: bool = False) -> None:
 
 
 def _table(rows: Sequence[Result]) -> list[str]:
-    """Return lines with the rows as aligned columns below their keys."""
+    """Return the lines of a table whose head contains the keys of the rows."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
     cells = [keys, *([_cell(row.get(key)) for key in keys] for row in rows)]
     widths = [max(len(line[column]) for line in cells) for column in range(len(keys))]
@@ -142,7 +142,7 @@ class Campaign:
         cases: function that returns the cases for a number of runs and a seed.
         run: function that runs a case. It is defined at the top level of a module, because other processes
             and machines import it.
-        summarise: function that summarises the results, in the order of the cases, given the folder.
+        summarise: function that summarises the results of all cases, given the results and the folder.
         default_runs: default number of runs.
     """
 
@@ -177,7 +177,7 @@ def fly(
         workers: number of processes (default: the number of cores).
         dask: address of the scheduler of a Dask cluster that runs the cases instead of this machine.
         progress: whether to show the progress on standard error.
-        only: text; only the cases whose key contains it are run.
+        only: text that the key of a case must contain for the case to be run.
     """
     cases = _selected(campaign, runs, seed, only)
     out.mkdir(parents=True, exist_ok=True)
@@ -210,7 +210,7 @@ def fly_here(campaign: Campaign, runs: int, seed: int) -> list[Result]:
 
 
 def _selected(campaign: Campaign, runs: int, seed: int, only: str) -> list[Case]:
-    """Return the cases whose key contains the text `only`. Raises UsageError if there is none."""
+    """Return the cases whose key contains the text `only`. Raises UsageError if no key contains it."""
     cases = [case for case in campaign.cases(runs, seed) if only in case.key]
     if only and not cases:
         raise UsageError(f"--only {only!r}: no case of {campaign.name} contains this text")
@@ -242,7 +242,7 @@ def _resume(label: Parameters, out: Path) -> dict[str, Result]:
 
 
 def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case]) -> Results:
-    """Run cases on the cores of this machine, and yield each result as soon as it is known."""
+    """Run cases on the cores of this machine, and yield each result when its case ends."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     count, context = workers or os.cpu_count(), get_context("spawn")
@@ -252,7 +252,7 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case]) -> Res
             for future in as_completed(keys):
                 yield keys[future], future.result()
         except BaseException:
-            # After Ctrl-C the known results are on disk, and cases that have not begun are cancelled.
+            # After Ctrl-C, cases that have not begun are cancelled; the other results are already on disk.
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
@@ -263,7 +263,7 @@ def _end_with_the_campaign() -> None:
 
 
 def _on_cluster(address: str, campaign: Campaign, cases: Sequence[Case], bar: Progress | None) -> Results:
-    """Run cases on a cluster, and yield each result as soon as it is known."""
+    """Run cases on a cluster, and yield each result when its case ends."""
     if importlib.util.find_spec("distributed") is None:
         raise UsageError("--dask needs distributed: pip install 'knightcube-flight[dask]'")
     report = bar.note if bar is not None else lambda _: None

@@ -27,14 +27,14 @@ from knightcube.errors import FlightError, UsageError
 from sim_hal.settings import Simulation
 
 _DRAWS = 100
-"""Number of draws of a case until its configuration is accepted: some draws have an impossible inertia."""
+"""Maximum number of draws per case, because drawn configurations may be invalid (impossible inertia)."""
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _FORMS = (
     "KEY=10% (uniform, relative), KEY=+-0.5 (uniform), KEY=normal 10% or KEY=normal 0.5 (standard "
     "deviation), KEY=1..5 (uniform), KEY=log 1..100 (uniform in the logarithm) or KEY=a|b|c (one of these)"
 )
 _MOST_LISTED = 20
-"""Maximum number of failed flights in the table; `summary.json` has all."""
+"""Maximum number of failed flights in the printed table; `summary.json` lists all failed flights."""
 
 Draw = Callable[[np.random.Generator, float], Any]
 
@@ -45,9 +45,9 @@ class Variation:
 
     Attributes:
         key: dotted key of the configuration, such as `craft.inertia` or `targets[0].at`.
-        text: distribution as given by the user.
+        text: text of the distribution as given by the user.
         draw: function that returns the drawn value, given a random generator and the configured number.
-        relative: whether the distribution refers to the configured number.
+        relative: whether the drawn value depends on the configured number.
     """
 
     key: str
@@ -57,7 +57,7 @@ class Variation:
 
 
 def variation_of(text: str) -> Variation:
-    """Return the variation in a text such as `craft.inertia=10%`. Raises UsageError for another form."""
+    """Return the variation in a text such as `craft.inertia=10%`. Raises UsageError for an invalid text."""
     key, equals, spread = (part.strip() for part in text.partition("="))
     if not equals or not re.fullmatch(r"\w+(\.\w+|\[\d+\])*", key):
         raise UsageError(f"--vary {text!r}: give {_FORMS}")
@@ -68,7 +68,7 @@ def variation_of(text: str) -> Variation:
 
 
 def _distribution(spread: str) -> tuple[Draw, bool] | None:
-    """Return the draw of a distribution and whether it refers to the configured number, or None."""
+    """Return the attributes `draw` and `relative` of a variation, or None for an unknown distribution."""
     if "|" in spread:
         values = [configuration_value(one.strip()) for one in spread.split("|")]
         return (lambda chance, _: values[int(chance.integers(len(values)))]), False
@@ -88,7 +88,7 @@ def _distribution(spread: str) -> tuple[Draw, bool] | None:
 
 
 def _between(low: float, high: float, logarithmic: bool) -> tuple[Draw, bool]:
-    """Return the uniform distribution between two numbers, or of their logarithm."""
+    """Return the uniform or log-uniform distribution between two numbers."""
     if logarithmic:
         ends = math.log(low), math.log(high)
         return (lambda chance, _: math.exp(chance.uniform(*ends))), False
@@ -103,14 +103,15 @@ def configuration_value(text: str) -> Any:
 def varied_campaign(path: Path, variations: Sequence[Variation], duration: float | None) -> Campaign:
     """Return the campaign that flies a simulated configuration with drawn values.
 
-    The result of a flight contains the drawn values, and the figures that the report judges: the section
-    `requirements` of a satellite, or the limits of the thesis for a testbed. The first cases are the same for
-    every number of runs. Raises UsageError for a key or a distribution that the configuration does not allow.
+    The result of a flight contains the drawn values, and the figures for which the report states a limit:
+    from the section `requirements` for a satellite, or from the thesis for a testbed. Case k does not depend
+    on the number of runs. Raises UsageError for a key or a distribution that the configuration does not
+    allow.
 
     Args:
         path: file of the configuration.
         variations: values to draw.
-        duration: duration of each flight, s, or None for that of the configuration.
+        duration: duration of each flight, s, or None for the configured duration.
     """
     text = read_text(path)
     base = read_document(text, str(path)).values
@@ -132,7 +133,7 @@ def varied_campaign(path: Path, variations: Sequence[Variation], duration: float
 def _case(
     base: dict[str, Any], variations: Sequence[Variation], duration: float | None, seed: tuple[int, int]
 ) -> Case:
-    """Return the case of a seed: its whole configuration as text, and the drawn values by key."""
+    """Return the case of a seed, with the complete configuration as text and the drawn values by key."""
     chance = np.random.default_rng(seed)
     refusal = ""
     for _ in range(_DRAWS):
@@ -158,14 +159,14 @@ def _case(
 
 
 def _numbers_at(values: dict[str, Any], one: Variation) -> list[tuple[Any, Any, str]]:
-    """Return container, index and full key of each number to be drawn. Raises UsageError."""
+    """Return container, index in the container, and full key of the numbers to draw. Raises UsageError."""
     steps = [int(step) if step.isdigit() else step for step in re.findall(r"\w+", one.key)]
     holder: Any = values
     for depth, step in enumerate(steps[:-1]):
         holder = _below(holder, step, one, steps[: depth + 1])
     last = steps[-1]
     if isinstance(holder, dict) and last not in holder and not one.relative:
-        return [(holder, last, one.key)]  # the configuration's default is replaced
+        return [(holder, last, one.key)]  # the drawn number replaces a default
     found = _below(holder, last, one, steps)
     if not one.relative and not isinstance(found, list):
         return [(holder, last, one.key)]
@@ -176,7 +177,7 @@ def _numbers_at(values: dict[str, Any], one: Variation) -> list[tuple[Any, Any, 
 
 
 def _below(holder: Any, step: Any, one: Variation, path: Sequence[Any]) -> Any:
-    """Return the value one step below a container. Raises UsageError, with keys of a similar name."""
+    """Return the item `step` of a container. Raises UsageError, which suggests similar keys."""
     if isinstance(holder, dict) and step in holder:
         return holder[step]
     if isinstance(holder, list) and isinstance(step, int) and step < len(holder):
@@ -189,7 +190,7 @@ def _below(holder: Any, step: Any, one: Variation, path: Sequence[Any]) -> Any:
 
 
 def _leaves(holder: Any, at: Any, key: str) -> Iterator[tuple[Any, Any, str]]:
-    """Yield container, index and full key of each value in nested lists."""
+    """Yield container, index in the container, and full key of each value in nested lists."""
     if isinstance(holder[at], list):
         for number in range(len(holder[at])):
             yield from _leaves(holder[at], number, f"{key}[{number}]")
@@ -202,7 +203,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _drawn(values: dict[str, Any], one: Variation, chance: np.random.Generator) -> dict[str, Any]:
-    """Replace the numbers of a variation by drawn ones, and return them by full key."""
+    """Replace the configured numbers of a variation by drawn numbers, and return these by full key."""
     drawn = {}
     for holder, at, key in _numbers_at(values, one):
         held = holder[at] if isinstance(holder, list) or at in holder else math.nan
@@ -230,7 +231,7 @@ def fly_case(case: Case) -> Result:
             report = summarise(read_run(request.out))
         except (FlightError, DeviceError) as error:
             return found | {"error": str(error), "config": given["config"]}
-    if flown.interrupted:  # by Ctrl-C, which also reaches the workers
+    if flown.interrupted:  # Ctrl-C also reaches the worker processes
         raise KeyboardInterrupt
     found["mode"] = flown.ending.mode
     found["faults"] = dict(flown.ending.faults)
@@ -248,7 +249,7 @@ def _within(result: Result) -> bool:
 
 
 def figures_of(results: Sequence[Result]) -> dict[str, tuple[float, str, list[float]]]:
-    """Return limit, unit and the worst value of each flight by quantity; NaN where a flight has no value."""
+    """Return limit, unit and the worst value of each flight (NaN if unknown), for each judged quantity."""
     found: dict[str, tuple[float, str, list[float]]] = {}
     for number, result in enumerate(results):
         for row in result["judged"]:
@@ -267,7 +268,7 @@ def numbers_drawn(results: Sequence[Result]) -> dict[str, list[float]]:
 
 
 def _summarise(results: Sequence[Result], out: Path) -> Summary:
-    """Return the table of a campaign, and write the configurations of failed flights and the picture."""
+    """Return the summary of a campaign, and write the configurations of failed flights."""
     failed = [result for result in results if not _within(result)]
     folder = out / "failed"
     for result in failed:
@@ -303,7 +304,7 @@ def _summarise(results: Sequence[Result], out: Path) -> Summary:
 
 
 def _quantiles(values: Sequence[float]) -> dict[str, float | None]:
-    """Return median, 95 % quantile and maximum of the known values, or None without one."""
+    """Return median, 95 % quantile and maximum of the finite values, each None without finite values."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return dict.fromkeys(("median", "95 %", "maximum"))
@@ -315,7 +316,7 @@ def _quantiles(values: Sequence[float]) -> dict[str, float | None]:
 
 
 def _influence(drawn: dict[str, list[float]], values: Sequence[float]) -> str:
-    """Return the drawn key with the largest rank correlation with a figure, and the correlation."""
+    """Return the key of the drawn number that correlates most with a figure, and the rank correlation."""
     known = np.isfinite(values)
     ranks = np.argsort(np.argsort(np.array(values)[known]))
     best = ("", 0.0)

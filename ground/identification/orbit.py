@@ -30,7 +30,7 @@ from knightcube.gnc.estimation import free_filter as states
 from knightcube.gnc.estimation.rigid_body import BodyErrors, inertia_covariance, tensor
 
 LEARNED = 0.5
-"""Largest ratio of the claimed to the configured standard deviations (rms) of a learned quantity."""
+"""Maximum ratio of estimated to configured standard deviation (rms) at which a quantity counts as learned."""
 _UNIFORM = math.sqrt(3.0)
 """Largest value of a uniformly distributed error with a standard deviation of one."""
 _FRACTIONS = np.geomspace(1.0, 1e-3, 13).tolist()

@@ -180,7 +180,7 @@ class Terminal:
         return Sealer(self._vault, spi, TELECOMMAND_MASK, block, shared=True)
 
     def send_by(self, sealer: Sealer, packet: bytes) -> int:
-        """Send a command packet with a sealer's key and return the counter of its frame.
+        """Send a command packet in a frame authenticated by `sealer`, and return the counter of the frame.
 
         Raises FlightError if the packet is too long, or if the frame cannot be sent.
         """

@@ -161,7 +161,7 @@ def knowledge(run: Run) -> Object | None:
 def stars_age(run: Run, times: FloatArray) -> FloatArray:
     """Return the ages (n,), s, of the newest accepted star attitude at `times` (n,), s.
 
-    An age is infinite before the first accepted star attitude.
+    Before the first accepted star attitude, the age is infinite.
     """
     stars = run["stars"]
     accepted = np.concatenate([[-math.inf], seconds(stars[stars["accepted"] == 1])])

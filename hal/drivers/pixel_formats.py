@@ -1,8 +1,8 @@
 """Pixel formats of V4L2 cameras, as kernel drivers and libcamera name them, converted to grey images.
 
 The layouts are those of the kernel's documentation (Linux Media userspace API, chapter "Image Formats"). The
-MIPI formats pack four pixels of 10 bits into five bytes, or two pixels of 12 bits into three bytes; the last
-byte holds the low bits, beginning with the first pixel at the lowest bits.
+MIPI formats pack four pixels of 10 bits into five bytes, or two pixels of 12 bits into three bytes. The last
+byte holds the low bits of all these pixels, those of the first pixel in the lowest bits.
 
 A Bayer mosaic is converted by the kernel (1, 2, 1) / 4 along rows and columns. Red, green and blue then
 contribute a quarter, a half and a quarter to each pixel, wherever the pixel lies in the mosaic, so that all
@@ -20,11 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 BIG_ENDIAN = 1 << 31
-"""Bit of the code of a format whose pixels are big-endian."""
+"""Bit that marks big-endian pixels in the numeric code of a pixel format."""
 
 Packing = Literal["u1", "<u2", ">u2", "mipi10", "mipi12", "bits10", "luma first", "luma second", "jpeg"]
 _GROUPS: dict[str, tuple[int, int]] = {"mipi10": (4, 5), "mipi12": (2, 3), "bits10": (4, 5)}
-"""Numbers of pixels and bytes of a group, by packing."""
+"""Numbers of pixels and of bytes in the smallest group of whole bytes, for each packing."""
 
 Pixels = npt.NDArray[Any]
 
@@ -82,7 +82,7 @@ class PixelCoding:
         return _luma(grey) if self.is_bayer else np.ascontiguousarray(grey)
 
     def _unpacked(self, lines: npt.NDArray[np.uint8]) -> Pixels:
-        """Return the pixels of rows of bytes."""
+        """Return the pixel values in rows of packed bytes."""
         if self.packing == "u1":
             return lines.copy()
         if self.packing in {"luma first", "luma second"}:
@@ -113,7 +113,7 @@ _UNPACK = {"mipi10": _mipi10, "mipi12": _mipi12, "bits10": _bits10}
 
 
 def _luma(mosaic: Pixels) -> Pixels:
-    """Return the grey image of a Bayer mosaic, of the same type; the image is reflected at its edges."""
+    """Return the grey image of a Bayer mosaic, of the same type. The edges are extended by reflection."""
     wide = np.pad(mosaic, 1, mode="reflect").astype(np.uint32)
     rows = wide[:-2] + 2 * wide[1:-1] + wide[2:]
     total = rows[:, :-2] + 2 * rows[:, 1:-1] + rows[:, 2:]
@@ -167,7 +167,7 @@ PIXEL_FORMATS: dict[str, PixelCoding] = {
 
 
 def fourcc(name: str) -> int:
-    """Return the numeric code of a pixel format from its name of up to four letters, or with -BE."""
+    """Return the numeric code of a pixel format from its name: up to four letters, with or without -BE."""
     letters = name.removesuffix("-BE")
     code = int.from_bytes(letters.ljust(4).encode("ascii"), "little")
     return code | BIG_ENDIAN if letters != name else code

@@ -9,9 +9,10 @@ these values over several sentences, usually rounds the position to 2 m, and lac
 The receiver loses its configuration at a power loss. The driver therefore requests NAV-PVT messages at the
 start, and again whenever none has arrived for three seconds. Receivers with protocol version 27 or later (M9,
 M10, F9) are configured by CFG-VALSET (u-blox F9 interface description, UBX-22008968). Older receivers (u-blox
-7 and 8) are configured by CFG-PRT, CFG-RATE and CFG-MSG. The receiver reports its version in MON-VER. After a
-refused command (ACK-NAK), the driver tries the other kind. No call blocks. Consumer receivers stop working
-above 18 km or 515 m/s, so that a satellite needs a firmware without this limit.
+7 and 8) are configured by CFG-PRT, CFG-RATE and CFG-MSG. The receiver reports its version in MON-VER. If the
+receiver refuses CFG-VALSET (ACK-NAK), the driver uses the older commands, and vice versa. No call blocks.
+Consumer receivers stop working above 18 km or 515 m/s, so that a satellite needs a firmware without this
+limit.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ RATE_MEASUREMENT, RATE_SOLUTION, RATE_TIME, PVT_ON_UART1 = 0x30210001, 0x3021000
 """Keys of CFG-VALSET; the second hexadecimal digit of a key determines the size of its value."""
 OVERHEAD = 8
 PVT_LENGTH, OLD_PVT_LENGTH = 92, 84
-"""Lengths (bytes) of the payload of NAV-PVT, from protocol version 15 on and in u-blox 7."""
+"""Payload lengths (bytes) of NAV-PVT: from protocol version 15 on, and of the older u-blox 7."""
 _PVT = struct.Struct("<IHBBBBBBIiBBBBiiiiIIiiiiiIIHHIihH")
 THREE_DIMENSIONS = 3
 """Value of the NAV-PVT field `fixType` for a three-dimensional fix."""
@@ -167,7 +168,7 @@ def frame(kind: Kind, payload: bytes = b"") -> bytes:
 
 
 LONGEST_FRAME = 8192
-"""Largest length (bytes) of a payload; NAV-SAT, RXM-RAWX and MON-VER, for example, have up to 4 kB."""
+"""Maximum payload length (bytes); the longest known messages (NAV-SAT, RXM-RAWX, MON-VER) have 4 kB."""
 _NMEA = re.compile(rb"\$([\x20-\x23\x25-\x29\x2b-\x7e]{5,90})\*([0-9A-Fa-f]{2})\r?\n")
 _NMEA_TAIL = 100
 
@@ -175,8 +176,8 @@ _NMEA_TAIL = 100
 class UbxParser:
     """Decoder that extracts UBX frames from received bytes, and counts NMEA sentences between them.
 
-    If a candidate frame is invalid, the search continues two bytes after the candidate's start. A long
-    candidate whose end has not arrived is discarded if it contains a valid frame.
+    If a candidate frame is invalid, the search continues two bytes after the candidate's start. An
+    incomplete long candidate is discarded if it contains a valid frame.
 
     Attributes:
         bytes_received: number of received bytes.
@@ -188,7 +189,10 @@ class UbxParser:
     """
 
     def __init__(self, longest: int = 256) -> None:
-        """Wait without a further search for frames with at most `longest` bytes of payload."""
+        """Wait for the end of an incomplete frame with a payload of at most `longest` bytes.
+
+        While a longer frame is incomplete, valid frames are searched for within its bytes.
+        """
         self.bytes_received = 0
         self.frames = 0
         self.long_frames = 0
@@ -248,7 +252,7 @@ class UbxParser:
         return -1
 
     def _discard(self, data: bytes) -> None:
-        """Count bytes outside valid frames, and the NMEA sentences that they complete."""
+        """Count bytes outside valid frames, and valid NMEA sentences among these bytes."""
         if not data:
             return
         self.discarded_bytes += len(data)
@@ -355,7 +359,7 @@ class UbloxReceiver:
         self._port.close()
 
     def _condition(self) -> str:
-        """Return why no usable fix arrives and what to do, or an empty text."""
+        """Return the reason for a missing fix and the remedy, or an empty text if fixes arrive."""
         since_ns = self._clock.now_ns() - self._silence_ns
         if self._fix_arrival_ns >= since_ns:
             return self._cause
@@ -406,7 +410,7 @@ class UbloxReceiver:
         return reading
 
     def _take_refusal(self, command: Kind) -> None:
-        """Count a refused command, and try the other kind of configuration."""
+        """Count a refused command, and configure the receiver by the commands of the other generation."""
         self._refused += 1
         name = NAMES.get(command, f"command {command[0]:02X} {command[1]:02X}")
         if not self._protocol and command in NAMES:
@@ -416,14 +420,14 @@ class UbloxReceiver:
         self._refusal = f"the receiver refused {name} (ACK-NAK, protocol version {version}): {cure}"
 
     def _use_valset(self, wanted: bool) -> None:
-        """Configure by CFG-VALSET or not, and at once if this is a change."""
+        """Select CFG-VALSET or the older commands, and configure at once after a change to CFG-VALSET."""
         self._is_due = self._is_due or wanted > self._uses_valset
         self._uses_valset = wanted
 
     def _set_up(self) -> None:
         """Configure the receiver to send only NAV-PVT.
 
-        The request is repeated while no NAV-PVT arrives.
+        The configuration is repeated while no NAV-PVT arrives.
         """
         now_ns = self._clock.now_ns()
         requested_ns = self._requested_ns
@@ -441,7 +445,7 @@ class UbloxReceiver:
 
 
 def legacy_set_up(baud_rate: int, period_ns: int) -> bytes:
-    """Return the frames that make u-blox 7 and 8 send UBX only on UART 1, one NAV-PVT per period (ns)."""
+    """Return the frames that configure u-blox 7 and 8: only UBX on UART 1, one NAV-PVT per period (ns)."""
     rate = (period_ns // 1_000_000).to_bytes(2, "little") + b"\x01\x00\x01\x00"  # time system GPS
     # Port 1 is UART 1, configured as 8N1 with UBX in both directions and without NMEA.
     port = b"\x01\x00\x00\x00\xd0\x08\x00\x00" + baud_rate.to_bytes(4, "little") + b"\x01\x00" * 2
@@ -515,7 +519,7 @@ def reading_of(
 
 
 def _require(limits: Iterable[tuple[str, float, float, float, str]]) -> None:
-    """Raise OutOfRange for the first value out of bounds: name, value, lower and upper bound, unit."""
+    """Raise OutOfRange for the first value out of bounds among tuples (name, value, low, high, unit)."""
     for name, value, low, high, unit in limits:
         if not low <= value <= high:
             raise OutOfRange(DEVICE, name, value, low, high, unit)

@@ -1,8 +1,8 @@
 """Driver of free-running cameras (Video for Linux 2) with manual exposure.
 
 A free-running camera has no trigger. The camera exposes frames continuously, and the kernel stamps each frame
-with the monotonic time. A trigger selects the first frame whose exposure begins after the trigger. All other
-frames are returned to the kernel without reading their pixels.
+with the monotonic time. A trigger selects the first frame whose exposure begins after the trigger. The driver
+returns earlier frames to the kernel without reading their pixels.
 
 A flag of the kernel driver states whether the time stamp refers to the start of exposure (SOE) or to the end
 of the frame. The kernel driver uvcvideo always sets the flag SOE. Unless the module parameter `hwtimestamps`

@@ -259,8 +259,8 @@ class TorqueCoils(Protocol):
     def brake(self, axes: Axes) -> None:
         """Brake the given bridges: hold both inputs high, whatever currents are commanded.
 
-        Never waits for the bus. A braked bridge drives no current, even if a leg is stuck high. The brakes
-        hold until `start` or the next call of this method.
+        Never waits for the bus. A braked bridge drives no current, even if a leg is stuck high. The
+        bridges stay braked until `start` or the next call of this method.
         """
 
     def off(self) -> None:

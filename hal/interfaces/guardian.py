@@ -49,7 +49,7 @@ class CoilReach:
     def note(self, folder: Path) -> None:
         """Write the bus and address durably to a file in `folder`, for the script `deploy/coils-off`.
 
-        The SHA-256 of bus and address follows them. Never raises.
+        The file also contains the SHA-256 of bus and address, as a checksum. Never raises.
         """
         import hashlib  # noqa: PLC0415 - the guardian, which imports this module, needs no checksum
 

@@ -163,7 +163,7 @@ class Parameter:
     choices: tuple[float, ...] = ()
 
     def accepts(self, value: float) -> bool:
-        """Return whether a fault parameter may have a value; NaN is not."""
+        """Return whether a value of a fault parameter is allowed. NaN is never allowed."""
         if self.choices:
             return value in self.choices
         return self.low <= value <= self.high and not (self.whole and value % 1.0)

@@ -133,7 +133,7 @@ class SunAcquisitionLaw(_MagneticLaw):
 
 _NOTHING: FloatArray = np.zeros(3)
 _LARGEST_COIL_ERROR = 0.3
-"""Largest compensated error of an element of the coils' matrix. The matrix is then always invertible."""
+"""Limit of the errors that are compensated in the elements of the coils' matrix, to keep it invertible."""
 
 
 def commanded(dipole: FloatArray, coils: FloatArray) -> FloatArray:

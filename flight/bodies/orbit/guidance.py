@@ -83,7 +83,10 @@ errors in a time that is too short for it; the feedback gains correct them inste
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Followed:
-    """A path from the time `begin_ns` on, with the origin of its times and its slew, if it has one."""
+    """A path that is followed from `begin_ns` on; its times count from `origin_ns`.
+
+    The attribute `slew` is None for a path without a slew.
+    """
 
     law: PointingLaw
     origin_ns: int
@@ -603,7 +606,7 @@ class PointingPlanner:
         elif job.running is not None:
             self._continue(job, result.value, now_ns)
         elif self._paths.astray.since is not None and not self._paths.astray.ready:
-            self._wanted = True  # requested before the damping; a new plan follows later
+            self._wanted = True  # this plan was requested before the damping: plan again
         elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
             self._fail(f"plan {job.number}: {reason}", now_ns, AGAIN_NS if job.span is STEADY else 0)
         else:

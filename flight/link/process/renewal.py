@@ -1,4 +1,4 @@
-"""Part of the link in the renewal in orbit (docs/fly/renewal.md): requests, and reports of their execution.
+"""Requests for a renewal in orbit (docs/fly/renewal.md), and reports of their execution, in the link process.
 
 The privileged program `deploy/renewal.py` reads the requests and the record `contact` in the folder of this
 module, and writes the status file that this module reads.
@@ -30,12 +30,12 @@ _DAMAGED = (ValueError, TypeError, AttributeError, LookupError, RecursionError)
 
 
 def encoded(values: object) -> bytes:
-    """Return values as a record of JSON."""
+    """Return values as a line of JSON with a checksum."""
     return to_record(json.dumps(values, sort_keys=True).encode())
 
 
 def decoded(data: bytes) -> Any:
-    """Return the values of a record of JSON. Raises ValueError for a damaged record."""
+    """Return the values in a line of JSON with a checksum. Raises ValueError if the line is damaged."""
     return json.loads(line_of(data) or b"")
 
 
@@ -58,7 +58,7 @@ class Renewal:
         self._reported = self._stored_number()
 
     def request(self, directive: Privileged, done: Report) -> str:
-        """Store a request for the privileged part. Return the problem, or an empty text."""
+        """Store a request for the privileged part. Return the reason for a failure, or an empty text."""
         if not self._status.exists():
             return "this board has no renewal: deploy/install.sh installs it"
         name = f"{done.spi}-{done.counter}-{done.request.packet}-{done.request.sequence}"
@@ -102,7 +102,7 @@ class Renewal:
         return []
 
     def _reports(self, entries: list[list[Any]]) -> list[Report]:
-        """Return the reports that were not sent before, and store the number of the newest one."""
+        """Return the reports that were not sent before, and store the number of the newest report."""
         found = []
         for number, request, result, name, text in entries:
             if number > self._reported:

@@ -159,7 +159,10 @@ class UdpLine:
         return int(self._socket.getsockname()[1])
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return the frames in the received datagrams, each cut to one byte more than the longest unit."""
+        """Return the frames and senders of the received datagrams.
+
+        A datagram longer than a CLTU is cut to one byte more than the longest CLTU, so that it stays invalid.
+        """
         found = []
         for _ in range(AT_MOST):
             try:
