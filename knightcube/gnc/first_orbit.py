@@ -146,8 +146,9 @@ class FirstOrbit:
             orbit are not included.
         distance: distance of the object from the observer at the time of the state, m.
         interval: ends of the 95 % confidence interval of the distance, m.
-        lasts: whether the orbit is bound to the Earth and does not hit the Earth. If `lasts` is false, at
-            least one other orbit in the distance interval is bound and does not hit the Earth.
+        lasts: whether the orbit is bound to the Earth and does not hit the Earth. If this most likely orbit
+            is unbound or hits the Earth, another orbit in the distance interval is bound and does not hit the
+            Earth.
         chi_square: chi-square of the sightings, with `degrees` degrees of freedom.
         degrees: number of degrees of freedom of the chi-square.
     """

@@ -293,7 +293,7 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
         return FrameFound(motion, solution)
     if abs(solution.camera.focal_length / job.camera.focal_length - 1.0) > _SCALE_TOLERANCE:
         again = _motion(replace(job, camera=solution.camera))
-        assert isinstance(again, MotionResult)  # The first fit returned the same type.
+        assert isinstance(again, MotionResult)  # Both fits use the same estimator.
         return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
     if not job.motion_first:
         # For a single image, a second fit would add half the computing time for a small gain.

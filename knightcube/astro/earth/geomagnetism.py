@@ -27,7 +27,7 @@ from knightcube.errors import FlightError
 FIRST_YEAR, LAST_YEAR = 2025.0, 2030.0
 NANOTESLA = 1e-9
 EXTRAPOLATION = 2.5e-8
-"""Standard deviation (T per component) that each year outside the validity of the model adds.
+"""Standard deviation of the extrapolated field, T per component and per year outside the model's validity.
 
 Extrapolations of IGRF-14 from 2005, 2010 and 2015 by the variation of the previous five years had errors of
 up to 170 nT rms ten years after their validity, at an altitude of 500 km.
@@ -47,7 +47,7 @@ def check_year(year: float) -> None:
 
 
 def extrapolation_sigma(julian_date: float) -> float:
-    """Return the standard deviation (T per component) that extrapolation adds, 0 in the model's years."""
+    """Return the standard deviation of the field due to extrapolation, T per component."""
     year = float(julian_epoch(julian_date))
     return EXTRAPOLATION * max(FIRST_YEAR - year, year - LAST_YEAR, 0.0)
 

@@ -1,8 +1,8 @@
 """Reader of mean elements for SGP4 from files: two-line elements, and OMM in JSON, XML, KVN and CSV.
 
-The Orbit Mean-Elements Message (OMM) is defined in CCSDS 502.0-B-3. CelesTrak and Space-Track publish it for
-satellite numbers above 99999, which two-line elements hold only up to 339999 (Alpha-5). Each message is
-converted to two lines. The rounding of the epoch to 1e-8 days shifts the satellite by up to 3 m.
+The Orbit Mean-Elements Message (OMM) is defined in CCSDS 502.0-B-3. CelesTrak and Space-Track publish OMMs
+for satellites with numbers above 99999. Two-line elements can hold numbers only up to 339999 (Alpha-5). Each
+OMM is converted to two-line elements. The rounding of the epoch to 1e-8 days shifts a satellite by up to 3 m.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from knightcube.errors import UsageError
 
 _SGP4_EPOCH = datetime(1949, 12, 31, tzinfo=UTC)
 _ANY_NUMBER, _LARGEST_NUMBER = 999_999_999, 339_999
-"""Largest satellite number of an OMM, and largest one in two-line elements; larger ones are written as 0."""
+"""Largest satellite number of an OMM, and largest number in two-line elements, above which 0 is written."""
 _FIXED = {
     "CENTER_NAME": ("EARTH",),
     "REF_FRAME": ("TEME",),
@@ -54,7 +54,7 @@ _NUMBERS: dict[str, tuple[float, float, str]] = {
 }
 """Bounds and unit of the numbers of an OMM, all of which are required."""
 _LEAST_DRAG = 1e-9
-"""Smallest absolute value of B* that two-line elements can hold, with one digit of the exponent."""
+"""Smallest nonzero absolute value of B* that two-line elements can hold (one-digit exponent)."""
 _YEARS = 1957, 2056
 """First and last year that two-line elements can hold."""
 
@@ -97,7 +97,7 @@ def read_elements(text: str) -> list[NamedElements]:
 
 
 def _two_lines(text: str) -> list[NamedElements]:
-    """Return the elements of a file of two-line elements with or without lines of names."""
+    """Return the elements of all satellites in a file of two-line elements, with or without name lines."""
     lines = [line.rstrip() for line in text.splitlines() if line.strip()]
     found: list[NamedElements] = []
     name = ""
@@ -118,7 +118,7 @@ def _two_lines(text: str) -> list[NamedElements]:
 
 
 def _alpha5(text: str) -> int:
-    """Return the satellite number of five columns, whose first one may be a letter."""
+    """Return a satellite number from five columns, of which the first may be a letter (Alpha-5)."""
     if text[0].isalpha():
         return (10 + "ABCDEFGHJKLMNPQRSTUVWXYZ".index(text[0])) * 10_000 + int(text[1:])
     return int(text)
@@ -174,7 +174,7 @@ def _kvn(text: str) -> list[Mapping[str, object]]:
 
 
 def _converted(message: Mapping[str, object], index: int) -> NamedElements:
-    """Return the elements of an OMM. Raises UsageError with the field and its value."""
+    """Return the elements of an OMM. Raises UsageError for a field with an invalid value."""
     name = _text(message, "OBJECT_NAME")
     where = f"OMM {index} ({name})" if name else f"OMM {index}"
     for key, accepted in _FIXED.items():
@@ -224,7 +224,7 @@ def _lines(
 
 
 def _epoch(text: str, where: str) -> datetime:
-    """Return the time of an epoch, which has the form of a calendar date or of a day of the year."""
+    """Return the time of an epoch that is given as a calendar date or as a year with a day of the year."""
     plain = text.strip().removesuffix("Z")
     day_of_year = re.fullmatch(r"(\d{4})-(\d{3})(T.*)", plain)
     try:

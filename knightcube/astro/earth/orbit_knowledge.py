@@ -27,11 +27,11 @@ from knightcube.errors import FlightError, UsageError
 
 _LONGEST_STEP = 30.0
 _SGP4_EPOCH, _MINUTES_PER_DAY = 2_433_281.5, 1440.0
-"""Julian date from which SGP4 counts days, and number of its units of time in a day."""
+"""Julian date from which SGP4 counts days, and number of minutes in a day."""
 _DRAG_FRACTION, _LEAST_DRAG = 0.5, 2.5e-4
-"""Standard deviation of B*, as a fraction of B* and at least in 1/Earth radius, that of a small satellite."""
+"""Standard deviation of B* as a fraction of B*, and its minimum (1/Earth radius), for small satellites."""
 _DRAG_TIME, _DECAYING = 0.25, 1e7
-"""Time (days) over which the effect of B* is computed, and effect (m per day squared) if the orbit decays."""
+"""Time (days) over which the effect of B* is computed, and effect (m/day^2) assumed for a decaying orbit."""
 
 
 class OrbitError(FlightError):
@@ -172,7 +172,7 @@ class TwoLineElements:
 
 
 def _drag_growth(satellite: Satrec) -> float:
-    """Return the standard deviation of the position along the track that drag causes, m per day squared."""
+    """Return the along-track standard deviation due to the error of B*, m per day squared."""
     found = []
     for drag in (0.0, max(_DRAG_FRACTION * abs(satellite.bstar), _LEAST_DRAG)):
         made = Satrec()
@@ -250,7 +250,7 @@ class _Field:
 
 _RATE = r"[ +-]\d{5}[ +-]\d"
 ANGLES = {"inclination": 180.0, "right ascension of the node": 360.0, "argument of perigee": 360.0}
-"""Largest values (deg) of the angles of mean elements; their smallest value is 0."""
+"""Upper bounds (deg) of the angles in mean elements, whose lower bound is 0."""
 FASTEST_MOTION, SLOWEST_MOTION, LARGEST_DRAG = 17.5, 0.01, 10.0
 """Bounds of the mean motion (revolutions per day), and largest absolute value of B* (1/Earth radius)."""
 SGP4_TYPES = " 02"
@@ -283,15 +283,15 @@ _LINES: tuple[tuple[_Field, ...], ...] = (
     ),
 )
 _BLANKS = (2, 9, 18, 33, 44, 53, 62, 64), (2, 8, 17, 26, 34, 43, 52)
-"""Numbers of the columns of both lines that are blank."""
+"""Columns, counted from 1, that are blank in the first line and in the second line of an element set."""
 
 
 def check_lines(first: str, second: str) -> None:
     """Raise UsageError, with line and columns, unless both lines are a valid two-line element set for SGP4.
 
-    The fields stand in fixed columns, their values are in range, the checksums fit, and the satellite numbers
-    and the ephemeris type are those of one element set for SGP4. A satellite number may begin with a letter
-    (Alpha-5, in which A is 10 and the letters I and O are omitted).
+    The check covers the columns, forms and ranges of all fields, the checksums, the ephemeris type, and the
+    equality of the satellite numbers of both lines. A satellite number may begin with a letter (Alpha-5, in
+    which A is 10 and the letters I and O are omitted).
     """
     for number, line in enumerate((first, second), 1):
         _check_line(number, line)
@@ -302,7 +302,7 @@ def check_lines(first: str, second: str) -> None:
         )
     days = 366.0 if int(first[18:20]) % 4 == 0 else 365.0
     if not 1.0 <= float(first[20:32]) < days + 1.0:
-        # SGP4 steps through resonant orbits by half a day, which would take forever from an absurd epoch.
+        # For resonant orbits, SGP4 takes steps of half a day, which are too many from an absurd epoch.
         raise UsageError(
             f"{first!r}: line 1, columns 21 to 32: the day of the year of the epoch, {first[20:32].strip()}, "
             f"must be from 1 to {days:g}"
@@ -321,7 +321,7 @@ def check_lines(first: str, second: str) -> None:
 
 
 LOWEST_RADIUS = 0.98 * EARTH_RADIUS
-"""Smallest radius (m) of a perigee or of a fix."""
+"""Minimum radius (m) of the perigee of mean elements and of a GPS position."""
 
 
 def perigee_radius(motion: float, eccentricity: float) -> float:
@@ -357,7 +357,7 @@ def _check_line(number: int, line: str) -> None:
 
 
 def _check_field(number: int, line: str, field: _Field) -> None:
-    """Raise UsageError unless a field has its form, and a value within its bounds."""
+    """Raise UsageError unless a field of `line` has the required form and a value within bounds."""
     text = line[field.first - 1 : field.last]
     columns = (
         f"columns {field.first} to {field.last}" if field.last > field.first else f"column {field.first}"

@@ -1,12 +1,12 @@
 """The map between the dipole moment of a satellite and the currents of its coils.
 
 Column k of the matrix D (3, n) is the dipole moment of coil k per ampere, so the currents i make the dipole
-moment D i. More than three coils can make a dipole moment by different currents. Of these, the currents with
-the least heat i' R i are used, where R is the diagonal matrix of the coils' resistances. Without a current
-limit, they are P m for a dipole moment m, with the weighted pseudo-inverse P of D. If P m exceeds the limit
-of a coil, the other coils carry the remainder. Control laws and planners need only dipole moments in body
-axes and one limit per body axis. The limits span the largest box of dipole moments that the coils can make.
-The heat of a dipole moment m is m' H m with H = P' R P.
+moment D i. More than three coils can make a dipole moment by different currents. Of all possible currents,
+those with the least heat i' R i are used, where R is the diagonal matrix of the coils' resistances. Without
+current limits, the currents of least heat for a dipole moment m are P m, with the weighted pseudo-inverse P
+of D. If P m exceeds the limit of a coil, the other coils carry the remainder. Control laws and planners need
+only dipole moments in body axes and one limit per body axis. The limits span the largest box of dipole
+moments that the coils can make. The heat of a dipole moment m is m' H m with H = P' R P.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.errors import UsageError
 
 LEAST_SPREAD = 0.05
-"""Smallest singular value of the unit vectors along the coils. Below it, the coils lie nearly in a plane."""
+"""Singular value of the unit vectors along the coils below which the coils lie nearly in a plane."""
 _STEPS = 200
 """Largest number of iterations for the box of dipole moments."""
 _PARALLEL = 1e-6
@@ -31,7 +31,7 @@ _SATURATED = 1e-4
 
 
 def missing_direction(dipoles: FloatArray) -> FloatArray | None:
-    """Return the unit vector (3,) along which coils in a plane make no dipole, or None if they span space.
+    """Return the unit vector (3,) normal to coils in a plane, or None if the coils span space.
 
     Column k of `dipoles` (3, n) is along coil k. Raises UsageError if all coils are parallel.
     """
@@ -128,9 +128,9 @@ class CoilMap:
     def _limited_currents(self, dipole: FloatArray) -> FloatArray:
         """Return the currents (n,), A, of least heat within the limits that make a dipole moment (3,).
 
-        By duality, the currents are those that a vector y (3,) of multipliers causes: R^-1 D' y, clipped to
-        the limits. The multipliers maximise a concave function, whose gradient is the missing dipole moment.
-        They are found by Newton's method with a line search.
+        By duality, the currents are R^-1 D' y, clipped to the limits, for a vector y (3,) of Lagrange
+        multipliers. The multipliers maximise a concave function, whose gradient is the missing dipole moment.
+        The multipliers are found by Newton's method with a line search.
         """
         limits, resistance = self.current_limits, self.resistance
 
@@ -171,7 +171,7 @@ class CoilMap:
         return np.asarray(self.dipoles @ currents)
 
     def per_dipole(self, matrix: FloatArray) -> FloatArray:
-        """Return a matrix (k, n) of effects of the currents as a matrix (k, 3) of effects of the dipole."""
+        """Convert derivatives by the currents (k, n) to derivatives by the dipole moment (k, 3)."""
         if self._strength is not None:
             return np.asarray(matrix / self._strength)
         return np.asarray(matrix @ self._inverse)
@@ -182,11 +182,11 @@ class CoilMap:
         return self._strength is not None
 
     def error_covariance(self, gain: float | FloatArray, axes: float) -> FloatArray:
-        """Return the covariance (9, 9) of the matrix from the commanded to the actual dipole, row by row.
+        """Return the covariance (9, 9) of the matrix (row by row) from the commanded to the actual dipole.
 
-        The errors of the coils are independent and uniform. The dipole of a coil has the largest relative
-        error `gain`, equal for all coils or (n,), and its axis the largest misalignment `axes` (rad) in each
-        of two directions.
+        The errors of the coils are independent and uniformly distributed. The largest relative error of a
+        coil's dipole is `gain`, equal for all coils or (n,). The largest misalignment of a coil's axis is
+        `axes` (rad) in each of two directions.
         """
         found: FloatArray = np.zeros((3, 3, 3, 3))
         gains = np.broadcast_to(gain, len(self.current_limits))
@@ -198,7 +198,7 @@ class CoilMap:
         return found.reshape(9, 9)
 
     def _box(self) -> FloatArray:
-        """Return the half lengths (3,) of the box with the largest volume inside what the coils can make.
+        """Return the half lengths (3,) of the largest box of dipole moments that the coils can make.
 
         The set of dipole moments that the coils can make is a zonotope, whose faces are normal to the cross
         products of two coils.
@@ -209,8 +209,8 @@ class CoilMap:
         normals = np.array([np.cross(one, other) for one, other in combinations(units.T, 2)])
         normals = normals[np.linalg.norm(normals, axis=1) > _PARALLEL]
         reached = np.abs(normals @ self.dipoles) @ self.current_limits
-        # A row times the box is the largest fraction of the distance to a face within the box.
-        # Each step shares the violation among the axes, as in iterative proportional fitting.
+        # The product of `use` and the box is the extent of the box towards each face, relative to the face.
+        # Each step scales the multiplier of a face by this extent, as in iterative proportional fitting.
         use = np.abs(normals) / reached[:, None]
         multipliers = np.full(len(use), 3.0 / len(use))
         for _ in range(_STEPS):

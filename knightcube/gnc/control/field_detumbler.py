@@ -34,10 +34,10 @@ bound, the commanded dipole moment does not increase the bounded quantity. If th
 values, detumbling takes longer, because a spin along the field is then stopped only after the field has
 rotated by a right angle.
 
-The magnetometer alone shows the rate along the field late. Until all components of the rate are known, the
-coils therefore do no positive work. The work of the coils depends on the rate across the field, but neither
-on the rate along the field nor on the inertia tensor. The rate of a body with unequal moments of inertia
-changes without a torque, and its energy does not.
+The magnetometer alone shows the rate along the field only after the field has rotated. Until all components
+of the rate are known, the coils therefore do no positive work. The work of the coils depends on the rate
+across the field, but neither on the rate along the field nor on the inertia tensor. The rate of a body with
+unequal moments of inertia changes without a torque, and its energy does not.
 """
 
 from __future__ import annotations
@@ -125,11 +125,11 @@ def braking_dipole(costate: FloatArray, field: FloatArray, limit: float | FloatA
 
 
 def without_growth(dipole: FloatArray, grows: Sequence[FloatArray]) -> FloatArray:
-    """Return the dipole moment (3,) without the part that increases a quantity.
+    """Return the dipole moment (3,) without the part that increases a bounded quantity, such as the rate.
 
     Each element (3,) of `grows` is the derivative of the growth rate of one quantity with respect to the
-    dipole moment. At most two elements are possible. No component of the result is larger than the largest
-    component of the given dipole moment.
+    dipole moment. The argument `grows` has at most two elements. No component of the result is larger than
+    the largest component of the given dipole moment.
     """
     tried = [dipole, *(_orthogonal(dipole, vector) for vector in grows)]
     for one in tried:
@@ -370,7 +370,7 @@ class FieldDetumbler:
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the dipole moment (3,), A m^2, that acts until the next command, if not the commanded one."""
+        """Set the actual dipole moment (3,), A m^2, until the next command, if not the commanded one."""
         if self._dipole.any() or dipole.any():
             self._driven_ns = self._commanded_ns
         self._dipole = dipole

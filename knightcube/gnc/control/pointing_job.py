@@ -85,9 +85,9 @@ for this time. The weight is high because disturbance torques are poorly known b
 that they cause should be corrected by the end of the slew."""
 HOTTER = 1.1
 """Largest ratio of the heat of a new plan to the heat of the running plan for the rest of a slew. A hotter
-plan would lead back a deviation for which the remaining time is too short."""
+plan would correct a deviation for which the remaining time is too short."""
 _INSIDE = 1e-6
-"""Angle (rad) by which a cone that a running path violates is made narrower than the violation."""
+"""Margin (rad) by which a violated exclusion cone is narrowed in addition to the depth of the violation."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
 """Additional factor by which a slew that rotates too fast is lengthened, largest total factor, and largest
 number of trials."""
@@ -379,7 +379,7 @@ def _propagated(job: PointingJob, running: RunningSlew) -> tuple[FloatArray, Flo
 
 
 def _narrowed(cone: Cone, path: SlewPath, start: FloatArray) -> Cone:
-    """Return an exclusion cone that neither a path nor the attitude `start` (4,) at its begin violates."""
+    """Return an exclusion cone, narrowed if the path or the attitude `start` (4,) violates it."""
     room = min(
         float(cone.clearance(path.quaternion, path.times).min()),
         float(cone.clearance(start[None], np.zeros(1))[0]),

@@ -77,7 +77,8 @@ class SweepCost:
     Attributes:
         state: quadratic weights (n, 6, 6) of the errors.
         control: quadratic weights (n, controls) of the controls.
-        state_slope, control_slope: linear weights (n, 6, columns) and (n, controls, columns).
+        state_slope, control_slope: linear weights of the errors (n, 6, columns) and of the controls (n,
+            controls, columns), with the columns of the error model's affine part.
     """
 
     state: FloatArray

@@ -46,10 +46,11 @@ _SECOND = 1e-9
 class PropagatedSun:
     """An estimate of the Sun's direction in body axes and of the gyro bias.
 
-    Between measurements the direction is propagated with the gyro rate. The drift from the measured
-    directions gives the gyro bias, except for the bias component about the Sun, which does not move the
-    direction. The direction can therefore be propagated through an eclipse. The estimator is a complementary
-    filter of one direction (Mahony, Hamel & Pflimlin 2008, IEEE Transactions on Automatic Control 53(5)).
+    Between measurements the direction is propagated with the gyro rate. The gyro bias follows from the drift
+    of the propagated direction relative to the measured direction. The bias component about the Sun's
+    direction causes no drift and need not be known. The direction can therefore be propagated through an
+    eclipse. The estimator is a complementary filter of one direction (Mahony, Hamel & Pflimlin 2008, IEEE
+    Transactions on Automatic Control 53(5)).
     """
 
     def __init__(self) -> None:

@@ -71,8 +71,8 @@ _MAXIMUM_CHANGE = 3.0
 """Largest innovation that a coil fault can explain, as a multiple of the largest change of the rate by the
 coils. A reversed coil causes twice the change of the rate, and the uncertain age of a sample adds to this."""
 _SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
-"""Bounds of the time (s) between gyro samples during which wrong coil currents may have acted. Without an
-upper bound, a coil fault during a long gap could explain any innovation."""
+"""Bounds of the time (s) between gyro samples during which wrong coil currents may have acted. Wrong currents
+that may act for longer than the upper bound would explain any innovation after a long gap."""
 _PROOF = 1.0
 """Time span (s) of the gyro samples that must confirm the commands before the commands are trusted again."""
 _SHARE_SIGMA = 0.2

@@ -161,8 +161,9 @@ def propagated(
 def reset(covariance: FloatArray, at: slice, rotation: Sequence[float]) -> None:
     """Rotate the remaining error of an attitude to the axes after its correction, in place.
 
-    The attitude has the elements `at` of the error state, and was corrected by `rotation` (3,), rad. To first
-    order, the remaining error rotates by half the correction (Markley and Crassidis 2014, section 6.2.4).
+    The slice `at` of the error state is the attitude error, which was corrected by `rotation` (3,), rad. To
+    first order, the remaining error rotates by half the correction (Markley and Crassidis 2014, section
+    6.2.4).
     """
     x, y, z = rotation
     turn = np.array(((1.0, 0.5 * z, -0.5 * y), (-0.5 * z, 1.0, 0.5 * x), (0.5 * y, -0.5 * x, 1.0)))
@@ -215,9 +216,10 @@ def _inverted(s: FloatArray) -> FloatArray:
 
 
 def with_role(blocks: Sequence[StateBlock], roles: Mapping[str, Role]) -> list[StateBlock]:
-    """Return the blocks with new roles.
+    """Return the blocks of an error state with some roles replaced.
 
-    The new roles are given by the name of the block. Raises UsageError for a name without a block.
+    The mapping `roles` contains the new role of a block by the block's name. Raises UsageError if no block
+    has one of these names.
     """
     unknown = sorted(roles.keys() - {block.name for block in blocks})
     if unknown:

@@ -129,8 +129,8 @@ class FieldRate:
         self._set_inertia(np.zeros(6))
         self._covariance = np.zeros((SIZE, SIZE))
         self._pending = 0.0  # time (s) by which the covariance is behind the state
-        self._pending_impulse = np.zeros(3)  # integral of the dipole over this time, A m^2 s
-        self._pending_start = _NONE, _NONE, _NONE  # rate, field and change at the start of this time
+        self._pending_impulse = np.zeros(3)  # integral of the dipole since the covariance's time, A m^2 s
+        self._pending_start = _NONE, _NONE, _NONE  # rate, field and field change at the covariance's time
 
     @property
     def started(self) -> bool:
@@ -337,7 +337,7 @@ class FieldRate:
         self._rotation = compose(rotated, self._rotation)
 
     def _propagate_covariance(self) -> None:
-        """Propagate the covariance to the time of the state, about the middle of both times."""
+        """Propagate the covariance to the time of the state, linearised halfway between both times."""
         dt = self._pending
         if not dt or self._rate is None:
             return

@@ -27,8 +27,8 @@ sunlight, and the sizes of the disturbance torques of `knightcube.astro.earth.di
 
 The block `field_error` is the error of the field model. This vector keeps its sign for minutes, and is
 modelled as a Gauss-Markov process of first order in body axes. While the attitude is known accurately, the
-standard deviation of this error is estimated by expectation maximisation (Dempster, Laird & Rubin 1977), from
-the squared estimate and its variance.
+standard deviation of the field model's error is estimated by expectation maximisation (Dempster, Laird &
+Rubin 1977), from the square and the variance of the estimated error.
 """
 
 from __future__ import annotations
@@ -245,8 +245,9 @@ class FreeFilterSettings:
         coil_walk: random walk of the elements of the coils' matrix per sqrt(s), for example due to
             temperature.
         inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular
-            rate in rad/s. The load on flexible parts, which are not contained in Euler's equation of a rigid
-            body, vanishes with the rotation. This random walk limits the claimed accuracy of the inertia.
+            rate in rad/s. Flexible parts, which are not contained in Euler's equation of a rigid body, are
+            loaded only while the body rotates. This random walk is a lower limit of the inertia's
+            uncertainty.
         errors: largest errors of the description of body and sensors.
         coils: covariance (9, 9) of the coils' matrix, row by row, at the start; None for coils along the body
             axes, whose covariance follows from `errors`.
@@ -358,7 +359,7 @@ class FreeMemory:
 class FreeFilter:
     """The filter, with the present estimate.
 
-    Over 350 lines, because every propagation and measurement changes the same estimate and covariance.
+    The class is long, because every propagation and measurement changes the same estimate and covariance.
 
     Attributes:
         layout: the declared error state.
@@ -495,8 +496,9 @@ class FreeFilter:
 
         The estimate and its copies `memories` are changed. This is necessary after the sign or the gain of
         the coil was corrected, because the learned matrix refers to the dipole before the correction. The
-        error of the corrected dipole becomes zero, and its correlations with other states are deleted. Its
-        standard deviation becomes that of the settings, and along the coil at least `deviation`.
+        error of the corrected dipole becomes zero, and its correlations with other states are deleted. The
+        standard deviation of the corrected dipole becomes that of the settings, and along the coil at least
+        `deviation`.
 
         Args:
             direction: unit vector (3,) of the coil, body axes.
@@ -628,7 +630,7 @@ class FreeFilter:
             field = attitude_matrix(self.quaternion) @ around.field
             slope = cross_product(rate, field)
             rotation = self.motion.inverse @ cross_product(changed, field + 0.5 * seconds * slope)
-            # The field and the gyroscopic torque change with the time at which the dipole acts.
+            # The field and the gyroscopic torque change during the step, so the time of each dipole matters.
             change = self.motion.inverse @ cross_product(changed, slope)
             self.rate = self.rate + change + self.motion.stiffness(rate) @ rotation
             self.quaternion = multiply(from_rotation_vector(rotation), self.quaternion)
@@ -638,9 +640,9 @@ class FreeFilter:
         self._lag, self._given, self._since = np.zeros(3), np.zeros(3), 0.0
 
     def impulse(self, since: float) -> FloatArray:
-        """Return the integral (3,), A m^2 s, of the propagated dipole up to now, averaged over its begin.
+        """Return the time integral (3,), A m^2 s, of the dipole until now, as the mean over start times.
 
-        The begin is at any time of an interval since `begin_mean`, whose middle is `since` s ago.
+        The start times cover the averaging interval of the gyro samples, whose middle is `since` s ago.
         """
         if self._since == 0.0:
             return since * self.driven
@@ -800,9 +802,9 @@ class FreeFilter:
     def rate_noise(self, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0) -> FloatArray:
         """Return the noise density (3, 3) of the angular acceleration, rad^2/s^3.
 
-        It depends on the coils' dipole (3,) A m^2, on the error of the field model, and on the standard
-        deviation `doubt` (A m^2) of an uncertain dipole. Errors of a dipole cause no torque along the field,
-        but the error of the field model does.
+        The noise density depends on the coils' dipole (3,) A m^2, on the error of the field model, and on the
+        standard deviation `doubt` (A m^2) of an uncertain dipole. Errors of a dipole cause no torque along
+        the field, but the error of the field model does.
         """
         settings, motion, square = self._settings, self.motion, float(dipole @ dipole)
         coils = LASTING * (settings.coil_error**2 * square / 3.0 + doubt**2)

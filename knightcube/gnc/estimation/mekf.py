@@ -82,9 +82,9 @@ def rate_change(
 ) -> RateChange:
     """Return the change of the rate at a sample from the model accelerations before and after the sample.
 
-    The two accelerations apply one standard deviation of the age before and after the sample. They differ if
-    a coil command begins or ends in between. Half their difference is treated as noise, and so is the product
-    of the errors of age and acceleration.
+    The two accelerations apply one standard deviation of the age before and after the sample. The
+    accelerations differ if a coil command begins or ends in between. Half their difference is treated as
+    noise, and so is the product of the errors of age and acceleration.
     """
     pairs = zip(before.acceleration, after.acceleration, disturbance, strict=True)
     x, y, z = (0.5 * (a + b) + d for a, b, d in pairs)

@@ -314,7 +314,7 @@ def _through_pillow(path: Path) -> Image:
 
 
 _ON_SIDE = (5, 6, 7, 8)
-"""Values of the tag Orientation of images whose stored rows are columns."""
+"""Values of the tag Orientation for which the stored rows are columns of the displayed image."""
 _ORIENTATION = 0x0112
 """The tag Orientation of EXIF 2.3 and TIFF 6.0: where row 0 and column 0 of the stored pixels belong."""
 
@@ -339,8 +339,8 @@ def _upright(image: Image, picture: Picture) -> Image:
 def _check_kept(path: Path, picture: Picture) -> None:
     """Raise UsageError for images that Pillow misreads.
 
-    Pillow truncates 16-bit colour, does not invert inverted grey, and mixes up the rows of TIFF images that
-    are stored on their side.
+    Pillow truncates 16-bit colour, ignores the TIFF value WhiteIsZero, and mixes up the rows of TIFF images
+    that are stored on their side.
     """
     deep = any(";16" in _raw_mode(tile[3]) for tile in getattr(picture, "tile", ()))
     if picture.mode in COLOUR_MODES and deep and not _is_deep(picture):

@@ -175,7 +175,7 @@ def limb_in_view(
 def log10_chance(
     limb: LimbInView, residuals: FloatArray, others: FloatArray, camera: CameraModel, unknowns: int
 ) -> float:
-    """Return log10 of an upper bound of the expected number of chance limbs that fit as well as a limb.
+    """Return log10 of an upper bound of the expected number of chance limbs that fit equally well.
 
     Args:
         limb: length of the limb in the image, and its crossings with scan lines.

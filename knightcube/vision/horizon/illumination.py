@@ -302,7 +302,7 @@ def _sphere(count: int) -> FloatArray:
 
 
 _MARGIN = math.radians(5.0)
-"""Angle (rad) from the limb within which samples are not compared, for air and 1 deg of attitude error."""
+"""Angle (rad) from the limb within which air and an attitude error of 1 deg affect samples."""
 _DAY = DAYLIGHT + math.radians(12.0)
 """Elevation of the Sun (rad) above which ground is certainly bright."""
 _STRAY_LIGHT = math.radians(25.0)
@@ -310,7 +310,7 @@ _STRAY_LIGHT = math.radians(25.0)
 _LEAST = 8
 """Minimum number of compared samples, out of 64, to judge whether an image contradicts the attitude."""
 _MOST = 0.6
-"""Fraction of samples that contradict an attitude above which the image is false (clouds cause less)."""
+"""Threshold of the fraction of samples that contradict the attitude; clouds alone do not exceed it."""
 
 
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:

@@ -154,7 +154,7 @@ def evaluate(
     bounds: tuple[float, float, float],
     strict: float = 2.5,
 ) -> Indicators:
-    """Return the indicators of streaks for a given rotation of the camera.
+    """Return how streaks differ from streaks of stars, for a given rotation of the camera.
 
     Args:
         endpoints: ends of the streaks (n, 2, 2), px, corrected for bias, in any order.

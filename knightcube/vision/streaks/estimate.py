@@ -455,9 +455,9 @@ def _rolling_result(
     return replace(first, rate=first.rate - 0.5 * sum_of_both, covariance=covariance)
 
 
-# Indices of rate, acceleration, x and y in the vector of the shared and one star's own parameters.
+# Indices of rate, acceleration, x and y in the vector of shared parameters and one star's parameters.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
-# Index of the flux in the vector of the shared and one star's own parameters.
+# Index of the flux in the vector of shared parameters and one star's parameters.
 _LIGHT = 9
 # Last step of the joint fit (standard deviations) above which the fit counts as not converged.
 _UNSETTLED = 2.0
@@ -475,7 +475,7 @@ _SAME = 1.5
 
 
 def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> MotionResult:
-    """Return a copy of `seen` with the fitted stars, the ends of their streaks and the covariances."""
+    """Return a copy of the result `seen` with fitted stars, streak ends and covariances."""
     settings, joint = camera.settings, last.solution.joint
     significance = last.scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
     kept = np.flatnonzero(significance > settings.faint_sigmas)

@@ -222,7 +222,7 @@ _LEAST_LENGTH = 3.5
 _LENGTH_ERROR = 1.0
 # Part of the standard error of a region's length that is proportional to the length.
 _LENGTH_SHARE = 0.015
-# Maximum number of rotation angles from each ranking, one with and one without votes against an angle.
+# Maximum number of rotation angles from each of two rankings, with and without votes against an angle.
 _MOST_HYPOTHESES = 3
 # Largest distance (px) across the circles between two fragments of one star.
 _SAME_CIRCLE = 2.0

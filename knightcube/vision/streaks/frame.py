@@ -279,7 +279,7 @@ def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | N
     return float(np.sqrt(max(float(np.median(known)) - PIXEL_VARIANCE, 0.0)))
 
 
-# Minimum standard deviation (px) of the point spread in binned pixels.
+# Minimum standard deviation of the point spread in a binned image, in binned pixels.
 _NARROWEST = 1.0
 
 

@@ -85,8 +85,8 @@ class WorkBudget:
 _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
-# Displacement (px), in iteration 1, of a star without effect on the motion that reselects the fit's pixels.
-# Later iterations ignore the often poorly known displacements of stars without effect on the motion.
+# First displacement (px) of a star without effect on the motion above which pixels are selected again. Later
+# iterations ignore the often poorly known displacements of stars without effect on the motion.
 _FAINT_DRIFT = 3.2
 # Change of the acceleration, relative to the rotation, after which the fit's pixels are reselected.
 _GROWN = 0.1
@@ -543,7 +543,7 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
 
 
 # Largest change of the rate over the exposure, relative to the rate at mid-exposure.
-# The rate of a motion that starts or ends at rest changes by 2 in this measure.
+# For a motion that starts or ends at rest, this relative change is 2.
 _MOST_CHANGE = 2.2
 # Deviation (standard deviations) from the majority's motion above which a star must not affect the motion.
 _TRUST_SIGMAS = 3.5

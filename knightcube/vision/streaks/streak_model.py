@@ -85,8 +85,8 @@ class Strips:
 
     Attributes:
         star: index of the star of each block of pixels (b,), in ascending order.
-        time: time at which the star crosses each line of pixels (b, LINES) of the b blocks, in exposures from
-            mid-exposure.
+        time: time at which the star crosses each line of pixels (b, LINES), relative to mid-exposure, in
+            units of the exposure time.
         corner: column and row of the first pixel of each line of pixels, (b, LINES, 2) for b blocks.
         step: step in column and row from one pixel of a line to the next, (b, 2) for b blocks of lines.
         index: flat index in the frame of each of k pixels per line, (b, LINES, k), or 0 for a pixel that is
@@ -176,7 +176,7 @@ def _parts(
         1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_ROTATION)
     )
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
-    edges[:, -1] = times[:, 1]  # Exact, because streak ends are found by a test for equality.
+    edges[:, -1] = times[:, 1]  # Without rounding errors, streak ends can be found by equality.
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
     owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)

@@ -54,8 +54,8 @@ class StreakResiduals:
 
     Attributes:
         star: for each block of pixels (b,), the index of its star in the scene.
-        time: time at which the star crosses each line of pixels (b, LINES) of the b blocks, in exposures from
-            mid-exposure.
+        time: time at which the star crosses each line of pixels (b, LINES), relative to mid-exposure, in
+            units of the exposure time.
         images: images that are combined to model a streak, on lines of k pixels, (b, IMAGES, LINES, k) for b
             blocks.
         weight: inverse variance of each pixel of the b blocks (b, LINES, k), 0 for excluded pixels.
@@ -654,7 +654,10 @@ def _corrected_lens(
 def _lens_effect(
     camera: FitProblem, last: StreakFit, exposure: float, counted: FloatArray | None
 ) -> _LensEffect:
-    """Return the effect on the rotation of calibration errors that remain after correcting `counted` (m,)."""
+    """Return how calibration errors of the camera change the rotation, beyond the errors already corrected.
+
+    The fit has already corrected the calibration errors `counted` (m,), in standard deviations.
+    """
     nothing = np.zeros((3, 3))
     equations = star_equations(last.evaluation, last.free)
     if equations is None:

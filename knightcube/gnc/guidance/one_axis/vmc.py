@@ -127,7 +127,7 @@ class HorizonSearch:
     def with_time_cost(
         self, guess: float, shortest: float, longest: float, time_cost: float
     ) -> tuple[PathProgram, Trial | None]:
-        """Return the path that minimises energy plus `time_cost` (W) times horizon, from a guess of it (s).
+        """Return the path that minimises energy plus `time_cost` (W) times horizon, from a guess (s).
 
         The derivative of the minimum energy by the horizon equals the partial derivative at the optimal path
         (envelope theorem). A tried horizon is a lower bound of the optimum if a longer horizon reduces the

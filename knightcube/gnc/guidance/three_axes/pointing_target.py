@@ -62,7 +62,7 @@ class PointingTarget:
         numbers: numerical arguments of the goal. The goal INERTIAL has an attitude quaternion (4,) from ICRS
             into body axes. The goal GROUND has latitude and longitude, rad. The goal OBJECT has right
             ascension and declination, rad, of the field to search, or no arguments for the present field of
-            view. Other goals have no arguments.
+            view. Goals other than INERTIAL, GROUND and OBJECT have no arguments.
         roll: rotation about the pointing axis, rad; None leaves it free. A roll cannot be given for the goals
             in `ROLLS`.
     """

@@ -250,9 +250,10 @@ def guesses(
     kept: ConeConstraints,
     scale: float,
 ) -> list[Trajectory]:
-    """Return initial guesses for a slew of `scale` s from a state (7,) to the end, the most promising first.
+    """Return initial guesses for a slew with the duration `scale` (s), the most promising guess first.
 
-    The environment `around` is given at 2 k + 1 times. The guesses avoid the exclusion cones `kept`.
+    The slew leads from the state `start` (7,) to the end conditions `end`. The environment `around` is given
+    at 2 k + 1 times. The guesses avoid the exclusion cones `kept`.
     """
     curves = _curves(craft, around, start, end, scale)
     fit = _MomentumFit(curves, craft, start, end, kept, scale)
@@ -380,7 +381,7 @@ class _MomentumFit:
         return to_rotation_vector(multiply(np.broadcast_to(end.quaternion, last.shape), conjugate(last)))
 
     def _cone_violations(self, q: FloatArray) -> FloatArray:
-        """Return the depths (m, cones n) of m paths in the cones with margin, as differences of cosines."""
+        """Return the depths (m, cones * n) of m paths inside the cones, as differences of cosines."""
         return np.maximum(0.0, _ROOM - self._kept.values(q[:, None, 1:])).reshape(len(q), -1)
 
     def _propagated(self, sums: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -565,7 +566,7 @@ class HorizonContinuation:
         return [each for each in times if each <= task.longest and blocking_cone(task, each) is None]
 
     def _value(self, found: SolvedPath, time_cost: float) -> float:
-        """Return the energy plus time cost of a path, J, or the duration, s, if only time counts."""
+        """Return the energy plus time cost of a path, J, or only the duration, s, for a minimum-time slew."""
         return (
             found.horizon if math.isinf(time_cost) else self._solver.energy(found) + time_cost * found.horizon
         )
