@@ -12,7 +12,7 @@ import pytest
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from flight.link.frames import close_frame
+from flight.link.frames import TELECOMMAND_MASK, close_frame
 from flight.link.security import (
     COPIES,
     HIGHEST_COUNTER,
@@ -27,7 +27,7 @@ from flight.link.security import (
     encode,
 )
 from knightcube.errors import FlightError, UsageError
-from tests.flight.link.vaults import Ground, frame_with, gate, vault
+from tests.flight.link.vaults import Ground, frame_with, gate, parse, vault
 
 KEYS = {1: bytes(range(32)), 2: bytes(range(32, 64))}
 
@@ -158,6 +158,34 @@ def test_both_copies_lost_refuse_that_spi_and_its_reserve_changes_the_key(
     assert cause(gate(sky), old) is Refusal.MAC
     ground.write(sky.read(1) or pytest.fail("it was written"))
     assert gate(sky).admit(Ground(ground).frame(b"new")).counter == 0
+
+
+@pytest.mark.parametrize("store_every", [1, 3])
+def test_after_a_change_of_key_no_frame_is_accepted_twice(
+    sky: Vault, ground: Vault, store_every: int
+) -> None:
+    def entrance() -> Gate:
+        return Gate(sky, (1,), parse, TELECOMMAND_MASK, store_every=store_every)
+
+    first = entrance()
+    first.admit(Ground(ground).frame(b"by the old key"))
+    assert first.replace_key(1, 2, bytes(32))
+    ground.write(sky.read(1) or pytest.fail("it was written"))
+    frames = [Ground(ground).frame(b"by the new key") for _ in range(store_every)]
+    for frame in frames[:-1]:
+        first.admit(frame)
+    if store_every > 1:
+        assert entrance().admit(frames[0]).counter == 0, "not stored yet"
+    first.admit(frames[-1])
+    assert [cause(entrance(), frame) for frame in frames] == [Refusal.REPEATED] * store_every, "stored"
+    first.admit(Ground(ground).frame(b"one more"))
+    kept = sky.read(1) or pytest.fail("both copies are there")
+    assert kept.unused == store_every + (store_every == 1), "stored once per `store_every` counts"
+    last = Ground(ground).frame(b"last")
+    second = entrance()
+    second.admit(last)
+    second.close()
+    assert cause(entrance(), last) is Refusal.REPEATED, "stored at the end"
 
 
 def test_a_counter_that_cannot_be_stored_lets_nothing_in(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -265,6 +266,65 @@ def test_a_verdict_of_a_stuck_leg_that_the_brake_does_not_bear_out_is_braked_no_
                 break
     assert not watch.braked
     assert not watch.available[0]
+
+
+def _looks(leg: StuckLeg, stuck: Iterable[int], count: int = 40) -> list[int | None]:
+    """Return the results of ADC samples without commands, while each stuck axis that is not braked draws."""
+    drawing = set(stuck)
+    found = []
+    for _ in range(count):
+        found.append(leg.look(Supplied(0.15 * len(drawing - leg.brake), 0.0, 0.0, (0, 1, 2), False)))
+        if found[-1] is not None:
+            break
+    return found
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_stuck_axis_is_the_one_whose_release_lets_the_current_flow_again(axis: int) -> None:
+    leg = StuckLeg(0.04)
+    assert _looks(leg, {axis}, 2) == [None, None]
+    assert leg.is_searching
+    assert leg.brake == {0, 1, 2}
+    assert leg.suspicion == "supply current 150 mA, expected 0 to 0 mA"
+    # Two normal samples with all bridges braked, and two for each released bridge.
+    assert _looks(leg, {axis}) == [None] * (2 + 2 * axis + 1) + [axis]
+    assert (leg.is_searching, leg.brake, leg.rest, leg.suspicion) == (False, frozenset(), False, "")
+
+
+def test_a_current_that_braking_does_not_end_is_given_up_until_it_ends() -> None:
+    leg = StuckLeg(0.04)
+    excess = Supplied(0.15, 0.0, 0.0, (0, 1, 2), False)
+    assert [leg.look(excess) for _ in range(4)] == [None] * 4
+    assert (leg.is_searching, leg.brake) == (False, frozenset())
+    assert [leg.look(excess) for _ in range(20)] == [None] * 20
+    assert not leg.is_searching
+    _looks(leg, (), 2)
+    assert _looks(leg, {1})[-1] == 1, "the search is possible again"
+
+
+def test_a_rest_that_finds_nothing_is_not_repeated_for_50_samples() -> None:
+    leg = StuckLeg(0.04)
+    leg.ask_for_rest("no torque")
+    assert (leg.is_searching, leg.suspicion, leg.brake) == (True, "no torque", frozenset())
+    _looks(leg, (), 2)
+    assert not leg.is_searching
+    _looks(leg, (), 49)
+    leg.ask_for_rest("no torque")
+    assert not leg.is_searching
+    _looks(leg, (), 1)
+    leg.ask_for_rest("no torque")
+    assert leg.is_searching
+
+
+def test_a_search_without_agreement_ends_after_twelve_samples() -> None:
+    leg = StuckLeg(0.04)
+    leg.ask_for_rest("no torque")
+    samples = [Supplied(0.15 * (k % 2), 0.0, 0.0, (0, 1, 2), False) for k in range(13)]
+    searching = []
+    for sample in samples:
+        assert leg.look(sample) is None
+        searching.append(leg.is_searching)
+    assert searching == [True] * 12 + [False]
 
 
 @pytest.mark.parametrize(

@@ -109,6 +109,25 @@ def test_an_open_port_cannot_be_opened_again_until_the_driver_closes_it() -> Non
     os.close(far)
 
 
+def test_data_that_nobody_receives_are_dropped_oldest_first_and_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(serial_port, "_PENDING_LIMIT", 10)
+    near, far = os.openpty()
+    port = PySerialPort(os.ttyname(far), 115200, SystemClock())
+    port.close()
+    port._keep(1, b"abcd")
+    port._keep(2, b"efghij")
+    assert port.lost_bytes == 0
+    port._keep(3, b"kl")
+    assert port.lost_bytes == 4
+    assert port.receive() == [(2, b"efghij"), (3, b"kl")]
+    port._keep(4, b"mnopqrstuv")
+    assert (port.lost_bytes, port.receive()) == (4, [(4, b"mnopqrstuv")])
+    os.close(near)
+    os.close(far)
+
+
 def test_closing_ends_the_thread_that_waits_for_data(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial_port, "_READ_TIMEOUT_S", 60.0)
     near, far = os.openpty()

@@ -11,7 +11,16 @@ import pytest
 from flight.link.commands import ChangeMode, CommandError, Ping, Point, Slew, command_of_words, unpack
 from flight.link.modes import Mode
 from flight.link.process import commanding, directives
-from flight.link.process.commanding import MOST_ENTRIES, Timetable, TimetableError
+from flight.link.process.commanding import (
+    LATEST_NS,
+    MOST_ENTRIES,
+    Report,
+    Scheduling,
+    Sent,
+    Stage,
+    Timetable,
+    TimetableError,
+)
 from flight.link.process.directives import Deletion, Directive, Listing, Scheduled
 from flight.link.regular_files import overwrite
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
@@ -187,6 +196,58 @@ def test_a_due_command_that_cannot_be_removed_from_the_disk_is_reported_once_and
     assert link.stages(later) == ["accepted", "completed"]
     monkeypatch.undo()
     assert texts(link, send(link, Listing()))[-1] == "1 scheduled"
+
+
+def _scheduling(tmp_path: Path, mode: Mode | None = Mode.HOLD) -> tuple[Scheduling, int]:
+    """Return a scheduler with a command, and the due time of the command, ns."""
+    table, at_ns = Timetable(tmp_path), 1_800_000_000 * 10**9
+    table.add(at_ns, 1, 9, "ping 3")
+    made = Scheduling(table)
+    made._mode = None if mode is None else int(mode)
+    return made, at_ns
+
+
+@pytest.mark.parametrize(
+    ("mode", "delay_ns", "outcome"),
+    [
+        (Mode.HOLD, -1, "waits"),
+        (Mode.HOLD, 0, "sent"),
+        (Mode.HOLD, LATEST_NS, "sent"),
+        (Mode.HOLD, LATEST_NS + 1, "late"),
+        (None, LATEST_NS, "waits"),
+        (None, LATEST_NS + 1, "late"),
+        (Mode.SAFE, LATEST_NS, "safe"),
+    ],
+)
+def test_a_command_is_due_from_its_time_on_for_ten_seconds(
+    mode: Mode | None, delay_ns: int, outcome: str, tmp_path: Path
+) -> None:
+    scheduling, at_ns = _scheduling(tmp_path, mode)
+    found = list(scheduling.due(at_ns + delay_ns))
+    assert len(Timetable(tmp_path).entries) == (outcome == "waits")
+    if outcome == "waits":
+        assert found == []
+        return
+    (one,) = found
+    assert (one.spi, one.counter) == (1, 9)
+    if outcome == "sent":
+        assert isinstance(one, Sent)
+        assert one.command == Ping(3)
+        return
+    assert isinstance(one, Report)
+    assert one.stage is Stage.FAILED
+    assert {"late": "not executed, it is", "safe": "only the ground may decide"}[outcome] in one.text
+
+
+@pytest.mark.parametrize(("early_ns", "scheduled"), [(1, True), (0, False), (-1, False)])
+def test_only_a_time_to_come_can_be_scheduled(early_ns: int, scheduled: bool, tmp_path: Path) -> None:
+    scheduling, at_ns = _scheduling(tmp_path)
+    at = f"{datetime.fromtimestamp(at_ns * 1e-9, UTC):%Y-%m-%dT%H:%M:%S}"
+    done = Report(1, 12, Stage.COMPLETED, "schedule", "")
+    (answer,) = scheduling.obey(Scheduled(at, "ping 4"), done, at_ns - early_ns)
+    assert answer.stage is (Stage.COMPLETED if scheduled else Stage.FAILED)
+    assert answer.text.startswith("2: " if scheduled else f"{at} has passed: it is ")
+    assert len(Timetable(tmp_path).entries) == 1 + scheduled
 
 
 def test_words_are_read_by_the_table() -> None:
