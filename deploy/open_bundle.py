@@ -10,7 +10,7 @@ The program writes the artefact to FOLDER/artefact. For a configuration, it also
 configuration and the drop-ins of its units. For orbital elements or a star catalogue, this configuration is a
 copy of the configuration PRESENT with one value replaced. KEPT is the folder that will contain the catalogue.
 The program prints the version, the permission to replace a newer version, and the SHA-256 as one JSON object.
-For a refused bundle, it prints one line, and the exit status is 1.
+For a refused bundle, the program prints one line and exits with status 1.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _VALUES = {"elements": ("elements",), "catalogue": ("camera", "star_tracker", "i
 
 
 class Refused(Exception):
-    """Raised for a bundle that must not be installed. The text states the reason."""
+    """Raised for a bundle that must not be installed. The error text states the reason."""
 
 
 class FolderFetcher(FetcherInterface):  # type: ignore[misc]  # the package may be missing where types are checked

@@ -64,7 +64,7 @@ _DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError,
 
 
 class Refused(Exception):
-    """Raised for a request that cannot be executed. The text states the reason."""
+    """Raised for a request that cannot be executed. The error text states the reason."""
 
 
 @dataclasses.dataclass

@@ -95,7 +95,7 @@ def write_attitudes(run: Run, path: Path) -> list[Path]:
     """
     packets = run["attitude"]
     packets = packets[np.isfinite(packets["quaternion"]).all(axis=1)]
-    # Two packets of one time would be refused by readers.
+    # Readers of the message refuse two attitudes of the same time.
     packets = packets[np.unique(packets["time_ns"], return_index=True)[1]]
     if not len(packets) or not len(run["navigation"]) or not len(run["run"]):
         raise UsageError(f"{run.folder}: it has no attitudes of a satellite with respect to the stars")

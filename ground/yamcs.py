@@ -52,7 +52,7 @@ enabled: true
 authModules: [{class: org.yamcs.security.YamlAuthModule}]
 """
 USERS, USER = "etc/users.yaml", "admin"
-"""File of the password, and the user, who has Yamcs's public default password if the file is missing."""
+"""Password file and user name. Without the file, Yamcs uses a publicly known default password."""
 
 _INSTANCE = """\
 services:

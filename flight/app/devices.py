@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from sim_hal.rig import PosedCamera, SimulationRequest
 
 _BEFORE_ELEMENTS = 365.0
-"""Time (days) before the epoch of the elements from which the dates of the GPS receiver are possible."""
+"""Maximum time (days) by which a GPS date may precede the epoch of the two-line elements."""
 
 
 def fault_catalogue() -> tuple[str, str]:
@@ -162,7 +162,7 @@ def open_gps(config: Config, rig: Rig, stack: ExitStack) -> UbloxReceiver | None
         return None
     earliest_ns = EARLIEST_NS
     if isinstance(config, OrbitConfig) and config.elements is not None:
-        with suppress(UsageError):  # composing the body refuses wrong elements
+        with suppress(UsageError):  # wrong elements are reported when the body is built
             days = TwoLineElements(*config.elements).epoch - UNIX_EPOCH
             earliest_ns = round((days - _BEFORE_ELEMENTS) * DAY) * SECOND_NS
     gps = UbloxReceiver(rig.wires.gps, rig.clock, round(config.gps.period * SECOND_NS), earliest_ns)

@@ -148,7 +148,7 @@ class _Plain:
 
 @dataclass(frozen=True, slots=True)
 class Ping(_Plain):
-    """Command to answer with the same number."""
+    """Command that requests an answer with the same number."""
 
     number: int = 0
     packet = PING

@@ -84,7 +84,7 @@ IDLE = 0x7FF
 
 IDLE_CHANNEL = 7
 """Virtual channel of frames that contain only idle data."""
-_ONLY_IDLE_DATA = 0x7FE  # first header pointer of such a frame
+_ONLY_IDLE_DATA = 0x7FE  # first header pointer of a frame with only idle data
 
 _COUNTS = 256  # number of values of a frame count
 
@@ -92,7 +92,7 @@ _STATUS = 0b11 << 11  # frame status field: segment length identifier 11, all fl
 _LEAST_IDLE = HEADER_BYTES + 1
 
 Seal = Callable[[bytes, bytes], bytes]
-"""Function that returns the protected frame, without CRC, of a frame header and data."""
+"""Function that returns the protected frame, without CRC, from a frame header and data."""
 
 
 @dataclass(slots=True)

@@ -360,15 +360,15 @@ class BodyEstimation(Protocol):
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
         """Accept that the coil monitor multiplied the described dipoles of the coils by `change` (n,).
 
-        The relative standard deviations of the corrected dipoles are `deviations` (n,). The default does
-        nothing. It is for a filter that does not estimate the coils separately.
+        The relative standard deviations of the corrected dipoles are `deviations` (n,). The default method
+        does nothing, for a filter that does not estimate the coils separately.
         """
         del change, deviations
 
     def coils_used(self, used: BoolArray) -> None:
         """Accept that the coils `used` (n,) are in use now, while the others are isolated.
 
-        The default does nothing. It is for a body whose estimation does not depend on the allocation.
+        The default method does nothing, for a body whose estimation does not depend on the allocation.
         """
         del used
 

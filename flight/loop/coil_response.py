@@ -227,7 +227,7 @@ class CoilResponse:
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)[:, None]
         count = len(self._free)
-        # Gyroscopic acceleration (3, 6) per product of rates, and its changes (k, 3, 6) by k error modes.
+        # Coefficients (3, 6) of the gyroscopic acceleration, and their changes (k, 3, 6) by k inertia errors.
         self._gyroscopic: FloatArray = np.zeros((3, 6))
         self._modes: FloatArray = np.zeros((0, 3, 6))
         if count == 3:
@@ -257,15 +257,17 @@ class CoilResponse:
         self._turned: FloatArray = np.zeros(3)
         self._spun: FloatArray = np.zeros(6)  # integrals of the rate products, rad^2/s
         self._quiet_field: FloatArray | None = None
-        # Each bin has a row (f, n + 3 + k) for its f free axes.
-        # The first columns are n coil accelerations and the observed acceleration.
-        # The other columns are mean rate, angle, and the accelerations by the k error modes.
+        # Each bin has a row (f, n + 3 + k) for f free axes, n coils and k inertia error modes.
+        # The first columns of a row are n coil accelerations and the observed acceleration.
+        # The other columns of a row are mean rate, angle, and the accelerations by the k error modes.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
         self.fastest = 0.0
-        self._weights: FloatArray = np.zeros(len(self._modes))  # weights of the error modes, newest fit
-        # Each bin has a residual, with its time (ns) and the commanded acceleration of each coil (3, n).
-        # The acceleration per ampere (3, n), the residual (3,) and the error modes' (3, k) follow.
+        self._weights: FloatArray = np.zeros(
+            len(self._modes)
+        )  # weights of the inertia error modes in the newest fit
+        # The tuple of a bin begins with the time (ns) and the commanded acceleration by each coil (3, n).
+        # It ends with acceleration per ampere (3, n), residual (3,), and accelerations by error modes (3, k).
         self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]] = deque()
         self._in_a_row = {finding: [0] * coils for finding in Finding}
         self.sigma = np.full(coils, np.inf)

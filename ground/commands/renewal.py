@@ -29,7 +29,7 @@ from ground.link.commanding import add_link_options, explained, sha256_of, termi
 from knightcube.errors import FlightError, UsageError
 
 ENDLESS = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)
-"""Expiry of metadata without an end, which no wrong clock can reach."""
+"""Expiry date of metadata that never expire, so that a wrong clock on board does not matter."""
 PARTS = (
     "knightcube",
     "flight",
@@ -42,7 +42,7 @@ PARTS = (
     "LICENSE",
     "wheels",
 )
-"""Files and folders of the sources that make a release."""
+"""Source files and folders that a release contains."""
 _SIGNED_BY_ONE = ("targets", "snapshot", "timestamp")
 _TIMEOUT_S = 60.0
 """Default time (s) to wait for the privileged part, which runs every 10 s."""
@@ -116,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def make_signing_keys(folder: Path) -> Path:
-    """Make two root keys, a signing key and the first root metadata; return the file of these metadata."""
+    """Make two root keys, a signing key and the first root metadata, and return the metadata file."""
     try:
         folder.mkdir(mode=0o700, parents=True)
     except OSError as error:
@@ -133,7 +133,7 @@ def make_signing_keys(folder: Path) -> Path:
 
 
 def replace_signing_key(folder: Path, also_root: bool) -> int:
-    """Let a root key name another signing key, and other root keys; return the version of the metadata."""
+    """Replace the signing key and, if `also_root`, the root keys. Return the version of the root metadata."""
     root = _newest_root(folder)
     old = [_read_key(path) for path in sorted(folder.glob("root-*.pem"))]
     old = [signer for signer in old if signer.public_key.keyid in root.roles["root"].keyids]
@@ -207,7 +207,7 @@ def _command(options: argparse.Namespace) -> int:
             reports.append(report)
             sys.stdout.write(f"{report.stage.name.lower()}: {explained(report)}\n")
             sys.stdout.flush()
-            # A trial has begun with the second report of a start: the first one is of the link.
+            # The link reports the first start; the second start, of the privileged part, begins the trial.
             if options.what == "activate" and [one.stage for one in reports].count(Stage.STARTED) == 2:
                 break
     if not reports:
@@ -300,13 +300,13 @@ def _newest_root(folder: Path) -> Root:
 
 
 def _read(folder: Path, kind: type[T]) -> T | None:
-    """Return the signed part of metadata, or None if the file does not exist. Raises UsageError."""
+    """Return the newest metadata of a role, or None if the file does not exist. Raises UsageError."""
     path = folder / "metadata" / f"{kind.type}.json"
     return _signed(path, kind) if path.exists() else None
 
 
 def _signed(path: Path, kind: type[T]) -> T:
-    """Return the signed part of a metadata file. Raises UsageError."""
+    """Return the metadata in a file, without the signatures. Raises UsageError."""
     try:
         signed = Metadata[T].from_file(str(path)).signed
     except RepositoryError as error:
@@ -317,7 +317,7 @@ def _signed(path: Path, kind: type[T]) -> T:
 
 
 def _write_signed(path: Path, signed: T, signers: Iterable[CryptoSigner]) -> Path:
-    """Sign metadata and write them by one rename."""
+    """Sign metadata, and write the file atomically."""
     metadata = Metadata(signed)
     for signer in signers:
         metadata.sign(signer, append=True)
@@ -326,7 +326,7 @@ def _write_signed(path: Path, signed: T, signers: Iterable[CryptoSigner]) -> Pat
 
 
 def _date(text: str) -> datetime:
-    """Return a date as the end of a signature. Raises UsageError."""
+    """Return the expiry date in an argument such as 2030-01-01. Raises UsageError."""
     try:
         return datetime.fromisoformat(text).replace(tzinfo=UTC)
     except ValueError as error:

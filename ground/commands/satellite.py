@@ -126,7 +126,7 @@ def _add_way(parser: argparse.ArgumentParser, timeout: float) -> None:
 
 
 def _allow_behind(words: _Words) -> None:
-    """Let `--timeout` and `--json` stand behind the words of a command too."""
+    """Accept the options `--timeout` and `--json` also after the words of a command."""
     for word in words.choices.values():
         word.add_argument("--timeout", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
         word.add_argument("--json", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
@@ -169,13 +169,13 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_commands(words: _Words) -> None:
-    """Add the telecommands to the words of a parser."""
+    """Add a subparser for each telecommand."""
     for packet in COMMANDS:
         _configure_word(words.add_parser(packet.name, help=packet.meaning.lower()), packet)
 
 
 def _with_scheduled(options: argparse.Namespace) -> argparse.Namespace:
-    """Return the options with the words of a scheduled command as one line, and those behind the words.
+    """Return the options, with the scheduled command as one line and the options after its words.
 
     Raises UsageError for values that the command forbids; wrong words end the program with status 2.
     """

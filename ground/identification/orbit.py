@@ -69,7 +69,7 @@ class LearnedQuantity:
 
     @property
     def change(self) -> FloatArray:
-        """Differences (n,) of learned and configured values, in units of the claim; NaN without a claim."""
+        """Changes (n,) of learned values, in estimated standard deviations; NaN if these are unknown."""
         known = np.where(self.claim > 0.0, self.claim, math.nan)
         return np.asarray((self.value - self.described) / known)
 
@@ -209,7 +209,7 @@ def _largest(matrix: LearnedQuantity) -> tuple[float, float]:
 
 
 def _inertia_accuracy(found: LearnedDescription) -> tuple[float, float]:
-    """Return the smallest accuracies `moments` and `axes_deg` that contain the claims of the inertia.
+    """Return the smallest accuracies `moments` and `axes_deg` that cover the learned inertia's uncertainty.
 
     The accuracies do not exceed those of the configuration.
     """

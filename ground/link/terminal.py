@@ -108,7 +108,7 @@ class TerminalSettings:
         )
 
     def codes(self) -> LinkCodes:
-        """Return the codes of the link, without corrected errors."""
+        """Return the codes of the link, with error counters at zero."""
         coding = self.coding
         return LinkCodes(
             self.frame_bytes, coding.randomiser, coding.reed_solomon, coding.cltu, self.call_signs

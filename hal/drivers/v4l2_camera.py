@@ -679,7 +679,7 @@ class V4l2Camera:
     def collect(self) -> Frame | None:
         """Return the selected frame, None if it has not arrived. Raises DeviceError.
 
-        All other frames are returned to the kernel.
+        Frames other than the selected frame are returned to the kernel.
         """
         device = self._opened()
         try:

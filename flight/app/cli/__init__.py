@@ -46,7 +46,10 @@ class _Outlet(io.FileIO):
 
 
 def outlast_readers() -> None:
-    """Make standard output and error survive a closed reader; streams replaced by a caller stay unchanged."""
+    """Let the process continue if the reader of standard output or error is closed.
+
+    Streams that a caller has replaced stay unchanged.
+    """
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is None:
@@ -83,7 +86,7 @@ COMMANDS = {
 """Group and purpose of each command of the flight application; entry points in `ENTRY_POINTS` add more."""
 
 ENTRY_POINTS = "knightcube.commands"
-"""Name of the entry points, each of which is a table of the commands that a package adds."""
+"""Name of the entry point group; each entry point is a table of commands that a package adds."""
 
 PROGRAM = "knightcube"
 """Name of the program in help, errors and examples; `python -m flight` is the same program."""

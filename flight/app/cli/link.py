@@ -72,7 +72,7 @@ class _JudgedLink:
     """Values of a validated configuration.
 
     The attribute `socket` is the command socket of the flight, `inhibit` the duration of the separation
-    inhibit, s, and `problem` the reason why another file was read.
+    inhibit, s, and `problem` the reason why a stored configuration replaces the requested file.
     """
 
     link: Link
@@ -83,7 +83,7 @@ class _JudgedLink:
 
 @dataclass(frozen=True, slots=True)
 class _OpenedLink:
-    """An opened link, and the names of its lines."""
+    """An opened link, and the names of the communication lines for the log."""
 
     station: Station
     names: str
@@ -199,7 +199,10 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
 
 
 def _witness(keys: Path) -> Path:
-    """Return the folder of the witness: the second state folder of a service, else a sibling of the keys."""
+    """Return the folder of the witness (`flight.link.security`).
+
+    It is the second state folder of a service, or otherwise a folder beside the keys.
+    """
     folders = os.environ.get("STATE_DIRECTORY", "").split(":")
     return Path(folders[1]) if len(folders) > 1 else keys.absolute().parent / "witness"
 

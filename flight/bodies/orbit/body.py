@@ -221,7 +221,7 @@ class SatelliteEstimation(BodyEstimation):
         coils = self.coil_monitor.correction
         factors = Learned.of(coils.factors, np.diag(coils.deviations**2))
         found = {**learned_of(self.orbit_filter.slow, _utc(self._services)), COIL_FACTORS: factors}
-        # With an isolated coil, the matrix of more than three coils does not hold for all coils.
+        # With redundant coils, a matrix learned without an isolated coil is not stored for the next boot.
         if self._used.all() or not self._coils.is_redundant:
             self._whole_body = found[BODY]
         elif self._whole_body is not None:
@@ -236,14 +236,14 @@ class SatelliteEstimation(BodyEstimation):
         self._renew_redundant_coils()
 
     def coils_used(self, used: BoolArray) -> None:
-        """Accept which coils (n,) are in use. The matrix of more than three coils depends on them."""
+        """Accept which coils (n,) are in use, and reset the learned matrix of redundant coils."""
         self._used = used
         self._renew_redundant_coils()
 
     def _renew_redundant_coils(self) -> None:
         """Reset the learned matrix of more than three coils after a change of coils or allocation.
 
-        Parallel coils have no matrix, so their matrix is kept.
+        If only parallel coils are in use, the previous matrix is kept.
         """
         if not self._coils.is_redundant:
             return

@@ -55,7 +55,7 @@ class EstimatedEnvironment:
         self._clock = clock
         self._fix: GpsFix | None = None
         self._utc_offset_ns: int | None = None
-        self._newest_offset_ns: int | None = None  # time offset (ns) of the newest GPS fix, used or not
+        self._newest_offset_ns: int | None = None  # time offset (ns) of the newest GPS fix, even if rejected
         self._near: Ephemeris | None = None
         self._refused_in_a_row = 0
         self.refused = 0

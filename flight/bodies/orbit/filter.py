@@ -86,10 +86,10 @@ class DipoleHistory:
         return np.subtract(self._sum(to_ns), self._sum(from_ns)) / (to_ns - from_ns)
 
     def impulse(self, from_ns: int, to_ns: int) -> FloatArray:
-        """Return the mean (3,), A m^2 s, of the integral of the dipole from a time of an interval to its end.
+        """Return the integral (3,), A m^2 s, of the dipole until `to_ns`, averaged over its start time.
 
-        The torque of this impulse is the reason why the rate at the end of the interval `from_ns` to `to_ns`
-        differs from the mean rate of the interval.
+        The torque of this impulse is the difference of the angular momentum at the end of the interval
+        `from_ns` to `to_ns` from its mean over the interval.
         """
         first, last = bisect.bisect_right(self._times, from_ns), bisect.bisect_left(self._times, to_ns)
         knots = np.array([from_ns, *self._times[first:last], to_ns])
@@ -118,9 +118,9 @@ class FilterStep:
 
     Attributes:
         dipole: mean commanded dipole (3,), A m^2.
-        doubt: standard deviation of the true dipole from `dipole` beyond that of the coils' matrix, A m^2
-            per axis; zero for known dipoles of three coils.
-        gyro: mean angular rate (3,), rad/s, of `samples` gyro readings, whose mean time is `gyro_ns`.
+        doubt: standard deviation of the error of `dipole`, A m^2 per axis, in addition to that of the coils'
+            matrix; zero for known dipoles of three coils.
+        gyro: mean angular rate (3,), rad/s, of `samples` gyro readings with the mean time `gyro_ns`.
         impulse: time integral (3,), A m^2 s, of the dipole from a gyro reading to the end of the step,
             averaged over the readings.
         field: mean magnetic field (3,), T, of `fields` readings around `field_ns`, or None without a reading.
@@ -150,10 +150,10 @@ class FilterStep:
 
 
 class OpenStep:
-    """Collects the readings of the step under way."""
+    """Collects the readings of the present, incomplete filter step."""
 
     def __init__(self, begin_ns: int, acts: bool) -> None:
-        """Start a step at a time; The flag `acts` states whether the coils carry current during the step."""
+        """Start a step at a time. The flag `acts` states whether the coils carry current during the step."""
         self.begin_ns = self.end_ns = begin_ns
         self._acts = acts
         self._rates: list[FloatArray] = []
@@ -298,7 +298,7 @@ class StepReplay:
     def correct_coils(self, change: FloatArray, deviations: FloatArray) -> None:
         """Multiply the assumed dipoles of the coils by `change` (n,), and process the steps again.
 
-        What was learned about these coils is reset. The steps in which a corrected coil was driven have
+        The learned matrix of these coils is reset. The steps in which a corrected coil was driven have
         unknown dipoles, because the coil may have changed during these steps.
         """
         coils, changed = self._settings.coils, np.flatnonzero(change != 1.0)
@@ -430,7 +430,7 @@ class StepReplay:
         for begin_ns, end_ns in itertools.pairwise(times_ns):
             part = (end_ns - begin_ns) / SECOND_NS
             dipole, impulse = self._dipoles.mean(begin_ns, end_ns), self._dipoles.impulse(begin_ns, end_ns)
-            # The integral of the dipole's integral beyond that of the mean dipole.
+            # Second integral of the dipole minus the second integral of the mean dipole.
             uneven = part * (0.5 * part * dipole - impulse)
             self.free.advance(part, dipole, step.around, step.doubt, uneven)
 
@@ -438,7 +438,7 @@ class StepReplay:
         """Apply the mean gyro and magnetometer readings of a step at its end."""
         free, settings = self.free, self._settings
         since = (step.end_ns - step.gyro_ns) / SECOND_NS
-        # The coils may act only during a part of the step, which the mean dipoles do not show.
+        # A coil that acts only during a part of the step changes the rate unevenly.
         change = self._rate_change(step, since, step.impulse - free.impulse(since))
         spread = settings.free.coil_error**2 * float(change @ change) + settings.gyro_noise**2 / step.samples
         refused = not free.gyro(step.gyro, spread * _EYE, change, since)
@@ -451,10 +451,11 @@ class StepReplay:
             self.refused_fields = 0 if used else self.refused_fields + 1
 
     def _rate_change(self, step: FilterStep, since: float, impulse: FloatArray) -> FloatArray:
-        """Return the change (3,), rad/s, of the rate since the mean over an interval.
+        """Return the difference (3,), rad/s, of the present rate from the mean rate over an interval.
 
-        The middle of the interval is `since` s ago. `impulse` (3,), A m^2 s, is that of the dipole
-        (`DipoleHistory.impulse`), less that of the newest dipole, which acts in the present acceleration.
+        The middle of the interval is `since` s ago. The argument `impulse` (3,), A m^2 s, is that of the
+        dipole (`DipoleHistory.impulse`) minus that of the newest dipole, which the present acceleration
+        includes.
         """
         free = self.free
         shown = attitude_matrix(free.quaternion) @ step.around.field
@@ -495,9 +496,9 @@ class _Beginning:
     """An estimate at the end of a step, with terms that are computed once for all its propagations.
 
     Attributes:
-        spread: covariance (19, 19) of the estimate, with the states in the order that the loop uses.
+        spread: covariance (19, 19) of the estimate, with the states in the order of the loop's estimates.
         moving: covariance (18, 18) of attitude, rate, coils and misalignment of the star camera.
-        field, residual: magnetic field (3,), T, and residual dipole (3,), A m^2, in body axes.
+        field, residual: magnetic field (3,), T, and satellite's residual dipole (3,), A m^2, in body axes.
     """
 
     around: FilterEnvironment
@@ -509,7 +510,7 @@ class _Beginning:
 
 
 class EstimatePropagation:
-    """Propagates a filter's estimates within the step under way, in about 0.1 ms for each estimate."""
+    """Propagates a filter's estimates to times within a filter step, in about 0.1 ms for each estimate."""
 
     def __init__(self, free: FreeFilter) -> None:
         self._free = free
@@ -540,7 +541,7 @@ class EstimatePropagation:
         return _Beginning(around, memory, spread, memory.covariance[_MOVED], field, residual)
 
     def camera_covariance(self, seconds: float, dipole: FloatArray, around: FilterEnvironment) -> FloatArray:
-        """Return the covariance (3, 3), rad^2, of the newest attitude of the star camera, propagated."""
+        """Return the attitude covariance (3, 3), rad^2, of the star camera, propagated by `seconds`."""
         begun = self._beginning(self._free.memory(), around)
         moved, grown = self._motion(begun, seconds, dipole)[2:]
         rows = moved[0:3].copy()
@@ -550,7 +551,7 @@ class EstimatePropagation:
     def _motion(
         self, begun: _Beginning, seconds: float, dipole: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return rotation (4,), rate (3,), the errors' transition (6, 18), and the rate's noise (3, 3).
+        """Return rotation (4,), rate (3,), transition matrix (6, 18) of the errors, and rate noise (3, 3).
 
         The midpoint rule is used, because rate and torque change their directions during a step.
         """
@@ -614,14 +615,16 @@ class OrbitFilter:
         """
         self._settings = settings
         self._around = around
-        self._dipoles = DipoleHistory(settings.history_ns + 2 * settings.step_ns)  # a step may begin earlier
+        self._dipoles = DipoleHistory(
+            settings.history_ns + 2 * settings.step_ns
+        )  # a step may begin before the history
         self._replay = StepReplay(settings, self._dipoles)
         self._free, self._steps = self._replay.free, self._replay.steps
         self._propagated = EstimatePropagation(self._free)
         self._open: OpenStep | None = None
         self._field_check = StuckFieldCheck()
         self._refused_attitudes = 0
-        self._shifted = 0.0  # error (A m^2) of redundant coils in the open step beyond their matrix
+        self._shifted = 0.0  # additional dipole error (A m^2) of redundant coils in the present step
         self._shares = settings.coils.linear_shares(np.ones(len(settings.coils.current_limits), dtype=bool))
         self._placed_ns = 0  # time of the last attitude that was used
         self.restarts = 0

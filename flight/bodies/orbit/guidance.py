@@ -349,7 +349,7 @@ class ObjectAim:
                 text = f"object {found.number}, V {found.magnitude:.1f} +- {found.magnitude_sigma:.1f}"
                 self._events.report(events.OBJECT_FOLLOWED, now_ns, text)
             elif before:
-                # Search in the commanded direction, or without one in the camera's direction.
+                # Search again in the commanded direction, or where the camera points if none is commanded.
                 self._place = None
         self.moved = self.moved or before > 0 or self._followed > 0
 
@@ -367,7 +367,7 @@ class ObjectAim:
         track = self._track()
         if track is None:
             place = self._searched(job.quaternion)
-            # The weights refer to the boresight, so that rotations of the boresight are not cheap.
+            # The cost weights refer to the boresight, because its direction matters more than the roll angle.
             weights = replace(job.weights, roll=ROLL, axis=boresight)
             return replace(
                 job, axes=axes, weights=weights, slew=None, sight=ObjectDirection(place, np.zeros(3), 0.0)
@@ -406,11 +406,11 @@ class ObjectAim:
         self._escapes = bool(len(outside))
 
     def _track(self) -> Track | None:
-        """Return the followed track, or None if it has ended or none is followed."""
+        """Return the track that is followed, or None if no track is followed or the track has ended."""
         return next((track for track in self._tracks if track.number == self._followed > 0), None)
 
     def _searched(self, quaternion: FloatArray) -> FloatArray:
-        """Return the search direction (3,): the commanded one, or the camera's when the search began."""
+        """Return the commanded search direction (3,), or that of the camera when the search began."""
         if self._place is None:
             assert self._target is not None
             assert self._sensor is not None

@@ -156,7 +156,7 @@ class Filing:
     def select(self, use: UseFile, done: Report, then: Callable[[], str]) -> list[Report]:
         """Check and select a received file in steps, and report `done` if the function `then` succeeds.
 
-        The function `then` returns its problem, or an empty text. Returns the reports due now.
+        The function `then` returns the reason for a failure, or an empty text. Returns the reports due now.
         """
         try:
             path = self._received(use.name)

@@ -322,7 +322,7 @@ class TcpLine:
             self._connections[connection] = _Connection(self._framing.stream())
 
     def _make_room(self, trusted: bool, most: int) -> None:
-        """Drop the oldest connection of one kind if there are `most` of this kind."""
+        """Drop the oldest connection of a kind (`trusted` or not) if there are `most` of this kind."""
         same = [one for one, state in self._connections.items() if state.trusted == trusted]
         if len(same) >= most:
             self._drop(same[0])
@@ -363,7 +363,7 @@ class TncLine:
         return [(frame, None) for frame in self._stream.add(data)]
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Do nothing, because a TNC has only one other end."""
+        """Do nothing, because all telemetry is sent to the TNC."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
         """Send frames in KISS frames. Frames are discarded without a connection, or if the TNC is slow."""
@@ -415,7 +415,7 @@ class SerialLine:
         return [(frame, None) for _, data in pieces for frame in self._stream.add(data)]
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Do nothing, because a serial line has only one other end."""
+        """Do nothing, because all telemetry is sent to the serial line."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
         """Send frames. Frames are discarded while the port is lost."""
@@ -470,8 +470,9 @@ class StationSettings:
         spacecraft: spacecraft identifier in all frames.
         frame_bytes: length of a telemetry frame, bytes.
         rate: data rate of the telemetry, bytes/s.
-        command_loss: time without an authentic frame after which the board suspects itself, s; 0 for none.
-        renewal: status file of the privileged part of the renewal.
+        command_loss: time without an authentic frame after which the board returns to an earlier version, s;
+            0 for never.
+        renewal: status file that `deploy/renewal.py` writes.
         idle_rate: data rate (bytes/s) up to which frames of idle data are sent.
         encrypted: whether telemetry is encrypted. It is always authenticated.
         codes: codes of the lines, which count the corrected errors.
@@ -680,7 +681,7 @@ class Station:
         self._report(*reports)
 
     def _executed(self, directive: Directive, done: Report) -> list[Report]:
-        """Execute a directive and return the reports due now. The report `done` is sent at its completion."""
+        """Execute a directive and return the reports due now; `done` is the report at its completion."""
         match directive:
             case Play():
                 return self._playback.begin(directive, done)
