@@ -1,4 +1,4 @@
-"""Inertia tensors of rigid bodies: their principal axes, whether a body can have them, and that of a box."""
+"""Inertia tensors of rigid bodies: principal axes, physical validity, and the inertia tensor of a box."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def principal_axes(inertia: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def inertia_problem(inertia: FloatArray) -> str:
-    """Return why no body has the inertia tensor (3, 3), kg m^2, and the remedy; an empty text if one has."""
+    """Return why no body can have an inertia tensor (3, 3), kg m^2, with the remedy, or an empty text."""
     scale = float(np.abs(inertia).max())
     for row, column in ((0, 1), (0, 2), (1, 2)):
         above, below = float(inertia[row, column]), float(inertia[column, row])

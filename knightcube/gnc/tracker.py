@@ -337,7 +337,7 @@ class ObjectTracker:
             replace(track, line=predict(track.line, frame.time_ns, motion, tide), frames=track.frames + 1)
             for track in self._tracks
         ]
-        # From here on, the covariances of the sighted directions include the attitude error.
+        # After this line, the covariances of the sighted directions include the attitude error.
         crosses = cross_matrices(frame.directions)
         spread = np.asarray(
             frame.covariance + crosses @ frame.attitude @ crosses.transpose(0, 2, 1), dtype=float

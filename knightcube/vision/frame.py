@@ -8,7 +8,7 @@ wide.
 
 A hot pixel is a bright pixel with dark neighbours, which no optics can produce. If a star's image has a
 standard deviation of more than 0.5 px, the four neighbours of its brightest pixel have at least 15 % of the
-intensity of that pixel. Methods that need an image without gaps replace hot pixels, but only those that are
+intensity of that pixel. Methods that need an image without gaps replace only those hot pixels that are
 detected with certainty. A fit to pixels excludes hot pixels, which does little harm if a pixel of a star is
 excluded by mistake.
 
@@ -232,7 +232,7 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
 def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> FloatArray:
     """Return the ends (2, 2), px, of the uniform line with a given `centre` (2,) and `covariance` (2, 2).
 
-    Both ends equal the centre if the line is not longer than `least_length` px. The second moments
+    If the line is not longer than `least_length` px, the centre is returned as both ends. The second moments
     `covariance` are in px^2.
     """
     (across, along), axes = np.linalg.eigh(covariance)
@@ -255,7 +255,7 @@ pixels, the second limit is the number of standard deviations by which noise may
 pixel.
 """
 _REPAIR_SIGMAS, _HOT_SIGMAS = 10.0, 8.0
-"""Minimum brightness (standard deviations) of hot pixels that are replaced, and of those excluded."""
+"""Minimum brightness (standard deviations) of hot pixels that are replaced, and of excluded hot pixels."""
 _AROUND = tuple((dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0))
 
 

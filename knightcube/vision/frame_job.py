@@ -1,8 +1,8 @@
 """Attitude and rate from one frame, by the decision tree of the vision worker and of `knightcube solve`.
 
 1. In flight, the motion over the exposure is estimated for every frame, because each frame reports a rate.
-   For any other image, the motion is only estimated if a fast survey of the bright areas shows streaks. If
-   the streaks give no attitude, as those of a fence or a striped wall, the points of the image are
+   For an image from a file, the motion is only estimated if a fast survey of the bright areas shows streaks.
+   If the streaks give no attitude, as those of a fence or a striped wall, the points of the image are
    identified.
 
 2. Stars that are points are searched near their predicted positions if there is a prior attitude. Without a
@@ -224,7 +224,7 @@ def solve_frame(
             frame does not show.
     """
     tracker = TrackerSettings(settings, scale)
-    # Only the positions of the stars are needed, so that a poorly determined rate is accepted as well.
+    # The attitude needs only the positions of the stars, so a poorly determined rate is accepted as well.
     estimator = replace(settings.likelihood, worst_uncertainty=math.inf, worst_shaking=math.inf)
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False

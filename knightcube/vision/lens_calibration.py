@@ -9,7 +9,7 @@ frames.
 The data may not determine all parameters. In a narrow field, a shift of the optical axis looks like a
 rotation of the camera, and a single frame hardly separates the two. Each parameter therefore has a prior
 around an ideal lens with the initial focal length, the optical axis in the image centre and no distortion.
-Parameters whose standard deviation exceeds half of that of the prior are listed in `undetermined`.
+Parameters whose standard deviation exceeds half the prior standard deviation are listed in `undetermined`.
 """
 
 from __future__ import annotations
@@ -611,8 +611,8 @@ class LensCalibration:
     Attributes:
         determined: lens, standard deviations, omitted terms and accuracy, or None if no image was solved.
         images: images in the given order, each with its solution or the reason for excluding it.
-        mirrored: whether the images show the mirrored sky. The lens is that of the given images, and the
-            solutions of the images are those of the images with left and right exchanged.
+        mirrored: whether the images show the mirrored sky. For mirrored images, `lens` describes the given
+            images, and the solutions refer to the images with left and right exchanged.
     """
 
     determined: DeterminedLens | None

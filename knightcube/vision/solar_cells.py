@@ -38,7 +38,7 @@ _SOFT = 0.05
 The smooth rise gives a nonzero slope if the Sun is normal to a face and adjacent faces have zero current.
 """
 _RARE = 3.09
-"""Number of standard deviations that one normal reading in a thousand exceeds."""
+"""Deviation, in standard deviations, that a normal variable exceeds with a probability of 1 in 1,000."""
 
 
 class CoarseSunStatus(Enum):
@@ -162,7 +162,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
             break
     left = readings - _sunlight(normals @ direction)[0]
     square, freedom = float(left @ information @ left), len(shares) - 2
-    # The limit of chi-square is the value that one reading in a thousand exceeds (Wilson and Hilferty 1931).
+    # The limit of chi-square is exceeded with a probability of 1 in 1,000 (Wilson and Hilferty 1931).
     ninth = 2.0 / (9.0 * freedom)
     if square > float(freedom * (1.0 - ninth + _RARE * np.sqrt(ninth)) ** 3):
         reason = f"no Sun direction explains the currents: chi-square {square:.0f} of {freedom}"

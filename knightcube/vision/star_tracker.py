@@ -61,8 +61,8 @@ class MatchedStars:
 class StarSolution:
     """The attitude of a camera from one image of the sky, or the reason why the image was not solved.
 
-    A solution is true (`if solution:`) if the image was solved. Otherwise angles, quaternion and covariance
-    are NaN, `stars` is empty, and `reason` says why.
+    A solution is true (`if solution:`) if the image was solved. If the image was not solved, angles,
+    quaternion and covariance are NaN, `stars` is empty, and `reason` says why.
 
     Attributes:
         status: outcome: "solved", "no-stars", "too-few-stars", "no-match" or "ambiguous".

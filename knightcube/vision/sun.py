@@ -2,12 +2,13 @@
 
     solution = find_sun(image, camera)
 
-Only every few rows of the image are read, and bright patches on these rows are candidates for the Sun. The
-rim of a bright patch is traced along spokes from its centre, and a circle on the sphere is fitted to the rim
-points. The centre of this circle is the centre of the Sun, even if the disc is saturated, has glare, or is
-truncated by the edge of the image. An initial circle is found by consensus among triples of rim points, and
-is then refined by geometric least squares (Gauss-Newton). Tukey's biweight of each point's distance from the
-circle (Huber 1981, Robust Statistics, chapter 7) excludes a cloud beside the disc or a hot pixel on the rim.
+Only every n-th row of the image is read (`stride`), and bright patches on the rows are candidates for the
+Sun. The rim of a bright patch is traced along spokes from its centre, and a circle on the sphere is fitted to
+the rim points. The centre of this circle is the centre of the Sun, even if the disc is saturated, has glare,
+or is truncated by the edge of the image. An initial circle is found by consensus among triples of rim points,
+and is then refined by geometric least squares (Gauss-Newton). Tukey's biweight of each point's distance from
+the circle (Huber 1981, Robust Statistics, chapter 7) excludes a cloud beside the disc or a hot pixel on the
+rim.
 
 The function `sun_of_cameras` reads the cameras in an order that depends on the coarse Sun direction from the
 solar strings (Meller et al., chapter 2). If no camera finds the Sun, the coarse direction is returned with
@@ -519,7 +520,7 @@ _SIGMAS = 3.0
 _RING = 12
 """Number of directions that are tested at each angular distance from the coarse Sun direction."""
 _CONTRADICTED = 5.0
-"""Largest distance between measured and coarse Sun direction, in standard deviations of the coarse one."""
+"""Largest distance of measured and coarse Sun direction, in standard deviations of the coarse direction."""
 _CUT = np.radians(0.05)
 """Systematic error per axis (rad) of a disc that the edge of the image truncates."""
 

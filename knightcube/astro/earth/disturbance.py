@@ -7,7 +7,7 @@ behind the Sun). Each torque by air or sunlight is the cross product c x d of a 
 vector d. The body vector c (N m) is constant: the force multiplied by the lever arm of the centre of
 pressure. The pressure vector d is the direction of the pressure in body axes, multiplied by relative strength
 and exposed area. The exposed areas are those of a homogeneous box with the moments of inertia of the body.
-All other disturbance torques are represented by a constant torque in body axes.
+Disturbance torques other than those by air and sunlight are represented by a constant torque in body axes.
 """
 
 from __future__ import annotations

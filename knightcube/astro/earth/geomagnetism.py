@@ -3,8 +3,8 @@
 The model of degree 12 (NOAA NCEI and British Geological Survey, The US/UK World Magnetic Model for 2025-2030,
 2025) is evaluated by pygeomag. WMM2025 describes the field of the Earth's core, without crust, ionosphere and
 ring current. The publishers state a model error of 89 to 141 nT per component on the ground. The model is
-valid from 2025 to 2030. Outside these years, the field is extrapolated with the constant secular variation of
-the model, with the additional standard deviation `extrapolation_sigma`.
+valid from 2025 to 2030. Outside the years of validity, the field is extrapolated with the constant secular
+variation of the model. The function `extrapolation_sigma` returns the additional standard deviation.
 """
 
 from __future__ import annotations

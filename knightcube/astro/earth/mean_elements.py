@@ -1,9 +1,9 @@
 """Two-line elements that fit measured positions and velocities, by least squares with SGP4.
 
 The fitted parameters are the mean motion, the eccentricity vector, the inclination, the node and the mean
-argument of latitude, which remain well defined for circular orbits. The drag term is zero. The fit
-begins with the first positions, and the span is extended step by step, so that no revolution is lost between
-distant positions. Positions whose residuals are far above the median are rejected.
+argument of latitude, which remain well defined for circular orbits. The drag term is zero. The fit begins
+with the first positions and is extended in time step by step, so that revolutions between distant positions
+are counted correctly. Positions whose residuals are far above the median are rejected.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _FIRST_SPAN, _GROWTH = 2_500.0, 3.0
 _VELOCITY_TIME = 100.0
 """Ratio (s) of the standard deviations of positions and velocities that is assumed in the fit."""
 _FAR, _NEAREST, _ROUNDS = 6.0, 300.0, 4
-"""Residuals, in medians and in m, beyond both of which a position is rejected, and maximum number of fits."""
+"""Two limits of a residual (relative to the median, and m) for rejection, and maximum number of fits."""
 _FIRST_ECCENTRICITY, _DIFFERENCE = 1e-3, 1e-6
 """Eccentricity of the first guess, and relative step of the numerical derivatives.
 
@@ -54,8 +54,8 @@ class FittedElements:
         lines: the two lines.
         residuals: (n,) distances of the positions from the elements, m.
         used: (n,) whether each position was used in the fit.
-        growth: standard deviation of the error along the track that builds up in a day, m. It follows from
-            the scatter of the residuals, without drag and other errors of the model.
+        growth: standard deviation of the error along the track that builds up in a day, m. The growth follows
+            from the scatter of the residuals and excludes drag and other model errors.
     """
 
     lines: tuple[str, str]
@@ -192,9 +192,9 @@ def _first_guess(positions: FloatArray) -> FloatArray:
 
 
 def _satellite(parameters: FloatArray, epoch: float) -> Satrec:
-    """Return the satellite of the six parameters at the Julian date `epoch`."""
+    """Return the SGP4 satellite with the six fitted parameters and the Julian date `epoch` as its epoch."""
     motion, along, across, inclination, node, argument = parameters.tolist()
-    if inclination < 0.0:  # the same plane, with the node on the other side
+    if inclination < 0.0:  # the same plane with a positive inclination
         inclination, node, argument = -inclination, node + math.pi, argument + math.pi
     along, across = along - 1.0, across - 1.0
     eccentricity, perigee = min(math.hypot(along, across), 0.95), math.atan2(across, along)

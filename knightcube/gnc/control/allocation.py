@@ -54,9 +54,9 @@ def allocate(
     Column k of `dipoles` (3, n) is the dipole moment of coil k per ampere, m^2. The current limits of the
     coils are `limits` (n,), A, and the mask `available` (n,) marks the coils that may be used. The mask
     `free` (3,) marks the axes about which the body can rotate; a suspension thread carries the torque about
-    the other axes. Of all currents that make the torque, those with the least heat in the resistances
-    `resistance` (n,), ohm, are chosen; equal resistances are the default. Raises FlightError for an input
-    that is not finite.
+    the other axes. Of all currents that make the torque, the currents with the least heat in the resistances
+    `resistance` (n,), ohm, are chosen. Without this argument, the resistances are equal. Raises FlightError
+    for an input that is not finite.
     """
     wanted = np.asarray(torque, dtype=np.float64)
     if not (np.isfinite(wanted).all() and np.isfinite(field).all()):

@@ -5,12 +5,12 @@ until the field of the coils has decayed, then to measure the field. The filter
 `knightcube.gnc.estimation.field_rate` uses the samples in these pauses to estimate all components of the body
 rate and the rotation of the field in inertial axes. A gyro sample gives the rate along the field at once. The
 momentum plan uses a predicted field. If the attitude is known, the field is predicted along the orbit.
-Otherwise the measured field is assumed to continue to rotate at the present rate. In contrast to B-dot
-control, a spin along the field is also removed, as soon as the field has rotated. The coils stay off until
-`TRUSTED` consecutive samples agree with the prediction of the filter and the standard deviation of the rate
-across the field is below `BOUNDED`. Until the coils are driven, samples outside the pauses are used as well.
-The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a restarted
-sensor may give only unusable fields.
+Without a known attitude, the measured field is assumed to continue to rotate at the present rate. In contrast
+to B-dot control, a spin along the field is also removed, as soon as the field has rotated. The coils stay off
+until `TRUSTED` consecutive samples agree with the prediction of the filter and the standard deviation of the
+rate across the field is below `BOUNDED`. Until the coils are driven, samples outside the pauses are used as
+well. The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a
+restarted sensor may give only unusable fields.
 
 The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
 momentum h obeys h' = m x B, with the dipole moment m and the field B but without inertia and attitude. By

@@ -136,7 +136,7 @@ def acceleration_slopes(
     """Return the derivatives (n, 3, 6) of angular accelerations by rotation and rate.
 
     The second and third results are the magnetic field and the position (n, 3) in body axes. The motion has
-    attitudes (n, 4) and rates (n, 3) rad/s; the other arguments have the same meaning as in `linearised`.
+    attitudes (n, 4) and rates (n, 3) rad/s. The remaining arguments are those of the function `linearised`.
     """
     turned, inverse = attitude_matrix(quaternion), np.linalg.inv(inertia)
     shown, up = (np.einsum("nij,nj->ni", turned, vectors) for vectors in (field, position))

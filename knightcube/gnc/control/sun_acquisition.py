@@ -136,9 +136,9 @@ class ResidualDipole:
 AGREES = 0.2
 """Largest relative difference between the fields of two pauses, after propagation by the body's rotation."""
 ROLL = 150.0
-"""Cost of torques about other axes relative to the cost of a torque about the Sun."""
+"""Cost of a torque normal to the Sun direction, relative to the cost of a torque about the Sun direction."""
 FASTEST, FASTEST_ACROSS = 0.0165, 0.010
-"""Total rate, and rate across the direction of the Sun (rad/s), above which the body is only damped. Both
+"""Total rate, and rate across the direction of the Sun (rad/s), above which the body is only damped. The two
 rate limits are below the rates at which the flight software starts detumbling."""
 FASTEST_ROLL = 0.0105
 """Roll rate (rad/s) about the Sun above which a torque about the Sun is no longer preferred."""
@@ -176,8 +176,8 @@ class SunAcquisitionSettings:
 class SunAcquisition:
     """The Sun acquisition law, with estimates of the Sun direction, field and residual dipole moment.
 
-    It accepts the readings of the inertial unit and the directions of the Sun in order of time, and returns
-    the dipole moment of each cycle.
+    The law accepts the readings of the inertial unit and the directions of the Sun in order of time, and
+    returns the dipole moment of each cycle.
     """
 
     def __init__(self, schedule: WindowSchedule, seeking: SunAcquisitionSettings) -> None:
@@ -210,7 +210,7 @@ class SunAcquisition:
         self._sun.measure(time_ns, sun)
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the dipole moment (3,), A m^2, that acts until the next command, if not the commanded one."""
+        """Set the actual dipole moment (3,), A m^2, until the next command, if not the commanded one."""
         self._acts = dipole
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:

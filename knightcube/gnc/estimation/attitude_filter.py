@@ -6,18 +6,18 @@ the filter continues without the late measurement (module `replay`). The rate fr
 mean rate during the exposure. The filter therefore keeps the attitude at the start of an exposure until the
 exposure ends. The filter can also estimate the age of the inertial unit's samples (module `mekf`). For a body
 that hangs on the testbed's thread, the filter uses only the component of each measurement about the thread.
-The torsion and the damping of the thread are known or estimated. They are distinguished from the estimated
-disturbance because their torques depend on the angle and the rate.
+The torsion and the damping of the thread are known or estimated. The filter can distinguish the thread's
+torques from the estimated disturbance, because these torques depend on the angle and the rate.
 
 The class `CommandCheck` checks with the gyro whether the coils carry the commanded currents. While a coil is
 broken, the model predicts an acceleration that does not occur. The innovations of the gyro then exceed their
-covariance within one to a few samples, which they do not in a healthy flight. From then on, the filter treats
-the coil currents as unknown and follows the gyro. The currents of the last half second are also treated as
-unknown. A change of the rate that is too large for any coil current is not evidence against the commands,
-because the gyro may be faulty. The commands are trusted again when the rate follows the commands. The model
-z = b + g c is fitted to the gyro samples z of the last second, where c is the change of the rate that the
-commands should cause. The response g must be determined well, be 1 within its uncertainty, and leave white
-residuals. The commands are therefore never trusted again while the coils are not driven. If the gyro is
+covariance within one to a few samples, which they do not in a healthy flight. After such innovations, the
+filter treats the coil currents as unknown and follows the gyro. The currents of the last half second are also
+treated as unknown. A change of the rate that is too large for any coil current is not evidence against the
+commands, because the gyro may be faulty. The commands are trusted again when the rate follows the commands.
+The model z = b + g c is fitted to the gyro samples z of the last second, where c is the change of the rate
+that the commands should cause. The response g must be determined well, be 1 within its uncertainty, and leave
+white residuals. The commands are therefore never trusted again while the coils are not driven. If the gyro is
 noisier than assumed, the check widens its limits and does not raise an alarm.
 """
 
@@ -139,7 +139,7 @@ class CommandCheck:
         """Return whether wrong coil currents together with the noise can explain the newest innovation."""
         assert newest.variance is not None
         gap = (newest.time_ns - self._departures[-1][0]) * 1e-9 if self._departures else _SHORTEST_GAP
-        # Below, `change` is the largest change of the rate (rad/s) that unknown currents can cause.
+        # The variable `change` is the largest change of the rate (rad/s) that unknown currents can cause.
         state, model, duration = newest.state, self._model, min(max(gap, _SHORTEST_GAP), _LONGEST_GAP)
         idle = model.body.linearise(state.quaternion, state.rate, state.parameters, model.commands.idle, 0.0)
         change = model.noise.unknown_current * np.abs(idle.by_current).sum(axis=1) * duration
@@ -463,8 +463,8 @@ class AttitudeFilter:
     def measure_late(self, late: Sequence[Measurement], applied: OnApplied) -> None:
         """Insert late measurements at their own times, some of them at each call of `catch_up`.
 
-        The estimate continues without the late measurements until all are inserted. Then the callback
-        `applied` receives, for each late measurement, whether the measurement passed the gate.
+        The estimate continues without the late measurements until all are inserted. At the end of the replay,
+        the callback `applied` receives, for each late measurement, whether the measurement passed the gate.
         """
         self.catch_up()
         index = self._history.index_before(min(m.begin_ns for m in late)) if self._history else 0

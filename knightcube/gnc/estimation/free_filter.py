@@ -3,19 +3,20 @@
 A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
 gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. The
 module `attitude_filter` replays each late sample at its own time. Here, a late attitude is propagated to the
-present with the present rate, and its innovation includes the error of that rate. This approximation is
-accurate for some seconds, in which the rate of a body that is slow enough for star images is nearly constant.
+present with the present rate, and its innovation includes the error of that rate. The propagation with a
+constant rate is accurate for some seconds if the body rotates slowly enough for star images.
 
 Besides attitude and rate, the error state (`error_state`) holds the errors of the satellite's description in
 the following blocks.
 
 The block `inertia` holds the errors of the inertia tensor, relative to the trace. Euler's equation is linear
-in these errors. A tumble about more than one axis shows the ratios of the moments and the principal axes
-(Psiaki 2005, JGCD 28(4)). The common scale of the inertia is observable only against the dipole of the coils.
+in the errors of the inertia tensor. A tumble about more than one axis shows the ratios of the moments and the
+principal axes (Psiaki 2005, JGCD 28(4)). The common scale of the inertia is observable only against the
+dipole of the coils.
 
-The block `coils` is the matrix of gains and misalignments of the coils. This matrix times the commanded
-dipole is added to the commanded dipole. The blocks `gyro_matrix` and `field_matrix` hold scale factors and
-misalignments of gyro and magnetometer (Pittelkau 2001, JGCD 24(6)).
+The block `coils` is the matrix of gains and misalignments of the coils. The estimated dipole is the commanded
+dipole plus this matrix times the commanded dipole. The blocks `gyro_matrix` and `field_matrix` hold scale
+factors and misalignments of gyro and magnetometer (Pittelkau 2001, JGCD 24(6)).
 
 The block `camera` is the misalignment of the star camera. The attitude of the star camera is known more
 accurately than the attitude of the body, which has the uncertainty of this misalignment in addition. The
@@ -25,10 +26,10 @@ other horizon cameras are used, so this misalignment is a Gauss-Markov process w
 Further blocks are the biases of gyro and magnetometer, the residual dipole in shadow, its increase in
 sunlight, and the sizes of the disturbance torques of `knightcube.astro.earth.disturbance`.
 
-The block `field_error` is the error of the field model. This vector keeps its sign for minutes, and is
-modelled as a Gauss-Markov process of first order in body axes. While the attitude is known accurately, the
-standard deviation of the field model's error is estimated by expectation maximisation (Dempster, Laird &
-Rubin 1977), from the square and the variance of the estimated error.
+The block `field_error` is the error of the field model. The error of the field model keeps its sign for
+minutes, and is modelled as a Gauss-Markov process of first order in body axes. While the attitude is known
+accurately, the standard deviation of the field model's error is estimated by expectation maximisation
+(Dempster, Laird & Rubin 1977), from the square and the variance of the estimated error.
 """
 
 from __future__ import annotations
@@ -235,8 +236,8 @@ class FreeFilterSettings:
         magnet: standard deviation and random walk of the magnetometer bias, T.
         field: standard deviation of the field model's error before it is learned, T per axis.
         field_memory: correlation time of the field model's error, s.
-        torque: expected size and random walk of the torque by air, N m. The sizes of the other torques follow
-            from the ratios of this module.
+        torque: expected size and random walk of the torque by air, N m. The expected sizes of the torque by
+            sunlight and of the constant torque are fixed fractions of `torque`.
         torque_noise: density of the white noise of all other torques, N m sqrt(s).
         coil_error: relative error of the coils' dipole in any direction that lasts for tens of seconds, in
             addition to the constant matrix of the coils.
@@ -246,8 +247,8 @@ class FreeFilterSettings:
             temperature.
         inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular
             rate in rad/s. Flexible parts, which are not contained in Euler's equation of a rigid body, are
-            loaded only while the body rotates. This random walk is a lower limit of the inertia's
-            uncertainty.
+            loaded only while the body rotates. The random walk of the inertia keeps its uncertainty from
+            becoming too small.
         errors: largest errors of the description of body and sensors.
         coils: covariance (9, 9) of the coils' matrix, row by row, at the start; None for coils along the body
             axes, whose covariance follows from `errors`.
@@ -325,8 +326,8 @@ MINIMUM_FIELD_ERROR = 1e-8
 """Minimum standard deviation (T per axis) of the field model's error, which also represents slow variations
 of the magnetometer's errors."""
 CURRENTS = 1e-7
-"""Standard deviation (T per axis) of the magnetic field of auroral currents. It is added to the measurement
-noise, so that measurements in auroral zones are not rejected."""
+"""Standard deviation (T per axis) of the magnetic field of auroral currents. This deviation is added to the
+measurement noise, so that measurements in auroral zones pass the gate."""
 AIR_WALK = 6e-3
 """Random walk of the air density, relative to the density, per sqrt(s): 15 % in ten minutes."""
 _EYE: FloatArray = np.eye(3)
@@ -494,8 +495,8 @@ class FreeFilter:
     ) -> None:
         """Reset the learned matrix of the coils for one coil.
 
-        The estimate and its copies `memories` are changed. This is necessary after the sign or the gain of
-        the coil was corrected, because the learned matrix refers to the dipole before the correction. The
+        The estimate and its copies `memories` are changed. The reset is necessary after the sign or the gain
+        of the coil was corrected, because the learned matrix refers to the dipole before the correction. The
         error of the corrected dipole becomes zero, and its correlations with other states are deleted. The
         standard deviation of the corrected dipole becomes that of the settings, and along the coil at least
         `deviation`.
@@ -527,8 +528,8 @@ class FreeFilter:
     def renew_coils(self, covariance: FloatArray, memories: Sequence[FreeMemory] = ()) -> None:
         """Reset the learned matrix of the coils to the identity with a covariance (9, 9), row by row.
 
-        The estimate and its copies `memories` are changed. This is necessary for more than three coils when
-        coils are isolated or corrected, because the matrix depends on the allocation of currents.
+        The estimate and its copies `memories` are changed. The reset is necessary for more than three coils
+        when coils are isolated or corrected, because the matrix depends on the allocation of currents.
         """
         self.changes += 1
         estimated = self.layout.prior[COILS, COILS].any()
@@ -848,8 +849,8 @@ def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
 
     The array `inertia` (6,) holds the elements xx, yy, zz, yz, zx and xy, relative to the trace of the
     assumed inertia. The array `coils` (9,) holds the matrix of the coils row by row. The motion of a
-    satellite shows only these ratios, because a body with twice the inertia and twice the dipole moves in the
-    same way.
+    satellite shows only the ratios of inertia and dipole, because a body with twice the inertia and twice the
+    dipole moves in the same way.
     """
     trace = inertia[:3].sum()
     rows: FloatArray = np.eye(15) / trace

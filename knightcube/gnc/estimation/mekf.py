@@ -10,7 +10,7 @@ The filter estimates the age that the inertial unit's samples have at their time
 than its time stamp because of the serial line, a driver's buffer or the filters inside the unit. During its
 age, a sampled attitude changes by rate times age, and a sampled rate by acceleration times age. The
 innovations therefore depend on the age. Only attitude samples correct the estimated age. Rate samples do not
-correct it, because the acceleration is mostly caused by the coils, which respond to the noise of earlier
+correct the age, because the acceleration is mostly caused by the coils, which respond to the noise of earlier
 samples. An estimate of the age from rate samples would be an identification in closed loop and would drift
 with the noise while the attitude is held. A rate sample therefore treats the age as a considered parameter
 (Schmidt 1966): its variance and correlations enter the gains of all other states.
@@ -83,8 +83,8 @@ def rate_change(
     """Return the change of the rate at a sample from the model accelerations before and after the sample.
 
     The two accelerations apply one standard deviation of the age before and after the sample. The
-    accelerations differ if a coil command begins or ends in between. Half their difference is treated as
-    noise, and so is the product of the errors of age and acceleration.
+    accelerations differ if a coil command begins or ends in between. Half the difference of the accelerations
+    and the product of the errors of age and acceleration are treated as noise.
     """
     pairs = zip(before.acceleration, after.acceleration, disturbance, strict=True)
     x, y, z = (0.5 * (a + b) + d for a, b, d in pairs)

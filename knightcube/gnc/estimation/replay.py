@@ -92,8 +92,9 @@ class CommandHistory:
 _RATE_ONLY = {size: chi_square.bound(0.025, size) for size in (1, 3)}
 """Normalised squared innovation above which a gyro sample corrects only the rate, by the number of axes.
 Normally a gyro sample also corrects angle, disturbance and coil gain, by their correlations with the rate.
-Before a broken coil is detected these corrections are wrong: the angle error reached 40 sigma while the rate
-was right. In a consistent filter one gyro sample in forty exceeds this limit."""
+Before a broken coil is detected, the correlations with the rate give wrong corrections. The angle error
+reached 40 sigma while the rate was right. In a consistent filter, one gyro sample in forty exceeds this limit
+of the squared innovation."""
 
 
 @dataclass(slots=True, eq=False)
@@ -265,7 +266,7 @@ class CheckpointHistory:
 
     @property
     def newest(self) -> Checkpoint:
-        """The newest checkpoint. Raises IndexError if there is none."""
+        """The newest checkpoint. Raises IndexError if the history is empty."""
         return self._checkpoints[-1]
 
     @property

@@ -11,7 +11,7 @@ Accelerations that the model does not contain are random walks.
 Without torque the angular acceleration is a quadratic form of the rate, w' = Q p(w), where p are the six
 products of the rate's components. Errors of the inertia tensor, and of the gyro's scale and alignment, only
 change the coefficients Q. A fit with the changes of Q as nuisance parameters is therefore insensitive to
-these errors (Psiaki 2005, JGCD 28(4), and Pittelkau 2001, JGCD 24(6)).
+errors of inertia and gyro (Psiaki 2005, JGCD 28(4), and Pittelkau 2001, JGCD 24(6)).
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Torquing:
 class Accelerated(NamedTuple):
     """Angular acceleration w' (rad/s^2) and its derivatives (3, 3).
 
-    The derivatives are those with respect to torsion, damping and coil gain.
+    The derivatives are by torsion, damping and coil gain.
     """
 
     acceleration: Vector
@@ -302,7 +302,7 @@ _NEGLIGIBLE = 1e-6
 class BodyErrors:
     """Largest errors of the description of a body and its devices.
 
-    Random errors are drawn uniformly up to these values.
+    Random errors are uniformly distributed between minus and plus the largest errors.
 
     Attributes:
         moments: largest relative error of the principal moments of inertia.
@@ -340,8 +340,8 @@ def gyroscopic_coefficients(inertia: FloatArray) -> FloatArray:
 def coefficient_modes(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
     """Return the principal components (k, 3, 6) of Q over random bodies near an assumed `inertia` (3, 3).
 
-    The error of Q is a sum of these components with independent weights of variance 1. Random tensors that
-    violate the triangle inequality are omitted. The random bodies are drawn with a fixed seed.
+    The error of Q is a sum of the principal components with independent weights of variance 1. Random tensors
+    that violate the triangle inequality are omitted. The random bodies are drawn with a fixed seed.
     """
     generator = np.random.default_rng(0)
     tensors = _random_tensors(inertia, errors, generator)

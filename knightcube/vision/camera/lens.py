@@ -273,7 +273,7 @@ def _reach(k1: float, k2: float) -> float:
     discriminant = 9.0 * k1 * k1 - 20.0 * k2
     if discriminant < 0.0 or (k1 >= 0.0 and k2 >= 0.0):
         return np.inf
-    # This form of the quadratic's smaller positive root r^2 avoids cancellation; for k2 = 0 it is -1/(3 k1).
+    # This formula for the smaller positive root r^2 avoids cancellation and also holds for k2 = 0.
     denominator = -3.0 * k1 + np.sqrt(discriminant)
     return float(np.sqrt(2.0 / denominator)) if denominator > _NO_FOLD else np.inf
 

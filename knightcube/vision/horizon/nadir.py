@@ -149,7 +149,7 @@ _MOST_ALTITUDE = 3.0
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
 """Thresholds of three tests that a horizon must pass.
 
-These thresholds are the largest fraction of bright samples in the sky and on the night side, the minimum
+The thresholds are the largest fraction of bright samples in the sky and on the night side, the minimum
 coverage of the sunlit limb by edges, and the largest fraction of limb points on the night side.
 """
 _RIVAL = 0.3
@@ -390,7 +390,7 @@ _IMPROBABLE = 1e-6
 _COMMON = 2.0
 """Factor by which the variance of the difference of two nadirs may exceed the sum of their variances.
 
-This factor is above 1, because an unknown height of the air displaces the nadirs from opposite limbs in
+The factor is above 1, because an unknown height of the air displaces the nadirs from opposite limbs in
 opposite directions.
 """
 _UNKNOWN_TURN = 1.0

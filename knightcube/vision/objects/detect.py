@@ -588,7 +588,7 @@ def detect_objects(
     objects = () if report is None else report.objects
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
-    # A pixel subtends the largest angle on the boresight, and this angle is used for all directions.
+    # The angle that a pixel subtends on the boresight, the largest angle, is used for all directions.
     sigma = settings.streak_sigma / camera.focal_length
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     reason = f"fewer than {ends.least_streaks} significant streaks" if report is None else ""

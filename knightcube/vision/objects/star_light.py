@@ -9,7 +9,7 @@ the boresight. The brightnesses of stars and object are fitted by non-negative l
 streaks overlap or touch, and a segment of a faint star's streak, are explained by stars. Light that is not on
 the path of any star, or that ends where a star would continue, is not explained by stars.
 
-A star's streak has the same brightness from end to end. Therefore the brightness of a star is at most the
+A star's streak has the same brightness from end to end. The brightness of a star is therefore at most the
 minimum brightness of the image along the star's path. An erosion of the image, with the path as structuring
 element, gives the minimum brightness along the path for every position of the star. Objects that cross the
 streaks of stars, and points on these streaks, nearly vanish in the eroded image. The stars of a region are

@@ -62,7 +62,7 @@ _INSTANTS = 9
 _ROOM = 1.7
 # Largest chi-square of the rate difference of first and second fit (false alarm in 1 of 100,000 frames).
 _ONE_MOTION = 25.9
-# Standard deviation (px) added to that of the fitted attitude when the stars are identified again.
+# Additional standard deviation (px) of the fitted attitude when the stars are identified again.
 _PRIOR_PX = 1.0
 
 

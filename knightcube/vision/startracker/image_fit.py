@@ -265,8 +265,8 @@ class _Seen:
 def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tuple[_FittedPose, BoolArray]:
     """Return the fit to the stars that agree with each other, and a mask of these stars (n,).
 
-    An outlier affects the residuals of all stars in the fit. Therefore the influence of outliers is bounded
-    before the scatter of the residuals is computed.
+    An outlier affects the residuals of all stars in the fit. The influence of outliers is bounded before the
+    scatter of the residuals is computed.
     """
     for _ in range(_HUBER_ROUNDS):
         pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))

@@ -149,8 +149,8 @@ class ScaleSteps:
         """Return steps of a field's range of scales, within each of which side ratios vary by `tolerance`.
 
         At a field angle of tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2
-        / 2 across the radius. Therefore the ratio of two sides of a triangle at this field angle varies by
-        t^2 / 2. The steps are computed for the field angle half-way to the corner of the field.
+        / 2 across the radius. The ratio of two sides of a triangle at the field angle of tangent t therefore
+        varies by t^2 / 2. The steps are computed for the field angle half-way to the corner of the field.
         """
         lowest, highest = field.scale
         half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)

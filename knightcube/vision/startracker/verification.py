@@ -165,7 +165,7 @@ class _Matching:
 # Fraction of bright expected stars that match, below which the distortion of the lens is also fitted.
 _FEW_MISSED = 0.8
 # Maximum fraction of bright expected stars that have an unmatched star nearby instead of a match.
-# The second number is the radius within which stars are nearby, relative to the image corner's tangent.
+# The second value is the radius of the search for nearby stars, relative to the image corner's tangent.
 # A larger fraction of displaced stars indicates a wrong lens fit, because a foreground only hides stars.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
 # Log10 of the factor on the limit of chance matches above which a candidate is rejected at once.

@@ -351,7 +351,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     height = np.bincount(owner, light * z, n) / flux
     speed = np.linalg.norm(image_flow(pinhole, regions.centre) @ axis, axis=-1)
     low, high = _outermost(azimuth, owner, n)
-    # The brightness variance along a uniform arc is its squared length / 12 plus that of the point spread.
+    # The brightness variance along a uniform arc is length^2 / 12 plus the variance of the point spread.
     width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
     return AxisGuess(
         agree,

@@ -30,8 +30,8 @@ _TINY = 1e-12
 class DistortedPinhole(Pinhole):
     """A pinhole camera with small calibration errors: image centre, focal length and cubic distortion.
 
-    The inherited projections are those of the ideal pinhole; only the functions `paths` and `positions` apply
-    the distortion.
+    The inherited methods project without distortion. Only the functions `paths` and `positions` apply the
+    distortion.
 
     Attributes:
         shift: displacement (x, y) of the image centre, px.

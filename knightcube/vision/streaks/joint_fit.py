@@ -53,7 +53,7 @@ from knightcube.vision.streaks.normal_equations import (
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
 # Number of processed pixels per frame after which no further motion is fitted.
-# A fit in progress is always completed, so that the work on a frame may reach twice this limit.
+# A fit in progress is always completed, so that the work on a frame may be twice the limit.
 _MOST_WORK = 1_600_000
 # Fixed overhead of one evaluation of the model, expressed as a number of processed pixels.
 _EVALUATION = 15_000
@@ -85,8 +85,8 @@ class WorkBudget:
 _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
-# First displacement (px) of a star without effect on the motion above which pixels are selected again. Later
-# iterations ignore the often poorly known displacements of stars without effect on the motion.
+# First displacement (px) of a star without effect on the motion above which pixels are selected again.
+# Later iterations ignore the often poorly known displacements of stars without effect on the motion.
 _FAINT_DRIFT = 3.2
 # Change of the acceleration, relative to the rotation, after which the fit's pixels are reselected.
 _GROWN = 0.1
@@ -471,7 +471,7 @@ _LEAST_STREAKS = 3
 _LEAST_OFF = 4.0
 # Largest difference (px) between the length errors of streaks that agree with each other.
 _ALIKE = 3.0
-# Minimum ratio of the number of streaks with a wrong length to that of streaks with the correct length.
+# Minimum ratio of the number of streaks with a wrong length to the number with the correct length.
 _MORE = 2
 # Largest relative change of the rate at which the rotation angle is corrected.
 _MOST_STRETCHED_CHANGE = 0.5

@@ -834,8 +834,8 @@ def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | N
 def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float) -> BoolArray:
     """Return which stars' estimates lie within `sigmas` standard deviations of the weighted median, (n,).
 
-    A star is accepted only if its estimates of all k parameters lie within this limit. The model errors
-    `floors` (k,) are added in quadrature to the standard deviations.
+    A star is accepted only if its estimates of all k parameters lie within `sigmas` standard deviations. The
+    model errors `floors` (k,) are added in quadrature to the standard deviations.
     """
     agree = np.ones(len(estimates.change), dtype=np.bool_)
     for change, deviation, floor in zip(estimates.change.T, estimates.deviation.T, floors, strict=True):

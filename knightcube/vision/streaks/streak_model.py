@@ -281,8 +281,9 @@ def path_distances(
     """Return distances (px) across and along the path of `count` pixels on each of l lines, (count, b, l).
 
     The first pixel of each line (`corner`) and the step to the next pixel (`step`) are those of `Strips`;
-    `position` and `tangent` (b, l, 2) are those of the path where it crosses each line of pixels. The index
-    of a pixel within its line is the first array axis, so that operations run along contiguous memory.
+    `position` and `tangent` (b, l, 2) are the position and unit tangent at which the path crosses each line
+    of pixels. The index of a pixel within its line is the first array axis, so that operations run along
+    contiguous memory.
     """
     offset = np.arange(count, dtype=np.float32)[:, None, None]
     dx, dy = corner[..., 0] - position[..., 0], corner[..., 1] - position[..., 1]
@@ -578,7 +579,7 @@ def _ends(
         bell *= before
         out[near, image] = bell
         out[near, 0] = before * ndtr(u)
-        # The intensity at the end of a streak differs from that of its block of pixels if the speed changes.
+        # If the speed changes, the intensity at a streak's end differs from that at the centre of the block.
         thinning = gained[near] / speed[near] ** 2
         out[near, 0] -= _wide(sign * width**2 * thinning) * bell
         bell *= u

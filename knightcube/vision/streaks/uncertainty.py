@@ -1,10 +1,10 @@
 """Covariance of the fitted rotation, including errors that the model does not describe.
 
 Photon noise gives a lower limit of the covariance. The covariance is increased by the scatter of the stars
-beyond their noise, and by those calibration errors of the camera that the stars do not determine. Two errors
-affect all stars equally and cause no scatter: a point spread with an unexpected width or shape, which moves
-the ends of all streaks, and vibration of the body. The residuals at the streak ends and along the streaks
-limit the errors from point spread and vibration.
+beyond their noise, and by calibration errors of the camera that the stars do not determine. Two errors affect
+all stars equally and cause no scatter: a point spread with an unexpected width or shape, which moves the ends
+of all streaks, and vibration of the body. The residuals at the streak ends and along the streaks limit the
+errors from point spread and vibration.
 """
 
 from __future__ import annotations
@@ -227,8 +227,8 @@ def correct(
 def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:
     """Return the covariance (k, k) due to calibration errors that have the information matrix `left` (m, m).
 
-    Each correction is assumed to be uncertain by its own size, because large displacements of streaks are
-    underestimated.
+    Each correction is assumed to have a standard deviation of its own size, because large displacements of
+    streaks are underestimated.
     """
     change = leading @ error
     return np.asarray(leading @ np.linalg.inv(left) @ leading.T + np.outer(change, change))

@@ -132,8 +132,8 @@ class HorizonSearch:
         The derivative of the minimum energy by the horizon equals the partial derivative at the optimal path
         (envelope theorem). A tried horizon is a lower bound of the optimum if a longer horizon reduces the
         total cost, otherwise an upper bound. The next horizon T is chosen as if the energy were proportional
-        to 1/T^3, which holds for a slew without limits. Only the last solution imposes the limits of current
-        and angle.
+        to 1/T^3, which holds for a slew without limits. Only the last of the solved programs imposes the
+        limits of current and angle.
         """
         low, high, time = shortest, longest, min(max(guess, shortest), longest)
         time_cost = min(time_cost, SHORTEST_COST * self.program_at(time).bang_power)
@@ -373,7 +373,7 @@ def plan(
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
-    """Return the difference (N,) on the nodes between the remainder of `last` and the remainder's prey path.
+    """Return the difference (N,), on the nodes, between the rest of the path `last` and its prey path.
 
     None without a rest.
 

@@ -321,7 +321,7 @@ class SlewPath:
         return float(np.diff(self.times) @ mean_squares(self.dipole, heat_matrix(weights)))
 
     def since(self, time: float, nodes: int) -> SlewPath:
-        """Return the rest of the path from a time (s) before its end on, with times from zero on."""
+        """Return the part of the path after a time (s), with that time as the new time zero."""
         times = np.linspace(0.0, self.horizon - time, 2 * nodes + 1)
         found = self.references(np.minimum(time + times, self.horizon))
         dipole = self.dipoles(np.minimum(time + times, self.horizon))
@@ -550,8 +550,8 @@ class SlewTask:
         end: end conditions as a function of the slew's duration.
         horizon, longest: requested and longest permitted duration, s. The slew is stretched if no path of the
             requested duration is found.
-        time_cost: weight of the duration in the cost, W. None keeps the duration, and MINIMUM_TIME minimises
-            the duration only.
+        time_cost: weight of the duration in the cost, W. With None the duration is fixed, and with
+            MINIMUM_TIME only the duration is minimised.
         cones: exclusion cones that are avoided during the whole slew.
         nodes: number of collocation intervals.
     """

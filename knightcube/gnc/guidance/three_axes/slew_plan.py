@@ -269,8 +269,8 @@ def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
 def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
     """Return the violations (cones, 2 nodes), rad, of the margins to the cones between neighbouring points.
 
-    The required margin is `_ROOM`, or the angle between cone and path at the start or at the end if this
-    angle is smaller.
+    The required margin is `_ROOM`, but at most the angle between cone and path at the start and at the end of
+    the path.
     """
     clear = _clearances(task, path)
     room = np.clip(np.minimum(clear[:, :1], clear[:, -1:]), 0.0, _ROOM)
@@ -468,7 +468,7 @@ def plan_slew(
         goal: pointing target at the end; with a free roll, only the direction of the target counts.
         duration: requested duration of the slew, s.
         longest: longest duration to which the slew may be stretched if no slew of `duration` is found, s.
-            None stands for three times `duration`.
+            The default is three times `duration`.
         window: length of the time interval in which the slew may begin, s. The start time of minimum energy
             is chosen.
         time_cost: weight of the slew duration in the cost, W. If `time_cost` is given, the slew minimises

@@ -1,12 +1,12 @@
 """The search for the path of a slew, from guesses on a coarse grid to a path on a fine grid.
 
 An initial guess is a curve of the angular momentum over time. Coils cause no torque along the magnetic field,
-so the derivative of the inertial angular momentum is always normal to the field. This constraint on the
-torque is linear, so every momentum curve that reaches the end is the sum of a fixed curve and weighted modes.
-The attitude follows from the momentum by integration. A least-squares fit of about a dozen mode amplitudes
-finds curves that end at the target, stay outside the cones and need little heat. The fit of the mode
-amplitudes is started from many random amplitudes at once. Gravity gradient and other disturbance torques are
-neglected in the initial guesses. The random starts of the fit are the same in every call.
+so the derivative of the inertial angular momentum is always normal to the field. The condition that torque
+and field are normal is linear, so every momentum curve that reaches the end is the sum of a fixed curve and
+weighted modes. The attitude follows from the momentum by integration. A least-squares fit of about a dozen
+mode amplitudes finds curves that end at the target, stay outside the cones and need little heat. The fit of
+the mode amplitudes is started from many random amplitudes at once. Gravity gradient and other disturbance
+torques are neglected in the initial guesses. The random starts of the fit are the same in every call.
 
 Without the dipole limit, most guesses converge in a dozen Newton steps to a path outside the exclusion cones
 (a relaxed path). The heat of a relaxed path is a lower bound of the heat of a path within the dipole limit. A

@@ -203,7 +203,7 @@ def on_wings(peaks: Peaks) -> BoolArray:
     """Return which peaks (p,) may be local maxima on the wings of a brighter star."""
     x, y = peaks.place.T.astype(np.float32)
     square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
-    # Only peaks closer than 60 px are compared, because the wings fall to a millionth of the peak there.
+    # Only peaks closer than 60 px are compared, because at 60 px the wings are a millionth of the peak.
     lower, higher = np.nonzero(np.tri(len(x), k=-1, dtype=bool) & (square < _WINGS_END**2))
     # The wings of a saturated disc begin at the rim of the disc.
     apart = np.maximum(np.sqrt(square[lower, higher]) - peaks.core[higher], 0.0)
