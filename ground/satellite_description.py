@@ -131,8 +131,8 @@ def sun_synchronous_inclination(altitude: float, eccentricity: float) -> float |
 def largest_dipole(coils: tuple[Coil, ...]) -> float:
     """Return the dipole of coils in a typical direction, A m^2, or 0 if all coils have parallel axes.
 
-    It is the geometric mean of the singular values of the matrix of the dipoles at the current limits; for
-    three equal coils on three axes it is the dipole of one coil.
+    The result is the geometric mean of the singular values of the matrix of dipoles at the current limits.
+    For three equal coils on three axes, the result is the dipole of one coil.
     """
     dipoles = np.array([[component * coil.dipole for component in coil.axis] for coil in coils])
     values = np.linalg.svd(dipoles, compute_uv=False)

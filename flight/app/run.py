@@ -21,8 +21,8 @@ class RunRequest:
 
     The file `devices` belongs to a running server of simulated devices; without it, a server is started. The
     folder `archive` contains the runs of a board; its next run folder is then used instead of `out`. If
-    `accepted` is true, `config_path` is flown only if it is the accepted file, otherwise the last one that
-    flew. The simulated `faults` are injected in addition to those of the configuration
+    `accepted` is true and the file `config_path` is damaged, the last configuration that flew is flown
+    instead. The simulated `faults` are injected in addition to those of the configuration
     (`sim_hal.faults.schedule`).
     """
 
@@ -41,9 +41,9 @@ class RunRequest:
 class RunResult:
     """The result of a flight; `interrupted` states whether a signal ended the flight.
 
-    The state of the loop at its end is `ending`. The text `restart` states why the process should be
-    restarted; it is empty if no restart is needed. The text of each injected fault is in `faults`. `faults`
-    were injected.
+    The attribute `ending` is the state of the loop at the end of the flight. The text `restart` states why
+    the process should be restarted; it is empty if no restart is needed. The attribute `faults` contains the
+    text of each injected fault.
     """
 
     folder: Path
@@ -66,7 +66,7 @@ def utc_text() -> str:
 
 
 _NEWEST = 4
-"""Number of newest runs in which the number of the last boot is searched."""
+"""Number of newest runs whose folders are searched for the number of the last boot."""
 
 
 def default_folder(config_path: Path) -> Path:

@@ -586,7 +586,7 @@ class GainEquations(NamedTuple):
         covariance = np.linalg.inv(self.matrix + np.diag(weights))
         right = self.right + prior
         gains = covariance @ right
-        # The expected gains are 1 or -1, so that the weights are also the sum of their squares.
+        # The squares of the expected gains are 1, so the prior adds the sum of the weights.
         cost = self.constant + float(weights.sum() - right @ gains)
         return GainFit(gains, np.asarray(covariance.diagonal(), dtype=np.float64), cost)
 

@@ -66,7 +66,8 @@ class HorizonCameraTask:
         self._sequences = [-1] * len(cameras)
         self._errors = [""] * len(cameras)
         self._pictures = [b""] * len(cameras)
-        self._job: tuple[int, int, int] | None = None  # exposure (ns), camera bits, submission (ns)
+        # The job is described by time of exposure (ns), bit mask of cameras, and time of submission (ns).
+        self._job: tuple[int, int, int] | None = None
 
     def begin(self, time_ns: int) -> None:
         """Measure the ages of frames from `time_ns` on, when the first trigger is due."""

@@ -215,12 +215,12 @@ _NAMED_ELSEWHERE = {
     StreakStatus.SATURATED,
     StreakStatus.FROZEN,
 }
-"""Results without an event of their own, because the body is at rest or another event is reported."""
+"""Streak results that are not reported, because the body is at rest or another event is reported."""
 _NAN4, _NAN33 = np.full(4, np.nan), np.full((3, 3), np.nan)
 
 
 class FrameReport:
-    """Records frames. The attribute `accepted` counts the rates from streaks that the filter accepted."""
+    """Records results of frames. The attribute `accepted` counts accepted rates from streaks."""
 
     def __init__(self, measurer: FrameMeasurer, view: BodyView, services: Services) -> None:
         self._measurer = measurer

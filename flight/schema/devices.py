@@ -126,8 +126,8 @@ class Coils(Section, frozen=True, kw_only=True):
 
     The list `windings` has one entry per coil. A satellite has two to six coils. If the coils lie in a plane,
     the flight application treats the axis across the plane like that of a broken coil (`slots`). A dipole
-    moment along the magnetic field makes no torque, and is therefore added so that the missing coil needs no
-    current. More than three coils share a dipole moment so that they heat least.
+    moment along the magnetic field, which makes no torque, is added so that the missing coil needs no
+    current. More than three coils share a dipole moment so that their total heat is minimal.
     """
 
     bus: Bus = 1

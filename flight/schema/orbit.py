@@ -28,8 +28,8 @@ from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
 """Range of valid magnetometer readings, T.
 
-At a height of 200 km the field is up to 6.5e-5 T, and the coils may add as much. It is at least 7e-6 T up to
-a height of 2,840 km, the apogee of the highest orbit that is flown.
+At a height of 200 km the field is up to 6.5e-5 T, and the coils may add as much. The field is at least 7e-6 T
+up to a height of 2,840 km, the apogee of the highest orbit that is flown.
 """
 
 _FIELD = 3.3e-5
@@ -137,11 +137,11 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     The value `bias_walk` is the random walk of the gyro bias, rad/s per sqrt(s), and `field_noise` is the
     noise of a magnetometer sample, T per axis. The value `torque_start` is the expected size (N m) of the
     disturbance torques at an altitude of 500 km before they are estimated, and `torque_walk` their random
-    walk, N m per sqrt(s). Without these values, they are computed (`OrbitConfig.torque_sizes`). From one boot
-    to the next, the gyro bias may change by 10 deg/h, and the residual dipole by the fraction `changed` of
-    its initial standard deviation. The mapping `roles` gives blocks of the error state another role:
-    `estimated`, `considered` (the block is not corrected, but its uncertainty is part of every covariance) or
-    `fixed` (the block is known exactly).
+    walk, N m per sqrt(s). By default, `torque_start` and `torque_walk` are computed
+    (`OrbitConfig.torque_sizes`). From one boot to the next, the gyro bias may change by 10 deg/h, and the
+    residual dipole by the fraction `changed` of its initial standard deviation. The mapping `roles` sets the
+    role of blocks of the error state: `estimated`, `considered` (the block is not corrected, but its
+    uncertainty is part of every covariance) or `fixed` (the block is known exactly).
     """
 
     bias_walk: NotNegative = 2.0e-6
@@ -251,8 +251,8 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def torque_noise(self) -> float:
         """Return the noise of unmodelled torques in detumbling, rad/s per sqrt(s).
 
-        Unless it is configured, it is a tenth of the root mean square of the angular accelerations that the
-        mean dipole limit causes about the three principal axes in a typical field.
+        The default is a tenth of the root mean square of the angular accelerations that the mean dipole limit
+        causes about the three principal axes in a typical field.
         """
         if self.detumble.torque_noise is not None:
             return self.detumble.torque_noise
@@ -263,9 +263,9 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def dipole_errors(self) -> tuple[float, float]:
         """Return the largest errors (A m^2, each axis) of the residual dipole and its increase in sunlight.
 
-        Unless it is configured, the error of the residual dipole in shadow is that of a satellite with some
-        magnetic cleanliness, in proportion to its mass. Without a mass, that of a homogeneous box with the
-        configured moments of inertia is used. The increase in sunlight is three tenths of this value.
+        The default error of the residual dipole in shadow is proportional to the mass, as for a satellite
+        with some magnetic cleanliness. A missing mass is computed from the moments of inertia of a
+        homogeneous box. The error of the increase in sunlight is three tenths of the default error in shadow.
         """
         craft = self.craft
         mass = craft.mass
@@ -277,9 +277,9 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def torque_sizes(self) -> tuple[float, float]:
         """Return size (N m) and random walk (N m per sqrt(s)) of the disturbance torques at 500 km.
 
-        Unless it is configured, the size is that of drag and sunlight on the largest face, with the lever arm
-        of the described and the unknown offset of the centre of mass. The random walk is then the size times
-        2e-3 per sqrt(s), because plans extrapolate an estimated torque along the field for an hour.
+        The default size is that of drag and sunlight on the largest face, with the sum of the described and
+        the unknown offset of the centre of mass as lever arm. The default random walk is the size times 2e-3
+        per sqrt(s), because plans extrapolate an estimated torque along the field for an hour.
         """
         craft, section = self.craft, self.estimation
         x, y, z = craft.size
@@ -302,8 +302,8 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def slew_duration(self) -> float:
         """Return the requested duration of a slew to a distant target, s.
 
-        Unless it is configured, it is sixteen times the square root of the largest moment of inertia divided
-        by the torque of the mean dipole limit in a typical field.
+        The default is sixteen times the square root of the largest moment of inertia divided by the torque of
+        the mean dipole limit in a typical field, limited to 60 s to 1500 s.
         """
         if self.pointing.slew is not None:
             return self.pointing.slew
@@ -313,7 +313,7 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
 
 
 def _two_digits(value: float) -> float:
-    """Return a value rounded to two significant digits, because it is known to no more."""
+    """Return a value rounded to two significant digits."""
     return float(f"{value:.1e}")
 
 

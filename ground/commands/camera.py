@@ -33,7 +33,7 @@ _PATIENCE_NS = 10_000_000_000
 _MAX_ROTATION = 0.5
 """Largest rotation (rad) in one exposure, beyond which streaks leave any field of view."""
 _MAX_EXPOSURES = 8
-"""Number of exposure times to wait, because a free-running camera delivers its next complete frame."""
+"""Maximum time to wait for a frame, in exposure times (a free-running camera finishes other frames first)."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

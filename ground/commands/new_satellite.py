@@ -128,7 +128,7 @@ def _written(answers: Answers, force: bool) -> tuple[dict[str, Any], str]:
 
 
 class Answers:
-    """The values of the satellite's description, and the texts by which the user gave them."""
+    """The values of the satellite's description, and the texts that the user entered for them."""
 
     def __init__(self, out: Path | None, force: bool) -> None:
         """`out` is the file to write, if it is given; `force` states whether it may be replaced."""

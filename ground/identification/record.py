@@ -63,7 +63,7 @@ class Record:
         current: currents (m,) in the coil on body x, A.
         clipped: whether (m,) a current is at the coil's limit and may differ from the commanded one.
         period: control period, s.
-        field: measured field; None if the coils were never off.
+        field: measured magnetic field, or None if the coils were never off.
     """
 
     time: FloatArray
@@ -161,7 +161,8 @@ def _currents(
     requested, written = (
         control[name][:, 0].astype(float) for name in ("current_command", "current_written")
     )
-    late = np.append(written[1:], written[-1])  # a driver with its own thread reports one cycle later
+    # A driver with its own thread reports each current one cycle late.
+    late = np.append(written[1:], written[-1])
     is_late = (np.abs(written - requested) > _RESOLUTION) & (np.abs(late - requested) <= _RESOLUTION)
     current = np.asarray(np.where(is_late, late, written))
     clipped = np.abs(current) > _AT_LIMIT * limit
@@ -178,7 +179,7 @@ def _field(
 ) -> HorizontalField | None:
     """Return the mean horizontal field over the samples with the coils off; y is along the thread."""
     on = np.flatnonzero(current)
-    since = np.full(len(switch_time), -np.inf)  # when a current last ended before each switch
+    since = np.full(len(switch_time), -np.inf)  # end of the last non-zero current
     if len(on):
         newest = np.searchsorted(on, np.arange(len(switch_time)), side="right") - 1
         ends = np.append(switch_time[1:], np.inf)

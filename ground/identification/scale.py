@@ -64,8 +64,8 @@ class PlantPrior:
 class ScaledValue:
     """An estimated value, its standard deviation, and the contribution of its own prior.
 
-    `own_prior` is the derivative of the value's logarithm by the logarithm of its prior, which is 1 if the
-    motion added no information. None if the value has no prior.
+    The attribute `own_prior` is the derivative of the value's logarithm by the logarithm of its prior, which
+    is 1 if the motion added no information. A value without a prior has the `own_prior` None.
     """
 
     value: float
@@ -162,7 +162,7 @@ def _field(prior: PlantPrior, measured: HorizontalField | None) -> PriorValue:
 
 
 def excitation_config(config: TestbedConfig, duration: float) -> TestbedConfig:
-    """Return `config` with `duration` s of the excitation instead of its steps, without camera and paths."""
+    """Return `config` for an identification flight: `duration` s of excitation, without camera and paths."""
     return configuration.replace(
         config,
         name=f"identify {config.name}"[:64],

@@ -597,7 +597,7 @@ class Vn100Emulator:
         self._build_streams(now_ns)
 
     def save_foreign_output(self, packet: bytes, divisor: int, now_ns: int) -> None:
-        """Have the flash hold an output of packets that only other firmware sends, and restart from it.
+        """Store an output that only other firmware has in flash, and restart the unit from flash.
 
         The unit sends `packet` every `divisor` ticks of 1/800 s, also after later restarts.
         """

@@ -59,7 +59,7 @@ def _fault(
 
 
 def _chance(default: float) -> Parameter:
-    return Parameter(default, 1e-6, 1.0)  # above 0, because a probability of 0 would have no effect
+    return Parameter(default, 1e-6, 1.0)  # the minimum is above 0, because 0 would have no effect
 
 
 def _delay(default: float) -> Parameter:

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from typing import Any
 
 _ANSWER_S, _FIRST_ANSWER_S, _FIRST_S = 0.1, 5.0, 2.0
-"""Timeouts (s) of an answer, later and at first, and time (s) for which the first timeout holds."""
+"""Usual timeout (s) of an answer, initial timeout (s), and time (s) for which the initial timeout is used."""
 
 
 def pack(message: Any) -> bytes:

@@ -248,12 +248,12 @@ def _turns(quaternions: FloatArray) -> FloatArray:
 
 
 FAINT_SHARE = 0.25
-"""Largest charge (e-) of a pixel that counts as faint, as a fraction of the variance of the background."""
+"""Largest charge of a faint pixel (e-), divided by the variance of the background noise (e-^2)."""
 GREATEST_SKEWNESS = 0.05
 """Largest skewness at which noise is drawn as Gaussian, with an error of 0.004 by the Edgeworth series."""
 
 SLICES, OUTER_SLICES = 1 << 16, 64
-"""Number of equally probable slices of the normal distribution, and of outermost slices in each tail."""
+"""Number of equally probable slices of the normal distribution, and number of tail slices on each side."""
 
 
 def counts(

@@ -254,14 +254,14 @@ class TrueCraft:
 
 
 def coil_frames(dipoles: FloatArray) -> FloatArray:
-    """Return rotations (n, 3, 3) that turn the body axis x, y or z, in order of the coils, to each coil."""
+    """Return rotations (n, 3, 3) from body axis x, y or z (in cyclic order) to the axis of each coil."""
     frames = []
     for index, dipole in enumerate(dipoles.T):
         start, end = np.eye(3)[index % 3], dipole / np.linalg.norm(dipole)
         if float(start @ end) == 1.0:
             frames.append(np.eye(3))
             continue
-        # Two rotations by 180 deg, about an axis across the start and about the bisector of it and the end.
+        # Rotations by 180 deg about `start` and then about the bisector `middle` rotate `start` to `end`.
         middle = start + end
         across = np.eye(3)[(index + 1) % 3]
         if float(middle @ middle) < 1e-12:

@@ -200,7 +200,7 @@ class HorizonCameraFeed:
 
     @property
     def needed(self) -> bool:
-        """Whether horizon frames can improve the attitude. In eclipse they only serve a lost attitude."""
+        """Whether horizon frames can improve the attitude; in eclipse only a lost attitude."""
         if self._filter.worst_sigma <= NEEDED_SIGMA:
             return False
         around = self._environment.at(self._filter.measured_ns)
@@ -349,7 +349,7 @@ def _contradicts(sight: VectorObservation, turn: FloatArray, claim: FloatArray) 
 
 
 def _says_more(sight: VectorObservation, claim: FloatArray) -> bool:
-    """Return whether a direction is more accurate than an attitude of covariance `claim` about some axis."""
+    """Return whether a direction improves an attitude of covariance `claim` about at least one axis."""
     across = tangent_basis(sight.observed)
     rows = across @ np.cross(sight.observed, np.eye(3)).T
     known, own = rows @ claim @ rows.T, across @ sight.covariance @ across.T

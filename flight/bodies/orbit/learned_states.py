@@ -44,12 +44,12 @@ UNKNOWN_AGE = 86_400.0
 
 
 def _places(*parts: slice) -> IntArray:
-    """Return the indices, within the slow states, of parts of the filter's state."""
+    """Return the indices, counted within the slow states, of slices of the filter's state vector."""
     return np.asarray(np.concatenate([np.arange(part.start, part.stop) for part in parts]) - GYRO.start)
 
 
 _TORQUES = slice(TORQUES.start - GYRO.start, TORQUES.stop - GYRO.start)
-"""Indices of the sizes of the torques within the slow states."""
+"""Slice of the slow states that holds the sizes of the disturbance torques."""
 PARTS = {
     ERRORS: _places(GYRO, MAGNET, GYRO_MATRIX, FIELD_MATRIX, CAMERA),
     SOURCES: _places(DIPOLE, SUNLIT, TORQUES),
