@@ -197,7 +197,7 @@ def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArra
 def _at_unit_range(
     time_ns: int, position: FloatArray, velocity: FloatArray, covariance: FloatArray
 ) -> LineOfSightState:
-    """Return the line of sight from a state, whose parts are divided by the length of `position`."""
+    """Return the line of sight from a filter state, which is first divided by the length of `position`."""
     size = float(np.linalg.norm(position))
     direction, scaled = position / size, velocity / size
     jacobian = np.zeros((6, 6))

@@ -15,8 +15,8 @@ The methods are:
 
 - Triangles by area and polar moment: The area of an observed triangle and its propagated standard deviation
   define a range of areas in the table of guide star triangles (Michalski, sections 3.2.2 and 3.2.3, and Cole
-  & Crassidis 2004 and 2006). The triangles in this range of areas whose polar moment and side lengths match
-  are candidates. If several triangles match, the published methods pivot to a neighbouring triangle, while
+  & Crassidis 2004 and 2006). Triangles in the range of areas are candidates if their polar moments and side
+  lengths match too. If several triangles match, the published methods pivot to a neighbouring triangle, while
   this implementation tests all matching triangles.
 
 - Pyramid: The triangles are ordered so that no observed star occurs in many consecutive triangles, which

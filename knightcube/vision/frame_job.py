@@ -51,7 +51,7 @@ from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, S
 _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
 # Relative error of the assumed focal length above which the motion is fitted a second time.
 _SCALE_TOLERANCE = 0.01
-# Motion (px) of a star over the exposure below which it is measured as a point.
+# Motion (px) of a star over the exposure below which the star is measured as a point.
 _POINT_PX = 1.0
 # Predicted streak length (px) below which stars are measured as points if no motion can be fitted.
 # In a crowded sky, merged star images can look like streaks.

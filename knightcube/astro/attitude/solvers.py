@@ -200,8 +200,8 @@ def quest(profile: FloatArray) -> FloatArray:
 
     The matrix is M = l + t - S, with the largest eigenvalue l of K, the trace t of B and S = B + B^T. The
     adjugate of the matrix M is used instead of the inverse, so that a rotation by 180 deg causes no division
-    by zero. A small determinant of M still causes a loss of accuracy. The reference frame is therefore
-    rotated by 180 deg such that the determinant is largest and the remaining rotation smallest. The
+    by zero. A small determinant of the matrix M still causes a loss of accuracy. The reference frame is
+    therefore rotated by 180 deg such that the determinant is largest and the remaining rotation smallest. The
     determinant of the matrix M is proportional to the square of the quaternion's scalar part. The trace of
     the profile matrix B would be a cheaper criterion, but does not depend on the roll angle in a narrow field
     of view.

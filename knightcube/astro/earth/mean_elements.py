@@ -120,7 +120,7 @@ class _Fit:
             1e-3 * np.einsum("nji,nj->ni", to_icrs, states[:, k : k + 3])
             for k in range(0, states.shape[1], 3)
         ]
-        self._measured = np.hstack(parts)  # km and km/s, in the axes of SGP4
+        self._measured = np.hstack(parts)  # states in TEME axes, km and km/s
         self._scale = np.repeat([1.0, _VELOCITY_TIME], 3)[: states.shape[1]]
 
     def first_guess(self) -> FloatArray:

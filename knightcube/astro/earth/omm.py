@@ -52,7 +52,7 @@ _NUMBERS: dict[str, tuple[float, float, str]] = {
     "MEAN_ANOMALY": (0.0, 360.0, " deg"),
     "BSTAR": (-LARGEST_DRAG, LARGEST_DRAG, " per Earth radius"),
 }
-"""Bounds and unit of the numbers of an OMM, all of which are required."""
+"""Bounds and unit of the numerical fields of an OMM, which are all required."""
 _LEAST_DRAG = 1e-9
 """Smallest nonzero absolute value of B* that two-line elements can hold (one-digit exponent)."""
 _YEARS = 1957, 2056

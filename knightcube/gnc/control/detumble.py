@@ -156,7 +156,7 @@ class Detumbler:
             return
         window = (time_ns - self._begun_ns) // self._schedule.period_ns
         if window <= self._closed:
-            return  # the window of this late sample is closed: its mean field is already computed
+            return  # the mean field of the late sample's window is already computed
         if window != self._window:
             self._samples.clear()
             self._window = window

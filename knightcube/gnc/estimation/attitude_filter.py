@@ -116,7 +116,7 @@ class CommandCheck:
         if self.active:
             self._test_recovery(newest.state, rate)
             return None
-        assert newest.variance is not None  # only the first checkpoint has no variance, and it is not checked
+        assert newest.variance is not None  # only the first checkpoint, which is not checked, has no variance
         spreads = [math.sqrt(variance) for variance in newest.variance.diagonal().tolist()]
         departure = [value / spread for value, spread in zip(newest.innovation, spreads, strict=True)]
         largest = _DEPARTURES[1] * self._scale

@@ -97,7 +97,7 @@ def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatA
     The component of the rate along the field is not observable. The rate across the field is exact for a
     steady rotation of less than half a revolution, and zero without a field.
     """
-    rotated = np.cross(after, before)  # the field rotates opposite to the body
+    rotated = np.cross(after, before)  # in body axes, the field rotates opposite to the body
     length = float(np.linalg.norm(rotated))
     if length == 0.0:
         return np.zeros(3)

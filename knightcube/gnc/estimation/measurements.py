@@ -1,8 +1,8 @@
 """Measurements of the attitude filter: attitudes, gyro rates, mean rates, directions and fields.
 
-A measurement has a `latency` if it comes from a unit whose samples are older than their time stamps, by an
-age that the filter estimates. The latency is the assumed age (s) that was subtracted from the time stamp to
-give `time_ns`. None marks a known time.
+A measurement has a `latency` if it comes from an inertial unit whose samples are older than their time stamps
+and if the filter estimates the age of the samples. The latency is the assumed age (s) that was subtracted
+from the time stamp to give `time_ns`. A latency of None marks a known time.
 """
 
 from __future__ import annotations

@@ -349,7 +349,7 @@ EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)
 _STREAK = 20.0
 """Desired streak length (px): rates are inaccurate below 5 px, and faint stars are lost above 100 px."""
 _POINT = 1.0
-"""Motion (px) of a star during the usual exposure below which it counts as a point."""
+"""Motion (px) of a star during the usual exposure below which the star counts as a point."""
 
 
 @dataclass(frozen=True, slots=True)

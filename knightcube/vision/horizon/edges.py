@@ -100,7 +100,7 @@ class ScanLines:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImagePart:
-    """A rectangle of an image in which edges are searched on more lines.
+    """A rectangle of an image in which a second search finds edges on more scan lines.
 
     Attributes:
         box: lowest and highest (x, y) of the rectangle (2, 2), px.

@@ -62,7 +62,7 @@ class Ellipsoid:
         return self._along_axes(1.0 / (self.equatorial + height), 1.0 / (self.polar + height))
 
     def shape(self, height: float = 0.0) -> FloatArray:
-        """Return the inverse (3, 3) of `stretching`: it transforms the unit sphere into the ellipsoid, m."""
+        """Return the matrix (3, 3), m, that transforms the unit sphere into the ellipsoid."""
         return self._along_axes(self.equatorial + height, self.polar + height)
 
     def stretching_by_height(self, height: float = 0.0) -> FloatArray:
@@ -296,7 +296,7 @@ def shared_error(
     _, gradients = limb_gradients(fit.view, rays)
     weighted = gradients * _weights(fit.residuals, sigma)[0][:, None]
     inverse = _solved(weighted.T @ gradients + _information(fit.view, prior), np.eye(PARAMETERS))
-    assert inverse is not None  # the fit has already solved the same equations, so that they are not singular
+    assert inverse is not None  # the equations are not singular, because the fit has already solved them
     moved = np.array([inverse @ weighted[groups == k].sum(axis=0) for k in range(len(error))])
     return np.asarray((moved * (error**2)[:, None]).T @ moved)
 

@@ -229,7 +229,7 @@ class _Seen:
         return replace(self._pose(matrix, scale, held), covariance=np.asarray(inverse, dtype=np.float64))
 
     def _pose(self, matrix: FloatArray, scale: float, held: FloatArray) -> _FittedPose:
-        """Return a pose; `held` contains the fitted lens errors (bend, 0, 6 or 8) and the delay (0 or 1)."""
+        """Return a pose, whose lens errors (bend) and delay have the fitted values `held`."""
         bends = len(self.unknowns.bend)
         return _FittedPose(matrix, scale, np.pad(held[:bends], (0, BENDS - bends)), float(held[bends:].sum()))
 

@@ -269,7 +269,7 @@ def look_up(
 def _places(
     ratio: FloatArray, slack: FloatArray, cells: IntArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest position within a cell that agrees with each ratio, and the number of higher ones.
+    """Return the lowest position within a cell that agrees with each ratio, and how many higher ones agree.
 
     A position agrees with a side ratio if they differ by at most `slack`.
     """

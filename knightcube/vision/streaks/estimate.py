@@ -96,7 +96,7 @@ _MOST_GROWING = 2
 _MOST_ANGLES = 2
 # Maximum number of iterations of the fit for a camera at rest.
 _STILL_ROUNDS = 12
-# Minimum number of complete streaks from whose lengths alone the rotation angle is guessed.
+# Minimum number of complete streaks for a guess of the rotation angle from streak lengths alone.
 _WHOLE = 8
 # Maximum fraction of the flux in regions longer than the guessed streak length, for an accepted guess.
 _CONTRADICTED = 0.3

@@ -69,7 +69,7 @@ class Circles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AngleCandidate:
-    """A candidate for the rotation angle, with the stars found under this angle.
+    """A trial rotation angle, with the stars that were found for this angle.
 
     Attributes:
         angle: rad.
@@ -178,7 +178,7 @@ def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
 def _refined_angle(
     boxes: _Boxes, pinhole: Pinhole, circles: Circles, scale: FloatArray, width: int
 ) -> AngleCandidate:
-    """Return the best rotation angle near `width` samples, with the stars found under this angle."""
+    """Return the best rotation angle near `width` samples, with the stars found for this angle."""
     room = max(2, round(_FACTOR * width) - width + 1)
     widths = np.arange(max(width - room, 2), width + room + 1)
     held = [boxes.best(int(each)) for each in widths]

@@ -99,7 +99,7 @@ _LEAST_PROGRESS = 0.7
 _LOOKS = 1
 # Probability of a false alarm of the score test for a changing rate.
 _BY_CHANCE = 1e-4
-# Fraction of the test's limit below which an approximate test statistic suffices for a constant rate.
+# Fraction of the score test's limit below which an approximate statistic confirms a constant rate.
 _FAR_BELOW = 0.5
 # Number of acceleration components, which is the number of degrees of freedom of the score test.
 _GROWTHS = 3

@@ -247,7 +247,7 @@ FINE_NODES = 40
 """Number of nodes for paths that run along the current limit near the requested horizon. With 24 nodes the
 cost of such paths is up to 0.3 % above the optimum, with 40 nodes up to 0.07 %."""
 _NEARLY = 1.03
-"""Stretch of a horizon up to which the requested horizon is tried again with more nodes."""
+"""Largest stretch of a horizon after which a path over the requested horizon is searched with more nodes."""
 
 REFERENCE = 2.0
 MAX_STRETCH = 6.0

@@ -18,7 +18,8 @@ The end of a slew is an attitude, which gives three equations, or the direction 
 roll, which gives two. The body rate at the end gives three more equations. All end conditions are quadratic
 in the quaternion. An exclusion cone is a cone about a direction, such as the direction to the Sun, that a
 body axis must not enter during the slew. Field, position, and the cones of Sun, Earth and Moon are computed
-along a predicted orbit. Times of a slew count from `begin`, s of the ephemeris.
+along a predicted orbit. Times of a slew are relative to its start, which is `begin` s after the start of the
+ephemeris.
 """
 
 from __future__ import annotations
@@ -482,7 +483,7 @@ class EndConditions:
 def along(
     ephemeris: Ephemeris, begin: float, areas: FloatArray | None = None, path: SlewPath | None = None
 ) -> EnvironmentAt:
-    """Return the environment of a slew that starts at `begin` s of the ephemeris.
+    """Return the environment of a slew that starts `begin` s after the start of the ephemeris.
 
     If `areas` (3,) and `path` are given, the environment includes the pressures of air and sunlight on the
     areas that a body on this path exposes.

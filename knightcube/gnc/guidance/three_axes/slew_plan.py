@@ -334,8 +334,8 @@ class OrderedSlew:
         order: requested slew.
         task: planning task for the chosen start time.
         plan: planned path of the slew.
-        begin: start of the slew, in s of the ephemeris. In results of `knightcube.plan_slew`, the start is in
-            s after the argument `time`.
+        begin: start of the slew, in s after the start of the ephemeris. In results of `knightcube.plan_slew`,
+            the start is in s after the argument `time`.
         compared: number of start times that were planned.
     """
 
@@ -347,10 +347,11 @@ class OrderedSlew:
 
 
 def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedSlew:
-    """Return the best slew that begins in the window of `order`, which opens at `first` s of the ephemeris.
+    """Return the best slew that begins in the time window of `order`.
 
-    The ephemeris must begin `LEAD` s before `first`, and end `LEAD` s after the end of the longest slew.
-    Raises PlanningError with the last reason if no slew is found, and UsageError for a window out of range.
+    The window opens `first` s after the start of the ephemeris. The ephemeris must begin `LEAD` s before
+    `first`, and end `LEAD` s after the end of the longest slew. Raises PlanningError with the last reason if
+    no slew is found, and UsageError for a window out of range.
     """
     low, high = WINDOW_RANGE
     if not low <= order.window <= high:
@@ -385,7 +386,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
 
 
 def task_at(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> SlewTask:
-    """Return the planning task of a slew that begins at `begin` s of the ephemeris."""
+    """Return the planning task of a slew that begins `begin` s after the start of the ephemeris."""
     quaternion, rate = _motion(law_of(order.held, order.axes, _NO_ROLL, ephemeris, begin), ephemeris, begin)
     return SlewTask(
         order.craft,
@@ -402,7 +403,7 @@ def task_at(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> SlewTask:
 
 
 def end_law(goal: PointingTarget, axes: BodyAxes, ephemeris: Ephemeris, begin: float) -> EndLaw:
-    """Return the end conditions as a function of the duration, for slews from `begin` s of the ephemeris."""
+    """Return the end conditions by duration, for slews from `begin` s after the start of the ephemeris."""
     axis = axes.pointing
     if goal.goal is not Goal.INERTIAL and goal.roll is None:
         direction, _ = directions_of(goal)

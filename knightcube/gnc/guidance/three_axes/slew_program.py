@@ -80,9 +80,10 @@ class BandLayout:
         return int(self.end[-1]) + 1
 
     def band(self, blocks: FloatArray, tail: FloatArray) -> FloatArray:
-        """Return the band matrix of the intervals' `blocks` (k, WIDE, WIDE) and the `tail`; overwrite both.
+        """Return the band matrix of the `blocks` (k, WIDE, WIDE), one for each interval, and of the `tail`.
 
-        The block `tail` is for the state and the dipole of the last node, and for the end conditions.
+        The block `tail` is for the state and the dipole of the last node, and for the end conditions. The
+        given blocks are overwritten.
         """
         # The contributions of two neighbouring blocks to their common node are summed in the second block.
         blocks[1:, :10, :10] += blocks[:-1, STEP:, STEP:]

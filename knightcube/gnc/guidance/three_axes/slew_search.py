@@ -453,7 +453,8 @@ class HorizonContinuation:
     def shortened(self, relaxed: list[SolvedPath], shortest: float, time_cost: float) -> SolvedPath | None:
         """Return the best path found by shortening the slew as long as this reduces energy plus time cost.
 
-        The continuation starts from the relaxed path that keeps the dipole limit over the shortest duration.
+        The continuation starts from those paths in `relaxed` that keep the dipole limit at the shortest
+        durations.
         """
         best: SolvedPath | None = None
         for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:

@@ -236,7 +236,7 @@ def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
 # Number of peaks that are measured per requested star; some peaks turn out not to be stars.
 _MEASURED_FOR_ONE = 1.5
 _CLUTTERED_SHARE = 0.25
-# Noise of a block of pixels, relative to the median over the frame, above which it counts as foreground.
+# Noise of a block of pixels, relative to the frame's median, above which the block counts as foreground.
 _RESTLESS = 2.5
 # Radius (px) of a saturated disc above which it is a planet, the Moon or a lamp instead of a star.
 _WIDEST_CORE = 7.0
