@@ -6,11 +6,11 @@ its TUF target path. Python-tuf checks the metadata against the metadata in the 
 never decrease, and against the first root metadata in the file ROOT. Python-tuf reads the unpacked bundle
 instead of downloading files.
 
-The program writes the artefact to FOLDER/artefact. For a configuration, it also writes FOLDER/set with the
-configuration and the drop-ins of its units. For orbital elements or a star catalogue, this configuration is a
-copy of the configuration PRESENT with one value replaced. KEPT is the folder that will contain the catalogue.
-The program prints the version, the permission to replace a newer version, and the SHA-256 as one JSON object.
-For a refused bundle, the program prints one line and exits with status 1.
+The program writes the artefact to FOLDER/artefact. For a configuration, the program also writes FOLDER/set
+with the configuration and the drop-ins of its units. For orbital elements or a star catalogue, this
+configuration is a copy of the configuration PRESENT with one value replaced. KEPT is the folder that will
+contain the catalogue. The program prints the version, the permission to replace a newer version, and the
+SHA-256 as one JSON object. For a refused bundle, the program prints one line and exits with status 1.
 """
 
 from __future__ import annotations

@@ -491,7 +491,10 @@ class Renewal:
             self._report(name, "failed", word or "request", str(error) or type(error).__name__)
 
     def _restart(self, name: str, part: str) -> None:
-        """Restart flight, link or board. The request is stored as executed first, so it is never repeated."""
+        """Restart flight, link or board.
+
+        The request is stored as executed before the restart, so that it is never executed again.
+        """
         if part not in RESTARTS:
             raise Refused("the request is damaged")
         self._report(name, "completed", "restart", f"{part} is restarted")
@@ -710,7 +713,7 @@ class Renewal:
             self._begin_revert("the ground did not confirm it")
 
     def _go_back(self, what: str, request: str, word: str, text: str) -> bool:
-        """Return to the previous release or configuration. The result is False if there is none."""
+        """Return to the previous release or configuration. Returns False without a previous version."""
         state, board = self._state, self._board
         if what == "release":
             current, name = board.release("current"), board.release("previous")

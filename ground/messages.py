@@ -206,7 +206,7 @@ class ObjectOrbit:
         number: number of the object in the flight.
         sightings: number of sightings.
         span: time between the first and the last sighting, s.
-        utc_ns: UTC epoch of the orbit, ns since 1970; None without an orbit.
+        utc_ns: UTC epoch of the orbit, ns since 1970, or None without an orbit.
         orbit: initial orbit, or None if the sightings do not determine an orbit.
         reason: reason why `orbit` is None, or an empty text.
     """

@@ -64,7 +64,7 @@ def draw_marks(
 
 
 def outlined(plain: npt.NDArray[np.uint8], drawn: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return the picture `drawn` with black outlines around the marks; `plain` is the unmarked picture."""
+    """Return the picture `drawn` with black outlines around the marks, given the unmarked picture."""
     marks = np.any(plain != drawn, axis=2)
     width = max(1, round(_OUTLINE * max(plain.shape) / 1024.0))
     edged = drawn.copy()

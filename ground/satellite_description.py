@@ -117,7 +117,7 @@ class Derived:
 
 
 def sun_synchronous_inclination(altitude: float, eccentricity: float) -> float | None:
-    """Return the inclination (deg) at which J2 turns the node with the mean Sun, or None if there is none.
+    """Return the inclination (deg) at which J2 makes the node follow the mean Sun, or None.
 
     The argument `altitude` is the semi-major axis minus the Earth's radius, m (Vallado, eq. 11-13).
     """
@@ -187,7 +187,7 @@ def _rounded_up(value: float, step: float) -> float:
 
 
 def configuration_text(satellite: Satellite, values: Derived, made: FittedElements, command: str) -> str:
-    """Return the configuration file of a satellite; `command` is the command that writes the file."""
+    """Return the configuration file of a satellite, which names the `command` that writes the file."""
     x, y, z = satellite.size
     orbit = satellite.orbit
     wide = [] if satellite.wide_cameras else [("wide_cameras: []", "no cameras for Sun and horizon")]

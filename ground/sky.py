@@ -5,8 +5,8 @@ From 1800 to 2050, plan94 (Simon et al. 1994) errs by a few arcseconds, or by 80
 error of moon98 (Meeus 1998) is 10". The series need no ephemeris file. For an observer on the ground the
 Moon's direction differs by up to 1 deg.
 
-The FITS header describes a tangent plane with distortion polynomials (TAN-SIP; Calabretta & Greisen 2002,
-section 5.1.3; Shupe et al. 2005). FITS counts pixels from 1.
+The FITS header describes a tangent plane with distortion polynomials (TAN-SIP: Calabretta & Greisen 2002,
+section 5.1.3, and Shupe et al. 2005). FITS counts pixels from 1.
 """
 
 from __future__ import annotations
@@ -53,9 +53,10 @@ class _TangentPlane:
 
 
 def world_coordinates(sky: SkyMap, reversed_rows: bool = False) -> dict[str, str | int | float | bool]:
-    """Return the values of the FITS header by key; A and B map pixels to the sky, AP and BP the reverse.
+    """Return the values of the FITS header by key.
 
-    If `reversed_rows` is true, the first row of the file is the bottom row of the image.
+    The polynomials A and B map pixels to the sky, and the polynomials AP and BP map the sky to pixels. If
+    `reversed_rows` is true, the first row of the file is the bottom row of the image.
     """
     camera = sky.camera
 

@@ -55,7 +55,7 @@ def document(
     epoch: str = EPOCH,
     verified: bool = False,
 ) -> str:
-    """Return the tables as one XTCE document; `epoch` is the UTC of mission time zero, in ISO 8601.
+    """Return the tables as one XTCE document. The text `epoch` is the UTC of mission time zero, in ISO 8601.
 
     `verified` adds to each command the verification by Yamcs, with a parameter name that other clients do not
     know.

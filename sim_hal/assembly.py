@@ -67,7 +67,7 @@ ExposeWide = Callable[["EarthCameraModel", "EarthScene", tuple[int, ...]], "Futu
 
 @dataclass(frozen=True, slots=True)
 class CoilHardware:
-    """The chips on the coils' I2C bus and the coil circuit; `monitor` is None without a current monitor."""
+    """The chips on the coils' I2C bus and the coil circuit. The current `monitor` may be None."""
 
     bus: EmulatedI2cBus
     pwm: EmulatedPca9685
@@ -77,7 +77,7 @@ class CoilHardware:
 
 @dataclass(frozen=True, slots=True)
 class OrbitDevices:
-    """The configured devices that need an orbit; `wide` holds the horizon cameras."""
+    """The configured devices that need an orbit. The attribute `wide` holds the horizon cameras."""
 
     gps: EmulatedGps | None = None
     cells: EmulatedSolarCells | None = None
@@ -179,7 +179,7 @@ def assemble(
 
 
 def _true_description(config: Config, section: Simulation, world: World) -> dict[str, FloatArray] | None:
-    """Return the fields of the true-description packet; None for a world without a craft."""
+    """Return the fields of the true-description packet, or None for a world without a craft."""
     craft = getattr(world, "craft", None)
     if craft is None or not isinstance(config, OrbitConfig):
         return None
@@ -288,7 +288,7 @@ def emulated_camera(
     *,
     mounting: FloatArray | None = None,
 ) -> EmulatedCamera:
-    """Return the star camera on a moving body; `mounting` (4,) is by default that of the configuration."""
+    """Return the star camera on a moving body, with the `mounting` (4,) or the configured one."""
     mounting = np.array(camera.mounting) if mounting is None else mounting
     readout_ns, scan_ns = round(sky.readout * 1e9), round(sky.line_time * camera.rows * 1e9)
     tracks = no_objects if objects is None else objects.tracks
@@ -373,7 +373,7 @@ def assemble_orbit(
     line: SerialEnd | None,
     expose: ExposeWide | None = None,
 ) -> OrbitDevices:
-    """Build the devices that need an orbit; `line` is the device end of the GPS receiver's serial line.
+    """Build the devices that need an orbit. The GPS receiver uses `line`, the device end of a serial line.
 
     The world began at the time `start_ns`. `expose` replaces the renderer of the horizon cameras. Raises
     ConfigError in a world without an orbit.

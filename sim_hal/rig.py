@@ -101,7 +101,7 @@ class SimulationRequest:
 
 
 def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Rig:
-    """Open the emulated devices of a configuration with the requested faults; `stack` closes the devices.
+    """Open the emulated devices of a configuration with the requested faults, until `stack` is closed.
 
     Raises UsageError or ConfigError before a device is opened, and DeviceError if a device fails.
     """

@@ -162,7 +162,7 @@ class Truth(Section, frozen=True, kw_only=True):
 
 
 class CageTruth(Section, frozen=True, kw_only=True):
-    """The magnetic field of the simulated cage; `orbit` is the orbit at simulation time zero.
+    """The magnetic field of the simulated cage for an `orbit`, which is that at simulation time zero.
 
     `gain` is the ratio of the cage's field to the commanded field. `ring_current` scales the mean field of
     the ring current, 20 nT.
@@ -267,7 +267,7 @@ class FaultEntry(Section, frozen=True, kw_only=True):
 
 
 class Simulation(Section, frozen=True, kw_only=True):
-    """The section `simulation`; `world` is a key of `sim_hal.worlds.world.WORLDS` or `module:factory`.
+    """The section `simulation`, whose `world` is a key of `sim_hal.worlds.world.WORLDS` or `module:factory`.
 
     The three rows of `coil_field`, T/A, map the coil currents to the coils' field at the magnetometer in body
     axes. A row has one value for each coil.

@@ -39,7 +39,7 @@ class RunRequest:
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """The result of a flight; `interrupted` states whether a signal ended the flight.
+    """The result of a flight. The flag `interrupted` states whether a signal ended the flight.
 
     The attribute `ending` is the state of the loop at the end of the flight. The text `restart` states why
     the process should be restarted; it is empty if no restart is needed. The attribute `faults` contains the

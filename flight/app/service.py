@@ -130,7 +130,7 @@ class StartRetry:
 def retried_start(
     judge: Callable[[], J], attempt: Callable[[J, ExitStack], T], stack: ExitStack, retry: StartRetry
 ) -> T:
-    """Return the result of the first attempt that succeeds; `stack` closes what it has opened.
+    """Return the result of the first attempt that succeeds. Its open resources are closed by `stack`.
 
     Each attempt reads and validates a configuration with `judge`, and opens it with `attempt`. Raises
     UsageError for an invalid configuration, and StoppedError after a signal.

@@ -399,7 +399,7 @@ class KissStream:
     """Decoder of coded frames in KISS frames (Chepponis and Karn, 1987), with or without AX.25 headers."""
 
     def __init__(self, decode: Callable[[bytes], bytes], ax25: bool) -> None:
-        """Decode frames by the function `decode`; `ax25` states whether each has an AX.25 header."""
+        """Decode frames by the function `decode`, after removing AX.25 headers if `ax25` is true."""
         self._decode = decode
         self._ax25 = ax25
         self._data = b""

@@ -305,12 +305,12 @@ class CoilMonitorSettings:
         evidence: number of readings that are needed for a verdict.
         probe_current: amplitude (A) of the square wave that reveals which of several axes is faulty.
         probe_half_ns: half the period (ns) of the probe's square wave.
-        response: settings for judging coils by the body's motion; None if the motion is not evaluated.
+        response: settings for judging coils by the body's motion, or None if the motion is not evaluated.
         slow: settings like `response` with longer bins, which reveal missing torque at small currents.
         tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
         trial_after_ns: time (ns) from the verdict on a coil to its next trial.
         trials: largest number of trials of each coil.
-        self_test: settings of the self-test; None if the coils are not tested.
+        self_test: settings of the self-test, or None if the coils are not tested.
         absent: axes without a coil.
     """
 
@@ -664,11 +664,11 @@ class CoilMonitor:
 
     @property
     def probe(self) -> FloatArray | None:
-        """Currents (n,), A, on the wire that replace all commands during a probe; None without a probe."""
+        """Currents (n,), A, on the wire that replace all commands during a probe, or None."""
         return self._probe.wave(self._commands.newest_ns) if self._commands else None
 
     def test_wave(self, wanted: FloatArray) -> FloatArray | None:
-        """Return the currents (n,), A, on the wire that test a coil now; None without a test.
+        """Return the currents (n,), A, on the wire that test a coil now, or None without a test.
 
         The test replaces the `wanted` effective currents (n,), A, which are small.
         """

@@ -195,7 +195,7 @@ LEAST_GAIN, _EXACT = 0.1, 0.1
 """Smallest gain of a weak coil that is worth using, and largest standard deviation of a gain to be used."""
 _STEADY = 2.0
 """Largest difference between the gain of the newest half of the bins and that of all bins, in standard
-deviations of the former."""
+deviations of the gain of the newest half."""
 _CLEARLY, _CERTAINLY, _WORSE = 9.0, 20.0, 25.0
 """Thresholds for the differences of weighted sums of squares between hypotheses. A fault of one coil must
 explain the motion better than a fault of another coil by the first threshold, and a reversed coil better than
@@ -263,11 +263,10 @@ class CoilResponse:
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
         self.fastest = 0.0
-        self._weights: FloatArray = np.zeros(
-            len(self._modes)
-        )  # weights of the inertia error modes in the newest fit
+        # The newest fit determines the weights of the inertia error modes.
+        self._weights: FloatArray = np.zeros(len(self._modes))
         # The tuple of a bin begins with the time (ns) and the commanded acceleration by each coil (3, n).
-        # It ends with acceleration per ampere (3, n), residual (3,), and accelerations by error modes (3, k).
+        # The tuple ends with accelerations per ampere (3, n), residual (3,), and error accelerations (3, k).
         self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]] = deque()
         self._in_a_row = {finding: [0] * coils for finding in Finding}
         self.sigma = np.full(coils, np.inf)

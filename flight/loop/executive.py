@@ -236,7 +236,7 @@ class Observer(Protocol):
 
 
 class CyclicExecutive:
-    """Runs rate groups; `stopwatch` returns times (ns) by which execution times are measured."""
+    """Runs rate groups. The function `stopwatch` returns times (ns) to measure execution times."""
 
     def __init__(
         self,

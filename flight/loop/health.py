@@ -381,7 +381,7 @@ class Housekeeping:
         return self._coils.state()
 
     def run(self, cycle: Cycle, state: SteeringState) -> None:
-        """Write the housekeeping packet; `state` is the use of the coils in the newest control cycle."""
+        """Write the housekeeping packet with the use of the coils (`state`) in the newest control cycle."""
         now_ns, power, log_error = cycle.start_ns, self._power, self._log_error()
         text = log_error or "packets reach the disk again"
         self._facts.update(facts.LOG_FAULT, bool(log_error), now_ns, text)

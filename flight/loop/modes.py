@@ -265,7 +265,7 @@ class AttitudeWatch:
             timer.reset()
 
     def trigger(self, mode: Mode, known: bool, now_ns: int) -> Trigger | None:
-        """Return the trigger that is due, or None; `known` states whether the attitude permits steering."""
+        """Return the trigger that is due, or None. The flag `known` states that the attitude is known."""
         if mode is Mode.ACQUIRE and self.follows is not None and self._known.update(known, now_ns):
             return KNOWN[self.follows]
         if mode in POINTING and self._lost.update(not known, now_ns):
@@ -374,7 +374,7 @@ class ModeControl:
 
     Attributes:
         restart: reason why the process must be restarted; empty if no restart is needed.
-        wanted: target that a hold, a slew, the mode SUN or a command to point has set; None in other modes.
+        wanted: target that a hold, a slew, the mode SUN or a command to point has set, or None.
     """
 
     def __init__(

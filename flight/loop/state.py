@@ -417,7 +417,7 @@ class _StateCopy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True)
 class _ReadCopy:
-    """The result of reading one copy of the state; `problem` is empty for a valid or missing copy."""
+    """Result of reading one copy of the state. The text `problem` is empty for a valid or missing copy."""
 
     name: str
     copy: _StateCopy | None

@@ -268,7 +268,7 @@ class Steering:
             acquisition.begin(now_ns)
 
     def detumble(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
-        """Detumble in this cycle; `current` states whether the newest reading is within its age limit."""
+        """Detumble in this cycle. The flag `current` states whether the newest reading is recent enough."""
         return self._run_law(self._body.control.detumbling, readings, current, now_ns)
 
     def acquire_sun(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:

@@ -122,7 +122,7 @@ class Winding(Section, frozen=True, kw_only=True):
 
 
 class Coils(Section, frozen=True, kw_only=True):
-    """The PWM chip, the H-bridges and the coils; `bus` is the number or device file of the I2C bus.
+    """The PWM chip, the H-bridges and the coils. The value `bus` is the number or device file of the I2C bus.
 
     The list `windings` has one entry per coil. A satellite has two to six coils. If the coils lie in a plane,
     the flight application treats the axis across the plane like that of a broken coil (`slots`). A dipole

@@ -227,7 +227,7 @@ def merged_text(text: str, name: str) -> str:
 
 
 def _extended(document: Document, above: tuple[str, ...]) -> Document:
-    """Return a document merged with the file that it extends; `above` are the files that extend it."""
+    """Return a document merged with the file that it extends. The files `above` extend this document."""
     if EXTENDS not in document.values:
         return document
     named = document.values.pop(EXTENDS)

@@ -72,9 +72,9 @@ class Control(Section, frozen=True, kw_only=True):
     """The controller.
 
     The controllers `lq` and `thesis` use the weights of the Sease thesis, eqs. 5.30-5.32: Q = state_weight I
-    and R = control_weight. The controllers `pid` and `adaptive` use `bandwidth`; `target_weight` belongs to
-    `pid`, and `adaptation` and `reference_bandwidth` belong to `adaptive`. If `gains` are given, `pid` uses
-    them instead of the bandwidth. The controller `excitation` is used by `knightcube identify`.
+    and R = control_weight. The controllers `pid` and `adaptive` use `bandwidth`. The value `target_weight`
+    belongs to `pid`, and `adaptation` and `reference_bandwidth` belong to `adaptive`. If `gains` are given,
+    `pid` uses them instead of the bandwidth. The controller `excitation` is used by `knightcube identify`.
     """
 
     tracker: Literal["lq", "thesis", "pid", "adaptive", "excitation"] = "lq"
@@ -110,8 +110,8 @@ class Step(Section, frozen=True, kw_only=True):
 class Cage(Section, frozen=True, kw_only=True):
     """A Helmholtz cage that reproduces the magnetic field of an orbit by UTC (`bodies.testbed.control`).
 
-    The orbit is given by the two-line elements `elements`; `scale` is the ratio of the cage's field to the
-    orbit's field. With a cage, `plant.field` is the weakest field that plans assume.
+    The orbit is given by the two-line elements `elements`, and `scale` is the ratio of the cage's field to
+    the orbit's field. With a cage, `plant.field` is the weakest field that plans assume.
     """
 
     elements: tuple[str, str]

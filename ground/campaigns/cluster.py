@@ -2,7 +2,8 @@
 
 A plugin sends the project's packages to every worker, also to workers that join later. A case is sent as the
 name of its function and as data. This module itself is pickled by value, so that scheduler and workers can
-read it without the packages. Its top level must therefore import neither the packages nor Dask.
+read it without the packages. The top level of this module must therefore import neither the packages nor
+Dask.
 """
 
 from __future__ import annotations

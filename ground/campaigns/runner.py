@@ -140,8 +140,8 @@ class Campaign:
         name: name of the campaign.
         purpose: what the campaign measures, in one line.
         cases: function that returns the cases for a number of runs and a seed.
-        run: function that runs a case. It is defined at the top level of a module, because other processes
-            and machines import it.
+        run: function that runs a case, at the top level of a module, because other processes and machines
+            import the function.
         summarise: function that summarises the results of all cases, given the results and the folder.
         default_runs: default number of runs.
     """

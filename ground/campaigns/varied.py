@@ -34,7 +34,7 @@ _FORMS = (
     "deviation), KEY=1..5 (uniform), KEY=log 1..100 (uniform in the logarithm) or KEY=a|b|c (one of these)"
 )
 _MOST_LISTED = 20
-"""Maximum number of failed flights in the printed table; `summary.json` lists all failed flights."""
+"""Maximum number of failed flights in the printed table (all are in the file summary.json)."""
 
 Draw = Callable[[np.random.Generator, float], Any]
 

@@ -131,7 +131,7 @@ class Answers:
     """The values of the satellite's description, and the texts that the user entered for them."""
 
     def __init__(self, out: Path | None, force: bool) -> None:
-        """`out` is the file to write, if it is given; `force` states whether it may be replaced."""
+        """Set the file to write, if given, and with `force` the permission to replace an existing file."""
         self._out, self._force = out, force
         self._texts: dict[str, list[str]] = {}
         self.values: dict[str, Any] = {}

@@ -51,7 +51,7 @@ class Question:
         metavar: unit or form of the value, as the help shows it.
         text: the question, with the unit.
         read: function that returns the value of a text; it raises ValueError with the permitted values.
-        default: text of the default value; None for a value that must be given.
+        default: text of the default value, or None for a value that must be given.
     """
 
     name: str

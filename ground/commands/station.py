@@ -307,7 +307,7 @@ def _print(text: str) -> None:
 
 
 def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
-    """Return the console that the options describe; `stack` closes the console's resources."""
+    """Return the console that the options describe. Its resources are closed by `stack`."""
     from ground.console.commanding import CommandForms, LinkFeed, by_socket, flying  # noqa: PLC0415
     from ground.console.history import History  # noqa: PLC0415
     from ground.console.server import Console  # noqa: PLC0415

@@ -121,7 +121,7 @@ class Access:
     """Token of the next browser and cookies of the sessions."""
 
     def __init__(self, announce: Callable[[str], object]) -> None:
-        """Make a token; `announce` receives each token that replaces a used one."""
+        """Make a token. The function `announce` receives each token that replaces a used token."""
         self._announce = announce
         self._sessions: list[str] = []
         self.token = secrets.token_urlsafe(_RANDOM_BYTES)
@@ -161,7 +161,7 @@ def refusal(headers: Mapping[str, str], origin_required: bool) -> str:
 
 
 def application(console: Console, access: Access) -> web.Application:
-    """Return the web application; The packets of `console` must have been read once before."""
+    """Return the web application. The packets of `console` must have been read once before."""
 
     @web.middleware
     async def only_own_page(request: web.Request, handler: _Handler) -> web.StreamResponse:

@@ -116,7 +116,7 @@ def _direction(vector: FloatArray) -> list[float]:
 
 
 class FrameFolder:
-    """Folder of kept camera frames; `None` means that the flight has none."""
+    """Folder of kept camera frames, or None for a flight without kept frames."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder

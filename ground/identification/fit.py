@@ -4,7 +4,7 @@ The equation of motion, divided by the inertia, is theta'' = g I cos(theta) - ka
 (Sease 2013, eq. 5.4, with the thread). Each change of the current I is delayed by tau. The angle theta and
 the biased rate theta' + b are measured. The actual current differs from the commanded current, so an active
 coil adds process noise. The predictor is therefore the extended Kalman filter of angle and rate
-(prediction-error method; Ljung 1999, System Identification, sections 7.2 and 10.2). An output-error fit would
+(prediction-error method: Ljung 1999, System Identification, sections 7.2 and 10.2). An output-error fit would
 treat the accumulated process noise as signal. Between events the state is propagated by a Taylor series whose
 error is a ten-thousandth of the noise. The derivatives by the constants treat the filter gains as constant,
 which keeps the expected gradient at zero.

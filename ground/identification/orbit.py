@@ -69,7 +69,7 @@ class LearnedQuantity:
 
     @property
     def change(self) -> FloatArray:
-        """Changes (n,) of learned values, in estimated standard deviations; NaN if these are unknown."""
+        """Changes (n,) of learned values, in estimated standard deviations, or NaN if these are unknown."""
         known = np.where(self.claim > 0.0, self.claim, math.nan)
         return np.asarray((self.value - self.described) / known)
 

@@ -217,7 +217,7 @@ def plant_section(plant: AbsolutePlant, coil_turns: int) -> Plant:
 
 
 def plant_text(plant: AbsolutePlant, coil_turns: int, origin: str) -> str:
-    """Return the section `plant` as YAML text with uncertainties and sources; `origin` names the flight."""
+    """Return the section `plant` as YAML text with uncertainties, sources and the flight `origin`."""
     section, sources = plant_section(plant, coil_turns), plant.sources()
     area = replace(plant.dipole, sigma=plant.dipole.sigma / coil_turns)
     text = [f"# Made by `knightcube identify` from {origin}; +- is 1 sigma.", "plant:"]

@@ -266,7 +266,7 @@ class FileSession:
                     continue
             elif packet[:2] == _VERIFICATION:
                 report = report_of(packet)
-                # After a repeated counter, the command is sent again with a higher one.
+                # After a repeated counter, the command is sent again with a higher counter.
                 if report.counter in self._counters and report.stage is not Stage.REPEATED:
                     if report.stage is not Stage.ACCEPTED:
                         self._asked = None

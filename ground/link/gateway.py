@@ -48,7 +48,7 @@ _PING_PERIOD_S = 20.0
 _TOKEN_S = 5.0
 """Time (s) after which a connection without the token is closed."""
 _MOST_WITHOUT_TOKEN = 16
-"""Maximum number of connections that have not sent the token; a further connection closes the oldest one."""
+"""Maximum number of connections that have not sent the token; a further connection closes the oldest."""
 _REPORT_S = 1.0
 """Minimum time (s) between two reports about connections without the token."""
 _TOKEN_CHARACTERS = b"0123456789abcdef"
@@ -202,7 +202,7 @@ class Gateway:
     def __init__(
         self, terminal: Terminal, address: str, token: str, complain: Callable[[str], object]
     ) -> None:
-        """Listen on HOST:PORT of loopback; `complain` receives each refusal. Raises UsageError."""
+        """Listen on HOST:PORT of loopback, and pass each refusal to `complain`. Raises UsageError."""
         self._terminal = terminal
         self._token = token
         self._reported = -_REPORT_S

@@ -225,8 +225,8 @@ class Terminal:
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
         """Yield the reports on a command until the final report, for at most `seconds` s.
 
-        A report of a repeated frame is final if no other report came before. Otherwise somebody has repeated
-        the command's frame, and this report is skipped.
+        A report of a repeated frame is final if no other report came before. After other
+        reports it is skipped, because somebody else has repeated the command's frame.
         """
         reported = False
         for _, packet in self.packets(seconds):

@@ -61,7 +61,7 @@ class RunSignals:
 
     @cached_property
     def flown(self) -> ThreadMotion:
-        """True motion, or the estimated one without a truth log."""
+        """True motion, or the estimated motion without a truth log."""
         return self.truth or self.estimate
 
     @cached_property

@@ -72,7 +72,7 @@ class StepCommand:
 class StepResponse:
     """Figures of one step.
 
-    Figures of merit of a step; NaN means not applicable, and infinity means never reached.
+    Figures of merit of a step, with NaN for not applicable, and infinity for never reached.
     """
 
     steady_state_deg: float = math.nan

@@ -1,6 +1,7 @@
 """Report of a run as one object, printed by `report --json` and written as text by `ground.report.text`.
 
-`None` means that a value is unknown, not applicable or was never reached; `notes` give the reasons.
+`None` means that a value is unknown, not applicable or was never reached. The section `notes` gives the
+reasons.
 """
 
 from __future__ import annotations

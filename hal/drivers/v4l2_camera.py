@@ -470,7 +470,7 @@ class ExposureTiming:
         self._stamp_ns = 0  # last valid time stamp
 
     def begin(self, driver: str) -> None:
-        """Reset the detection for a newly opened camera; `driver` is the name of its kernel driver."""
+        """Reset the detection for a newly opened camera, given the name of its kernel driver."""
         self._arrival_stamps = driver == "uvcvideo" and not _uvc_uses_device_clock()
         self._contradictions = self._absurd = self._stamp_ns = 0
 

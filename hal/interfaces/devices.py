@@ -83,8 +83,8 @@ class GpsReading:
         utc_ns: UTC of the epoch, ns since 1970; 0 if the receiver does not know the time.
         position: (3,) position in the ITRS, m.
         velocity: (3,) velocity with respect to the ground, in ITRS axes, m/s.
-        sigma: reported standard deviation of the position per axis, m; NaN if the receiver does not know it.
-        velocity_sigma: reported standard deviation of the velocity per axis, m/s; NaN if unknown.
+        sigma: reported standard deviation of the position per axis, m, or NaN if unknown.
+        velocity_sigma: reported standard deviation of the velocity per axis, m/s, or NaN if unknown.
         satellites: number of GPS satellites used in the solution.
         valid: whether the receiver reports time, leap seconds and position as valid.
         rolled_over: whether the date was moved by 1024 weeks, after which the receiver's week number repeats.

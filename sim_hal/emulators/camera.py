@@ -71,7 +71,7 @@ class EmulatedCamera:
         scan_ns: int = 0,
         moving: Moving = no_objects,
     ) -> None:
-        """Connect the camera; `scan_ns` is the delay of a rolling shutter's last row."""
+        """Connect the camera. The last row of a rolling shutter has the delay `scan_ns`."""
         self._motion = motion
         self._expose = expose
         self._now_ns = now_ns

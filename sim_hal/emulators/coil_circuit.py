@@ -141,7 +141,7 @@ _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
     CoilCondition.B_HIGH: (None, _HIGH),
     CoilCondition.B_LOW: (None, _LOW),
 }
-"""Constant output of legs A and B in each condition; None for a leg that follows its input."""
+"""Constant output of legs A and B in each condition, or None for a leg that follows its input."""
 
 
 class CoilCircuit:
@@ -201,7 +201,7 @@ class CoilCircuit:
         self.update(self._coils[axis][1])
 
     def update(self, written: int) -> None:
-        """Update the currents after a STOP; `written` is the bit mask of the written PWM channels."""
+        """Update the currents after a STOP. The bit mask `written` contains the written PWM channels."""
         count = len(self._coils)
         draws = self._generator.random(count).tolist() if written else [0.5] * count
         for axis, (coil, channels, step, limit) in enumerate(self._coils):
@@ -266,7 +266,7 @@ def conversion_ns(code: int) -> int:
 
 
 class EmulatedIna219:
-    """An emulated INA219; `measure(start_ns, end_ns)` returns mean bus voltage (V) and mean current (A).
+    """An emulated INA219. The function `measure(start_ns, end_ns)` returns mean voltage (V) and current (A).
 
     Attributes:
         gain: gain of the current measurement, which a fault sets to a value other than 1.

@@ -71,7 +71,7 @@ class EmulatedI2cBus:
         parts: Sequence[I2cPart] = (),
         wait: Callable[[int], None] | None = None,
     ) -> None:
-        """Connect the chips; `wait` advances time by a timeout (ns), and without `wait` no time passes."""
+        """Connect the chips. If given, the function `wait` advances time by the timeout (ns) of a hang."""
         self._parts = list(parts)
         self._wait = wait
         self._faults: list[_Fault] = []

@@ -144,7 +144,7 @@ class Sensors:
             self._static = normalise(self._rng.standard_normal(4))
 
     def measure(self, motion: BodyMotion, windows: tuple[int, ...]) -> Vn100Sample:
-        """Return one sample; `windows` are the filter lengths of magnetometer, accelerometer and gyro."""
+        """Return one sample for the filter lengths `windows` of magnetometer, accelerometer and gyro."""
         profile = self._profile
         if windows not in self._scales:
             mag, accel, gyro = (math.sqrt(max(1, window)) for window in windows)

@@ -55,7 +55,7 @@ class Bench:
         now_ns: function that returns the simulation time, ns.
         generator: random generator of the faults.
         host: host end of a serial line in memory, or None for a pseudo-terminal.
-        flight_process: process identifier of the flight process; None in lock-step.
+        flight_process: process identifier of the flight process, or None in lock-step.
         gps_line: serial line of the GPS receiver, or None.
     """
 

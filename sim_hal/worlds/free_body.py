@@ -670,8 +670,8 @@ def built_craft(
 ) -> TrueCraft:
     """Return the true craft, which is described by `craft` or else by `section`.
 
-    Its disturbances are drawn from the generator `errors`, and it differs from its description by
-    `description`. Raises ConfigError as `craft_model`.
+    The disturbances are drawn from the generator `errors`. The argument `description` holds the differences
+    of the true craft from its description. Raises ConfigError as `craft_model`.
     """
     built = build(craft or craft_model(section), section.disturbances, errors)
     return built if description is NO_ERRORS else _differing(built, description)
@@ -680,7 +680,7 @@ def built_craft(
 def craft_model(section: FreeBodySection, config: Config | None = None) -> CraftModel:
     """Return the craft of a section, whose omitted values are those of the flight configuration.
 
-    Raises ConfigError for an inertia tensor that no body has, and for values that nobody gives.
+    Raises ConfigError for an impossible inertia tensor, and for values missing in both sections.
     """
     craft = section.craft
     if isinstance(craft, str):

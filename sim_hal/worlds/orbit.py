@@ -322,7 +322,7 @@ class Environment:
         generator: np.random.Generator,
         multiples: Disturbances | None = None,
     ) -> None:
-        """Begin at a Julian date UTC; `multiples` scale ring current, day bulge and random walks."""
+        """Begin at a Julian date UTC, with `multiples` of ring current, day bulge and random walks."""
         self._multiples = multiples = multiples or Disturbances()
         self._elements = elements
         self._julian_date = julian_date

@@ -115,7 +115,7 @@ class Testbed:
         self.time_ns = time_ns
 
     def motion(self, time_ns: int) -> BodyMotion:
-        """Advance to `time_ns` and return the motion; `time_ns` must not be before the present state."""
+        """Advance to `time_ns` and return the motion. The time must not be before the present state."""
         self.advance_to(time_ns)
         return about_thread(self.time_ns, self.angle, self.rate, self._model.field)
 

@@ -89,7 +89,7 @@ ENTRY_POINTS = "knightcube.commands"
 """Name of the entry point group; each entry point is a table of commands that a package adds."""
 
 PROGRAM = "knightcube"
-"""Name of the program in help, errors and examples; `python -m flight` is the same program."""
+"""Name of the program in help, errors and examples, also if started by `python -m flight`."""
 
 _EXAMPLES = f"""\
 examples:

@@ -201,7 +201,7 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
 def _witness(keys: Path) -> Path:
     """Return the folder of the witness (`flight.link.security`).
 
-    It is the second state folder of a service, or otherwise a folder beside the keys.
+    The folder is the second state folder of a service, or otherwise a folder beside the keys.
     """
     folders = os.environ.get("STATE_DIRECTORY", "").split(":")
     return Path(folders[1]) if len(folders) > 1 else keys.absolute().parent / "witness"

@@ -19,7 +19,7 @@ from knightcube.errors import FlightError
 
 
 def summary_text(result: RunResult, elapsed: float) -> str:
-    """Return the summary of a flight as lines of text; `elapsed` (s) is its duration in real time."""
+    """Return the summary of a flight that took `elapsed` s of real time, as lines of text."""
     ending = result.ending
     lines = [
         ("flown", f"{ending.mission_time:.0f} s in {elapsed:.1f} s, {result.reason}"),

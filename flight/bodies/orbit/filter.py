@@ -3,10 +3,9 @@
 A step holds the coil commands and the measurements between two times. A step ends early when the coils are
 switched on or off, so that the dipole is nearly constant during a step. When a step has ended, the filter
 processes it with the mean commanded dipole and the mean of the gyro samples. Magnetometer samples are used
-only while the coils are off and their field has decayed. Within the step under way, the estimate is
-propagated by the model. A measurement of a past time, such as a star fix, is applied at its own time. For
-this, the filter returns to the beginning of the step that contains this time, and repeats all steps since
-then.
+only while the coils are off and their field has decayed. Within an incomplete step, the estimate is
+propagated by the model. A measurement of a past time, such as a star fix, is applied at its own time: the
+filter returns to the beginning of the step that contains this time, and repeats all steps since then.
 """
 
 from __future__ import annotations
@@ -615,9 +614,8 @@ class OrbitFilter:
         """
         self._settings = settings
         self._around = around
-        self._dipoles = DipoleHistory(
-            settings.history_ns + 2 * settings.step_ns
-        )  # a step may begin before the history
+        # A step may begin before the history.
+        self._dipoles = DipoleHistory(settings.history_ns + 2 * settings.step_ns)
         self._replay = StepReplay(settings, self._dipoles)
         self._free, self._steps = self._replay.free, self._replay.steps
         self._propagated = EstimatePropagation(self._free)
@@ -813,7 +811,7 @@ class OrbitFilter:
             self._refused_attitudes = 0 if was else self._refused_attitudes + 1
             if was:
                 self._placed_ns = m.time_ns
-            # A fine estimate restarts after several contradicting attitudes, a coarse estimate after one.
+            # A fine estimate restarts after several contradicting attitudes, a coarse one after the first.
             patience = REFUSALS_TO_RESTART if self.knowledge is Knowledge.FINE else 1
             if self._refused_attitudes >= patience:
                 self.begin(m, doubted=True)

@@ -163,7 +163,7 @@ class PointingPaths:
     def running(self, now_ns: int) -> RunningSlew | None:
         """Return the slew whose rest may be planned again, or None.
 
-        It is None before the slew begins, near its end, and while the last new plan has not begun.
+        The result is None before the slew begins, near its end, and while the newest plan has not begun.
         """
         point, followed = self.sample(now_ns), self._followed
         if point is None or followed is None or followed.slew is None or self._next is not None:
@@ -429,7 +429,7 @@ AGAIN_NS = 10_000_000_000
 REST_AGAIN_NS = 5_000_000_000
 """Shortest time (ns) between two plans for the rest of a slew."""
 _SMALLEST = 0.5
-"""Smallest plausible principal moment of inertia, relative to the smallest described one."""
+"""Smallest plausible principal moment of inertia, relative to the smallest described moment."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -557,7 +557,7 @@ class PointingPlanner:
             self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
 
     def _plan_rest(self, estimate: Estimate, goal: PointingTarget, now_ns: int) -> None:
-        """Submit the job that plans the rest of the running slew again, if it is not near its end."""
+        """Submit the job that plans the rest of the running slew again, unless the slew is near its end."""
         running = self._paths.running(now_ns)
         job = None
         with suppress(UsageError):  # the running plan is kept

@@ -120,7 +120,7 @@ class Store:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Create the folder if it does not exist. Raises UsageError if it cannot be created."""
+        """Create the folder if it does not exist. Raises UsageError if this fails."""
         self._folder = folder / "transfers"
         self.received = folder / "received"
         try:

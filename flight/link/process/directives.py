@@ -21,7 +21,7 @@ from flight.link.telemetry.packets import (
 )
 
 KINDS = ("configuration", "elements", "catalogue", "release")
-"""Kinds of files that the satellite receives. Each kind is also the name of a folder."""
+"""Kinds of files that the satellite receives. The name of a kind is also the name of a folder."""
 SUM_BYTES = 32
 LONGEST_COMMAND = 96
 """Maximum length (bytes) of a command in words, including the terminating zero byte."""

@@ -474,7 +474,7 @@ class StationSettings:
             0 for never.
         renewal: status file that `deploy/renewal.py` writes.
         idle_rate: data rate (bytes/s) up to which frames of idle data are sent.
-        encrypted: whether telemetry is encrypted. It is always authenticated.
+        encrypted: whether telemetry is encrypted in addition to its authentication.
         codes: codes of the lines, which count the corrected errors.
     """
 
@@ -681,7 +681,7 @@ class Station:
         self._report(*reports)
 
     def _executed(self, directive: Directive, done: Report) -> list[Report]:
-        """Execute a directive and return the reports due now; `done` is the report at its completion."""
+        """Execute a directive and return the reports due now. The report `done` states its completion."""
         match directive:
             case Play():
                 return self._playback.begin(directive, done)

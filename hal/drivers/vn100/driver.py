@@ -598,7 +598,7 @@ def _places(layout: OutputLayout) -> _Places | None:
 
 __all__ = ["OUTPUT_SET", "Vn100", "Vn100Settings"]
 
-_LONGEST_PACKET = 128  # maximum packet length (bytes), so that a false header causes a short delay
+_LONGEST_PACKET = 128  # maximum packet length (bytes), which limits the delay that a false header causes
 _POLL_STEP_NS = 1_000_000
 
 
