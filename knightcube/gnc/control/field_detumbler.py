@@ -1,7 +1,8 @@
 """Detumbling of a free satellite with the magnetometer, and with gyro and attitude if available.
 
 The field of the coils disturbs the magnetometer. The coils are therefore switched off periodically, first
-until the field of the coils has decayed, then to measure the field. The filter
+until the field of the coils has decayed, then to measure the field. The driven phase between two pauses is
+short while the estimated rate is uncertain, as with the magnetometer alone. The filter
 `knightcube.gnc.estimation.field_rate` uses the samples in these pauses to estimate all components of the body
 rate and the rotation of the field in inertial axes. A gyro sample gives the rate along the field at once. The
 momentum plan uses a predicted field. If the attitude is known, the field is predicted along the orbit.
@@ -226,6 +227,14 @@ BOUNDED = 0.02
 """Largest standard deviation (rad/s) of the rate across the field at which the coils may be driven."""
 SILENT_PERIODS = 2
 """Number of coil pauses without an accepted sample after which the coils are switched off again."""
+DRIFT = 0.015
+"""Rotation (rad) by one standard deviation of the rate after which a driven phase ends. A measured field is
+about as accurate, so that the field that the detumbler predicts is nearly as accurate as a measured one."""
+EXTRAPOLATED = 0.5
+"""Time after which the coils add no more energy to a body whose field is extrapolated, as a fraction of the
+horizon. A body that still rotates by then is in a field that does not rotate as extrapolated."""
+SHORTEST = 9
+"""Shortest driven phase, as a multiple of the pause, for a rate that is not accurate."""
 OLDEST_NS = 100_000_000
 """Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
 INSTANTS = 150
@@ -302,6 +311,7 @@ class FieldDetumbler:
         self._sigma, self._sigma_of = math.inf, self._filter.covariance
         # A residual momentum causes the fastest rotation about the axis of the smallest moment of inertia.
         self._rest = LEFT * braking.slow * float(np.linalg.eigvalsh(settings.inertia)[0])
+        self._pause_ns = schedule.settle_ns + schedule.measure_ns
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
@@ -317,6 +327,9 @@ class FieldDetumbler:
         self._accepted_ns = now_ns
         self._fastest = self._most_energy = math.inf
         self._initial_known = False
+        self._known_ns = now_ns
+        self._extrapolated = True
+        self._act_ns = self._shortest_ns
         self._filter.restart()
 
     def listens(self, time_ns: int) -> bool:
@@ -324,9 +337,8 @@ class FieldDetumbler:
         schedule = self._schedule
         if not self.trusted and time_ns - self._driven_ns >= schedule.settle_ns:
             return True
-        phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
-        inside = schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns
-        return time_ns >= self._begun_ns and inside
+        phase_ns = (time_ns - self._begun_ns) % (self._pause_ns + self._act_ns)
+        return time_ns >= self._begun_ns and schedule.settle_ns <= phase_ns < self._pause_ns
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
         """Accept a field (3,) T measured at `time_ns`, or ignore it if the field of the coils disturbed it.
@@ -355,6 +367,8 @@ class FieldDetumbler:
                 self._bounded = self._agreed >= TRUSTED and sigma < BOUNDED
         if self._filter.restarts != starts or (not accepted and not self.trusted):
             self._distrust()
+        longest_ns = DRIFT / self.rate_sigma / _SECOND
+        self._act_ns = round(min(self._schedule.act_ns, max(longest_ns, self._shortest_ns)))
 
     def dipole(self, now_ns: int) -> FloatArray:
         """Return the present dipole (3,) A m^2, zero while the field is measured or the rate is unknown."""
@@ -363,8 +377,11 @@ class FieldDetumbler:
             self._advance(max(now_ns, self._time_ns))
         if self.trusted and now_ns - self._accepted_ns > SILENT_PERIODS * schedule.period_ns:
             self._distrust()
-        phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
-        acting = phase_ns >= schedule.settle_ns + schedule.measure_ns
+        phase_ns = (now_ns - self._begun_ns) % (self._pause_ns + self._act_ns)
+        self._begun_ns = (
+            now_ns - phase_ns
+        )  # the driven phases differ in length, so each pause is a new origin
+        acting = phase_ns >= self._pause_ns
         self._commanded_ns = now_ns
         self.acts(self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE)
         return self._dipole
@@ -374,6 +391,15 @@ class FieldDetumbler:
         if self._dipole.any() or dipole.any():
             self._driven_ns = self._commanded_ns
         self._dipole = dipole
+
+    @property
+    def next_pause_ns(self) -> int:
+        """Time at which the coils are next switched off to measure the field, as of the last command."""
+        return self._begun_ns + self._pause_ns + self._act_ns
+
+    @property
+    def _shortest_ns(self) -> int:
+        return min(self._schedule.act_ns, SHORTEST * self._pause_ns)
 
     @property
     def trusted(self) -> bool:
@@ -424,9 +450,11 @@ class FieldDetumbler:
         if not self._initial_known:
             if sigma >= max(KNOWN, KNOWN_SHARE * speed):
                 return without_growth(dipole, [works])
-            self._initial_known = True
+            self._initial_known, self._known_ns = True, now_ns
             multiple = braking.spin_up if speed > braking.gentle else 1.0
             self._fastest, self._most_energy = multiple * speed, multiple * multiple * energy
+        if self._extrapolated and (now_ns - self._known_ns) * _SECOND > EXTRAPOLATED * braking.horizon:
+            self._most_energy = min(self._most_energy, energy)
         # Each bound is compared with a value that is one standard deviation of the rate above the estimate.
         upper = speed + sigma
         grows = [works] if energy * upper**2 >= self._most_energy * speed**2 else []
@@ -456,10 +484,11 @@ class FieldDetumbler:
         """Return a momentum plan in the present body axes."""
         found, times = self._filter, self._braking.instants
         expected = self._expected(now_ns)
+        self._extrapolated = expected is None
         if expected is None:
             ahead = rotating_field(found.field, found.change, times)
         else:
             ahead = aligned_to(expected, found.field)
-        share = self._schedule.act_ns / self._schedule.period_ns
+        share = self._act_ns / (self._pause_ns + self._act_ns)
         limit = share * float(np.mean(self._braking.limit))
         return momentum_plan(found.momentum, ahead, times, limit, self._rest)

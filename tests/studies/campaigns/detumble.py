@@ -4,10 +4,10 @@ Two craft, each in a Sun-synchronous, an ISS-like and an equatorial orbit. The l
 magnetometer. The law `attitude` also has a gyro with a bias, a coarse attitude and the orbit. The law
 `inertia` has the same sensors, but the body's moments and principal axes differ from the described ones by up
 to the default accuracies. The coils are off for a twentieth of each four seconds, as the magnetometer needs,
-and before the rate is known. Coils are commanded each quarter of a second, and as often as the body rotates
-by 0.3 rad. Each time is compared with a rigorous lower bound (`least_time`), which no control of these coils
-can beat. The bound assumes that the coils are never off and that a dipole of the largest strength has any
-direction.
+and before the rate is known. While the rate is uncertain, they are off for a tenth of each two seconds. Coils
+are commanded each quarter of a second, and as often as the body rotates by 0.3 rad. Each time is compared
+with a rigorous lower bound (`least_time`), which no control of these coils can beat. The bound assumes that
+the coils are never off and that a dipole of the largest strength has any direction.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ CLOSER, TRIES = (0.06, 0.02, 0.007), 60
 def least_time(
     momentum: FloatArray,
     field: FloatArray,
-    step: float,
+    step: FloatArray | float,
     reach: float,
     left: float,
     others: FloatArray | float = 0.0,
@@ -78,7 +78,7 @@ def least_time(
     Args:
         momentum: initial angular momentum (3,), N m s, inertial axes.
         field: magnetic field (n, 3), T, at the middles of n steps, in the same axes.
-        step: duration of a step, s. The result is at most n steps.
+        step: duration of all steps or of each step (n,), s. The result is at most their sum.
         reach: largest strength of the coils' dipole moment, A m^2.
         left: final momentum, N m s.
         others: largest torque of other causes, N m, for all steps or for each step (n,).
@@ -88,13 +88,15 @@ def least_time(
     tried[0] = momentum
     longest, worst = -1.0, tried[0]
     other = np.broadcast_to(np.asarray(others, dtype=float), len(field))[:, None]
+    steps = np.broadcast_to(np.asarray(step, dtype=float), len(field))
+    ends = np.concatenate([[0.0], np.cumsum(steps)])
     for close in (None, *CLOSER):
         if close is not None:
             tried = worst + close * rng.standard_normal((TRIES, 3))
         tried /= np.linalg.norm(tried, axis=1, keepdims=True)
         pull = reach * np.linalg.norm(np.cross(field[:, None], tried), axis=2) + other
-        removed = np.vstack([np.zeros(len(tried)), np.cumsum(pull, axis=0)]) * step
-        times = _crossed(removed, tried @ momentum - left) * step
+        removed = np.vstack([np.zeros(len(tried)), np.cumsum(pull * steps[:, None], axis=0)])
+        times = np.interp(_crossed(removed, tried @ momentum - left), np.arange(len(ends)), ends)
         if times.max() > longest:
             longest, worst = float(times.max()), tried[times.argmax()]
     return longest
@@ -176,26 +178,27 @@ def run(case: Case) -> Result:
     bound = _Bound(flight)
     fastest = 0.0
     longest = wanted.get("longest", LONGEST)
-    seconds = 0
-    while seconds < longest:
-        start_ns = seconds * SECOND  # of a window
+    while flight.time_ns < longest * SECOND:
+        start_ns = flight.time_ns  # of a window
         flight.act(np.zeros(3))
         for phase_ns in SAMPLES_NS:
             flight.advance(start_ns + phase_ns)
             law.sample()
         acting_ns = start_ns + SCHEDULE.settle_ns + SCHEDULE.measure_ns
-        seconds += SCHEDULE.period_ns // SECOND
-        while not law.trusted and acting_ns < seconds * SECOND - SAMPLES_NS.step:
+        end_ns = start_ns + SCHEDULE.period_ns
+        while not law.trusted and acting_ns < end_ns - SAMPLES_NS.step:
             flight.advance(acting_ns)
             law.sample()
             acting_ns += SAMPLES_NS.step
-        act_ns = seconds * SECOND - acting_ns
+        if law.trusted:
+            end_ns = max(law.next_pause_ns, acting_ns)
+        act_ns = end_ns - acting_ns
         speed = float(np.linalg.norm(flight.motion.rate))
         cycles = max(LEAST_CYCLES, int(np.ceil(speed * act_ns / SECOND / 0.3)))
         for cycle in range(cycles):
             flight.advance(acting_ns + act_ns * cycle // cycles)
             flight.act(law.dipole())
-        flight.advance(seconds * SECOND)
+        flight.advance(end_ns)
         law.dipole()
         bound.pass_window()
         fastest = max(fastest, float(np.linalg.norm(flight.motion.rate)))
@@ -204,7 +207,7 @@ def run(case: Case) -> Result:
     rate = float(np.linalg.norm(flight.motion.rate))
     return {
         **wanted,
-        "seconds": float(seconds),
+        "seconds": flight.time_ns / SECOND,
         "least": bound.least(),
         "rate": rate,
         "lost": bool(rate >= SLOW),
@@ -229,11 +232,13 @@ class _Bound:
         self._momentum = attitude.T @ (np.array(craft.inertia) * rate)
         self._fields = [flight.body.orbit_truth().field]
         self._others = [self._other()]
+        self._times_ns = [flight.time_ns]
 
     def pass_window(self) -> None:
         """Keep the field and the largest torque of other causes at the end of a window."""
         self._fields.append(self._flight.body.orbit_truth().field)
         self._others.append(self._other())
+        self._times_ns.append(self._flight.time_ns)
 
     def least(self) -> float:
         """Return the lower bound of the time until the body is slow, s; it is at most the time so far."""
@@ -243,7 +248,7 @@ class _Bound:
         reach = float(np.linalg.norm(currents @ craft.coil_dipole.T, axis=1).max())
         residual = craft.constant_dipole + WALK * craft.walking_dipole
         reach += float(np.linalg.norm(residual) + np.linalg.norm(craft.sunlit_dipole))
-        step = SCHEDULE.period_ns / SECOND
+        step = np.diff(self._times_ns) / SECOND
         left = max(craft.inertia) * SLOW
         middles = 0.5 * (fields[1:] + fields[:-1])
         return least_time(self._momentum, middles, step, reach, left, np.maximum(others[1:], others[:-1]))
@@ -294,6 +299,10 @@ class _Law:
     @property
     def trusted(self) -> bool:
         return self._law.trusted
+
+    @property
+    def next_pause_ns(self) -> int:
+        return self._law.next_pause_ns
 
     def dipole(self) -> FloatArray:
         return self._law.dipole(self._flight.time_ns)

@@ -62,10 +62,10 @@ def unlike(described: FloatArray, limit: float, seed: int) -> Body:
     return Body(described, principal @ np.diag(drawn) @ principal.T, limit)
 
 
-def detumbler(body: Body | None = None) -> FieldDetumbler:
+def detumbler(body: Body | None = None, horizon: float = 1500.0) -> FieldDetumbler:
     described, limit = (INERTIA, LIMIT) if body is None else (body.described, body.limit)
     noise = FieldRateSettings(inertia=described, field_sigma=2e-7, torque_walk=1e-4 if body is None else 1e-5)
-    return FieldDetumbler(SCHEDULE, FieldDetumblerSettings(limit=limit), noise)
+    return FieldDetumbler(SCHEDULE, FieldDetumblerSettings(limit=limit, horizon=horizon), noise)
 
 
 def fly(
@@ -77,13 +77,14 @@ def fly(
     late: float = 0.0,
     body: Body | None = None,
     seed: int = 4,
+    horizon: float = 1500.0,
 ) -> FloatArray:
     """Return the speed (n,) rad/s of each cycle; `gyro` makes its reading of the rate.
 
     The field turns by `sooner` times what it does in orbit; a sample is `late` s older than the last command.
     The speed of a `body` other than the one described is that of its energy, in a body of its mean moment.
     """
-    law, rng = detumbler(body), np.random.default_rng(seed)
+    law, rng = detumbler(body, horizon), np.random.default_rng(seed)
     limit, inertia = (LIMIT, INERTIA) if body is None else (body.limit, body.inertia)
     speeds = []
     law.begin(0)
@@ -162,6 +163,14 @@ def test_with_a_gyro_a_fast_spin_along_the_field_is_stopped_soon_at_thrice_its_r
     assert speeds[-1] < math.radians(0.5)
 
 
+def test_coils_add_no_energy_when_an_extrapolated_field_should_long_have_let_them_stop_the_body() -> None:
+    """The spin along the field would be made faster for more than 60 s, which is half of this horizon."""
+    speeds = fly(np.array([0.0, 0.0, 0.1]), 120.0, gyro=lambda rate: rate + BIAS, horizon=80.0)
+    cycles = round(42.0 / (1e-9 * CYCLE_NS))
+    assert speeds[cycles] > 1.1 * speeds[0]
+    assert speeds[cycles:].max() < 1.02 * speeds[cycles]
+
+
 def test_a_gyro_that_is_stuck_does_not_mislead() -> None:
     speeds = fly(np.array([0.1, 0.05, 0.03]), 200.0, gyro=lambda _: np.zeros(3))
     assert speeds[-1] < 0.5 * speeds[0]
@@ -231,6 +240,39 @@ def test_the_coils_act_soon_after_the_begin_by_a_rate_that_is_bounded(gyro: bool
     assert law.rate is not None
     across = np.cross(FIELD, law.rate - rate) / np.linalg.norm(FIELD)
     assert np.linalg.norm(across) < 3.0 * BOUNDED
+
+
+LONG = WindowSchedule(100_000_000, 100_000_000, 3_800_000_000)
+
+
+def driven(gyro: bool) -> tuple[FieldDetumbler, list[float]]:
+    """Return a detumbler of a body that rotates steadily, and the durations (s) of its driven phases."""
+    noise = FieldRateSettings(inertia=INERTIA, field_sigma=2e-7, torque_walk=1e-4)
+    law = FieldDetumbler(LONG, FieldDetumblerSettings(limit=LIMIT), noise)
+    rate, rng = np.array([0.1, 0.05, 0.14]), np.random.default_rng(1)
+    law.begin(0)
+    begun_ns, found, before = 0, [], False
+    for now_ns in range(0, 20_000_000_000, 25_000_000):
+        field = attitude_matrix(from_rotation_vector(1e-9 * now_ns * rate)) @ FIELD
+        law.sample(now_ns, field + 2e-7 * rng.standard_normal(3), rate + BIAS if gyro else None)
+        acts = bool(law.dipole(now_ns).any())
+        if acts and not before:
+            begun_ns = now_ns
+        if before and not acts:
+            found.append(1e-9 * (now_ns - begun_ns))
+            assert law.listens(now_ns + LONG.settle_ns)
+        law.acts(np.zeros(3))  # the coils are disconnected, so the body keeps its rate
+        before = acts
+    return law, found
+
+
+def test_the_driven_phase_is_short_while_the_rate_is_uncertain_and_long_with_a_gyro() -> None:
+    law, alone = driven(gyro=False)
+    assert law.rate_sigma > 0.005
+    assert alone[1:4] == pytest.approx([1.8, 1.8, 1.8], abs=0.05)
+    law, helped = driven(gyro=True)
+    assert law.rate_sigma < 0.004
+    assert helped[1:4] == pytest.approx([3.8, 3.8, 3.8], abs=0.05)
 
 
 def test_after_another_mode_drove_the_coils_they_settle_before_the_first_sample() -> None:
