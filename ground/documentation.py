@@ -132,7 +132,7 @@ def _details(field: Field) -> dict[str, Any]:
 
 
 def meaning_of(field: Field) -> str:
-    """Return a text of a field's meaning, states or bits, ranges and counter wrap."""
+    """Return a text about a field: its meaning, states or bits, ranges and counter wrap."""
     parts = [field.meaning] if field.meaning else []
     levels = {number: f" ({level})" for number, level in field.alarms}
     for word, labels in (("", field.states), ("bits: ", field.bits)):

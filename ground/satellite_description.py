@@ -30,7 +30,7 @@ _YEAR_RATE = 2.0 * math.pi / (365.2422 * 86_400.0)
 _EQUATOR_FIELD = 2.98e-5
 """Field of the Earth's dipole at the equator at one Earth radius, T [IGRF-13]."""
 _OFFSET, _DRAG_COEFFICIENT, _SUN_PRESSURE = 0.02, 2.2, 4.56e-6
-"""Mass offset (m) that the CubeSat Design Specification allows, drag coefficient, light pressure (Pa)."""
+"""Centre of mass offset (m) [CubeSat Design Specification], drag coefficient, sunlight pressure (Pa)."""
 _CURRENT_ERROR, _CURRENT_SIGMA = 3.5e-3 / 0.148, 2.0e-3 / 0.148
 """Bound of the simulated current error, and assumed noise, relative to the limit [as in `orbit`]."""
 _STRAY_FIELD = 7.4e-5

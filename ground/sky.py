@@ -178,8 +178,7 @@ def directions_of_bodies(julian_date: float) -> dict[str, FloatArray]:
 
 
 _SAME_PX = 0.1
-"""Distance (px) between optical axis and image centre above which the report states the coordinates of
-each."""
+"""Distance (px) between optical axis and image centre above which both points are reported."""
 
 
 def sky_facts(sky: SkyMap | None, bodies: Sequence[SkyBody], reversed_rows: bool = False) -> dict[str, Any]:

@@ -248,7 +248,7 @@ def _add_verifiers(command: Element, layout: Layout) -> None:
             _add_condition(either, "verification_stage", dict(STAGES)[stage])
         window_of = {"timeToStopChecking": window, "timeWindowIsRelativeTo": "commandRelease"}
         SubElement(verifier, "CheckWindow", window_of)
-        if kind in {"Complete", "Failed"}:  # XTCE allows a returned parameter for these verifiers only
+        if kind in {"Complete", "Failed"}:  # only these verifiers may have a parameter
             SubElement(verifier, "ReturnParmRef", {"parameterRef": "verification_text"})
 
 

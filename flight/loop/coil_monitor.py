@@ -475,7 +475,7 @@ class CoilMonitor:
 
     @property
     def _unknown(self) -> str:
-        """The reason why a coil's current may differ from its command; empty if there is none."""
+        """The reason why a coil's current may differ from its command; empty if none differs."""
         return self._leg.suspicion or self._strangeness or self._weak
 
     @property

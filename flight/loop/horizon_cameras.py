@@ -123,7 +123,7 @@ class HorizonCameraTask:
                 self._errors[number] = str(error)
                 continue
             if frame is None or frame.sequence <= self._sequences[number]:
-                continue  # a repeated frame does not count as a new one
+                continue  # a repeated frame does not count as a new frame
             self._sequences[number] = frame.sequence
             before = self._pictures[number]
             self._pictures[number] = frame.pixels[::_SPARSE, ::_SPARSE].tobytes()

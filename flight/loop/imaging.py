@@ -522,7 +522,7 @@ class Imaging:
                 self._facts.update(facts.CAMERA_LOST, True, now_ns, f"no frame for {age_ns * 1e-9:.1f} s")
             return
         if frame.sequence <= self._last_sequence:
-            # A repeated frame does not count as a new one.
+            # A repeated frame does not count as a new frame.
             text = f"frame {frame.sequence} was delivered again"
             self._events.report(events.CAMERA_FROZEN, now_ns, text)
             self._report.record(frame, StreakStatus.FROZEN.value, None, now_ns, False)

@@ -68,7 +68,7 @@ LONGEST_LABEL = 32
 Label = Annotated[str, Meta(max_length=LONGEST_LABEL)]
 
 REMEMBERED = 32
-"""Number of the newest unclean shutdowns that are stored."""
+"""Maximum number of unclean shutdowns in the stored state."""
 
 
 class StatePart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -560,8 +560,8 @@ class StateKeeper:
 
         The time `window` is the operating time (s) within which an unclean shutdown counts as recent. The
         digest `devices` identifies the present devices; parameters learned for other devices are discarded.
-        The number `boots` is the highest boot number in other files. If the state has a smaller boot count,
-        the state is outdated or lost, and the last boot counts as unclean.
+        The argument `boots` is the highest boot number that `note_boot` has written. If the state has a
+        smaller boot count, the state is outdated or lost, and the last boot counts as unclean.
         """
         self._store = store
         self._notices = notices

@@ -5,8 +5,8 @@ direction of the torque is preserved. The sent commands are compared with the su
 motion (`flight.loop.coil_monitor`). A verdict that a coil is broken activates a fact. The fact reports an
 event, whose reaction excludes the axis.
 
-All currents in the loop are effective currents: those of healthy coils with the same dipole. Only the coil
-drive converts them to the currents on the wire, by the signs and gains that the coil monitor has found.
+All currents in the loop are effective currents: those of healthy coils with the same dipole. The coil
+drive converts effective currents to wire currents by the signs and gains that the coil monitor has found.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class CoilDrive:
                 self._facts.update(facts.COILS_BROKEN[verdict.axis], True, now_ns, verdict.text)
 
     def _begin_trial(self, axis: int, text: str, now_ns: int) -> None:
-        """Use a coil again that the monitor tries without a command."""
+        """Use an excluded coil again, because the coil monitor begins a trial of this coil."""
         self._reported.discard(axis)
         self._facts.release(facts.COILS_BROKEN[axis])
         self.isolate()

@@ -306,12 +306,12 @@ class Camera(Section, frozen=True, kw_only=True):
     `device` is the real camera.
 
     A frame in which stars form streaks is exposed for a time within the range `streak_exposure` (s) that
-    depends on the body's rate. All other frames, and all frames without `streak_exposure`, are exposed for
-    `exposure` s. While the attitude is fine, a frame is taken every `fine_period` s, if this value is given,
-    otherwise every `period` s. If `max_rate` is given, no exposure begins while the body rotates faster than
-    `max_rate` rad/s. A frame counts as late `late_after` s after the end of its exposure, and vision counts
-    as slow if a frame takes longer than `vision_slow_after` s. The newest `keep_frames` frames are kept in
-    the folder `frames` of the run.
+    depends on the body's rate. Frames without streaks, and all frames if `streak_exposure` is omitted, are
+    exposed for `exposure` s. While the attitude is fine, a frame is taken every `fine_period` s, if this
+    value is given, otherwise every `period` s. If `max_rate` is given, no exposure begins while the body
+    rotates faster than `max_rate` rad/s. A frame counts as late `late_after` s after the end of its exposure,
+    and vision counts as slow if a frame takes longer than `vision_slow_after` s. The newest `keep_frames`
+    frames are kept in the folder `frames` of the run.
     """
 
     device: V4l2Device | AravisDevice | None = None

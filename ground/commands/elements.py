@@ -251,7 +251,7 @@ def read_fixes(path: Path) -> Fixes:
 
 
 def _celestial(dates: FloatArray, states: FloatArray) -> Fixes:
-    """Return the fixes of states (n, 3 or 6), ITRS: positions, and velocities with respect to the ground."""
+    """Return celestial fixes from ITRS states (n, 3 or 6): positions and, if given, ITRS velocities."""
     turns = np.array([celestial_to_terrestrial(float(date)) for date in dates]).reshape(-1, 3, 3)
     positions = np.einsum("nji,nj->ni", turns, states[:, :3])
     if states.shape[1] == 3:

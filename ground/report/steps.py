@@ -223,7 +223,7 @@ def judged_steps(
 
 
 def _step_ends(packets: PacketArray) -> FloatArray:
-    """Return the times, s, at which a commanded mode or a mode without steering ended any step."""
+    """Return the times (n,), s, at which a commanded mode or a mode without steering began."""
     by_command = np.array([text_of(row["trigger"]).startswith("commanded") for row in packets], dtype=bool)
     steering = np.isin(packets["mode"], [int(mode) for mode in STEERING])
     return seconds(packets)[by_command | ~steering]

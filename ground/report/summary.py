@@ -239,7 +239,7 @@ def _modes(packets: PacketArray) -> list[Object]:
 
 
 def _health(packets: PacketArray) -> Object | None:
-    """Return how long each stream was good, active facts and resources, or None without health packets."""
+    """Return availability of the streams, active facts and resources, or None without health packets."""
     if not len(packets):
         return None
     streams = {

@@ -191,7 +191,7 @@ def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
 def seed_number(text: str) -> int:
     """Return the seed given as an argument.
 
-    Raises ArgumentTypeError if the seed does not fit the flight log.
+    Raises ArgumentTypeError if the seed is not a whole number from 0 to 2^64 - 1.
     """
     try:
         value = int(text)

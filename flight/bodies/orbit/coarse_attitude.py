@@ -200,7 +200,7 @@ class HorizonCameraFeed:
 
     @property
     def needed(self) -> bool:
-        """Whether horizon frames can improve the attitude; in eclipse only a lost attitude."""
+        """Whether horizon frames can improve the attitude. In eclipse they improve only a lost attitude."""
         if self._filter.worst_sigma <= NEEDED_SIGMA:
             return False
         around = self._environment.at(self._filter.measured_ns)

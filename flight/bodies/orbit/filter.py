@@ -614,7 +614,7 @@ class OrbitFilter:
         """
         self._settings = settings
         self._around = around
-        # A step may begin before the history.
+        # Dipoles are kept longer than the history, because its first step may begin earlier.
         self._dipoles = DipoleHistory(settings.history_ns + 2 * settings.step_ns)
         self._replay = StepReplay(settings, self._dipoles)
         self._free, self._steps = self._replay.free, self._replay.steps

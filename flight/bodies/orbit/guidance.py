@@ -231,7 +231,7 @@ class PointingTargetLaw:
 
 
 def target_of(target: Target) -> PointingTarget:
-    """Return the pointing target in the entry of a numbered target of a satellite."""
+    """Return the pointing target of a satellite's numbered target."""
     law = target.law
     assert isinstance(law, PointingTargetLaw), "only the satellite's own targets reach its planner"
     return law.target

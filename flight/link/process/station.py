@@ -150,7 +150,7 @@ class UdpLine:
             self._socket.close()
             raise UsageError(f"link.udp: {address} cannot be listened to: {error}") from error
         if peers is not None:
-            with contextlib.suppress(OSError):  # a kernel without socket filters leaves the work to `receive`
+            with contextlib.suppress(OSError):  # without a socket filter, `receive` does it
                 _accept_only(self._socket, peers)
 
     @property
