@@ -438,7 +438,7 @@ class PointingJob:
         sizes: estimated sizes (9,) of the disturbance torques, N m.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
         areas: relative areas (3,) of the faces on which air and sunlight act.
-        slew: parameters of slews, or None if the body always approaches the law without a slew.
+        slew: parameters of slews, or None if the body always approaches the attitude law without a slew.
         running: the running slew whose rest is planned again, or None for a new path.
         sight: the sighted object to which to point instead of `target`; None for the target.
     """
@@ -475,7 +475,7 @@ def run(job: PointingJob) -> PointingTable | None:
 
     The result is None if the rest of a running slew was requested and the running plan should be kept. The
     computation takes about one second, two seconds with a slew, and a tenth of a second for the rest of a
-    slew. Raises FlightError if the magnetic field is unknown, and UsageError if the law does not define an
+    slew. Raises FlightError if the magnetic field is unknown, and UsageError if the target does not define an
     attitude.
     """
     if job.running is not None and job.slew is not None:

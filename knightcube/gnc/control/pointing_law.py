@@ -27,10 +27,10 @@ from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
 
 LARGEST_ROTATION = math.radians(20.0)
-"""Largest rotation error (rad) used by the law; larger errors are reduced to this error, because the pointing
-law is linear."""
+"""Largest rotation error (rad) that the pointing law uses. Larger errors are reduced to this error, because
+the pointing law is linear."""
 LARGEST_RATE = math.radians(1.0)
-"""Largest rate error (rad/s) used by the law; larger rate errors are reduced to this error."""
+"""Largest rate error (rad/s) that the pointing law uses, and to which larger errors are reduced."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,7 @@ class PointingLaw:
     """The feedback law that computes dipole moments from a pointing table."""
 
     def __init__(self, table: PointingTable, limit: float | FloatArray) -> None:
-        """Create the law for a table and the dipole limit (A m^2) along each body axis.
+        """Create the pointing law for a pointing table and the dipole limit (A m^2) along each body axis.
 
         The limit is equal for all axes or has shape (3,).
         """

@@ -14,9 +14,9 @@ constant during a step. The affine part of the error model has one column for ea
 control offset k is linear in the affine part of the error model and has the same columns. A linear-quadratic
 sweep also supports controls other than the dipole moment.
 
-The path minimises the squared rotation error relative to the law plus the squared dipole moment, in the
-predicted field and torques. The path obeys the full equations of motion and the limit of the coils. The path
-is found by iterative linear-quadratic sweeps (Li & Todorov 2004, ICINCO, and Tassa, Erez & Todorov 2012,
+The path minimises the squared rotation error relative to the attitude law plus the squared dipole moment, in
+the predicted field and torques. The path obeys the full equations of motion and the limit of the coils. The
+path is found by iterative linear-quadratic sweeps (Li & Todorov 2004, ICINCO, and Tassa, Erez & Todorov 2012,
 IROS). Each sweep linearises the equations of motion about the last motion and simulates the corrected motion.
 Because coils cause no torque along the field, the first iterations from a large error would give tumbling
 motions. The first sweeps therefore allow a torque along the field, at a cost that is increased until this
@@ -323,12 +323,12 @@ class PathCriterion:
     """The terms of the cost of a step of a path.
 
     Attributes:
-        state: weights (6, 6) of rotation and rate errors relative to the law.
+        state: weights (6, 6) of rotation and rate errors relative to the attitude law.
         dipole: weight of the squared dipole moment of each axis.
         end: cost-to-go of following the attitude law after the path. The first column of the linear part of
-            `end` is for the law and the expected torques, and each further column is for one disturbance
-            torque of unit size.
-        shape: disturbance torques of unit size (n + 1, 3, sizes), in the axes of the law.
+            `end` is for the attitude law and the expected torques, and each further column is for one
+            disturbance torque of unit size.
+        shape: disturbance torques of unit size (n + 1, 3, sizes), in the axes of the commanded attitude.
         fastest: rate above which the cost increases steeply (see `EXCESS`), rad/s.
     """
 
@@ -371,11 +371,11 @@ class MotionGains:
 def best_path(
     expected: PathConditions, initial: AttitudeReferences, criterion: PathCriterion
 ) -> tuple[PlannedMotion, MotionGains]:
-    """Return the best path from the first state of `initial` to the law, and the gains along the path.
+    """Return the best path from the first state of `initial` to the attitude law, with feedback gains.
 
-    The motion `initial` (n + 1,) is an initial guess that ends at the law and need not be feasible with
-    coils. The computation takes 0.3 ms per instant and sweep. Raises PlanningError if the body rotates too
-    fast to be propagated.
+    The motion `initial` (n + 1,) is an initial guess that ends on the attitude law and need not be feasible
+    with coils. The computation takes 0.3 ms per instant and sweep. Raises PlanningError if the body rotates
+    too fast to be propagated.
     """
     rest = PlannedMotion(initial.quaternion, initial.rate, np.zeros((len(initial.times) - 1, 4)))
     first = _first(expected, rest, _swept(expected, rest, criterion, 1.0, given=True))
@@ -396,7 +396,7 @@ def best_path(
 
 
 def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) -> PlannedMotion:
-    """Return the motion with which the sweeps start.
+    """Return the motion from which the first linear-quadratic sweep starts.
 
     The motion is propagated with the given gains, or without control if the motion diverges with the gains.
     The torque along the field is not limited, so far from the motion `rest` the gains may rotate the body by

@@ -168,10 +168,11 @@ def best_course(
 ) -> tuple[PlannedMotion, MotionGains] | None:
     """Return the best motion over all instants from the first state of `initial`, with feedback gains.
 
-    The initial guess `initial` (n + 1,) ends at the law and covers the part that will be flown. The weights
-    `state` (6, 6) of the errors and `dipole` of the dipole moment are computed by `step_costs`. Returns None
-    if no motion is found within `STEPS` iterations or if the motion exceeds the limit of the coils. The
-    result is also None if the body rotates faster than `fastest` (rad/s) in the part that will be flown.
+    The initial guess `initial` (n + 1,) ends on the attitude law and covers the part that will be flown. The
+    weights `state` (6, 6) of the errors and `dipole` of the dipole moment are computed by `step_costs`.
+    Returns None if no motion is found within `STEPS` iterations or if the motion exceeds the limit of the
+    coils. The result is also None if the body rotates faster than `fastest` (rad/s) in the part that will be
+    flown.
     """
     count, first = len(expected.field) - 1, len(initial.times)
     quaternion = np.concatenate([initial.quaternion, expected.wanted.quaternion[first:]])
@@ -296,7 +297,7 @@ class PointingWeights:
         turn: rotation error about one axis that has a cost of one, rad.
         rate: rate error about one axis that has a cost of one, rad/s.
         dipole: dipole moment along one axis that has a cost of one, A m^2.
-        fastest: rate above which the cost increases steeply while the body approaches the law (see
+        fastest: rate above which the cost increases steeply while the body approaches the attitude law (see
             `pointing_path.EXCESS`), rad/s.
         roll: rotation error with unit cost about the unit vector `axis` (3,), rad, if rotations about this
             axis weigh less than other rotations.
@@ -369,8 +370,8 @@ class PointingPreview:
 
     Attributes:
         wanted: the law.
-        initial: initial guess (n + 1,) of the motion from the body's state to the law, not necessarily
-            feasible.
+        initial: initial guess (n + 1,) of the motion from the body's state to the attitude law, not
+            necessarily feasible.
         field, position: magnetic field (T) and position (m), each (m, 3), ICRS.
         pressures: pressures of air and sunlight at the m instants.
         sizes: present estimates (9,) of the sizes of the disturbance torques, N m.
@@ -434,9 +435,9 @@ def _beyond(
     dipole: float,
     shape: FloatArray,
 ) -> CostToGo:
-    """Return the cost-to-go of following the law from the instant with index `begin` on.
+    """Return the cost-to-go of following the attitude law from the instant with index `begin` on.
 
-    The first column of the linear part is for the law and the expected torques.
+    The first column of the linear part is for the attitude law and the expected torques.
     """
     air, light = ahead.pressures.air[begin:], ahead.pressures.light[begin:]
     pressed = [(ahead.sizes[AIR], air), (ahead.sizes[LIGHT], light)]

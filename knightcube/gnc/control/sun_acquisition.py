@@ -143,8 +143,8 @@ rate limits are below the rates at which the flight software starts detumbling."
 FASTEST_ROLL = 0.0105
 """Roll rate (rad/s) about the Sun above which a torque about the Sun is no longer preferred."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
-"""Bandwidth w (rad/s) and damping ratio z of the Sun pointing law. At one radian from the Sun, the law
-demands at most the fraction `SHARE` of the torque that the coils can produce."""
+"""Bandwidth w (rad/s) and damping ratio z of the Sun pointing law. At one radian from the Sun, the pointing
+law demands at most the fraction `SHARE` of the torque that the coils can produce."""
 RESIDUAL = 0.05
 """Largest estimated residual dipole moment, as a fraction of the coils' limit."""
 _FIELD = 3e-5

@@ -3,14 +3,14 @@
 An attitude law aligns one body axis exactly with a first direction, and a second body axis with a second
 direction as closely as possible (TRIAD: Black 1964). A direction can be fixed in inertial axes, fixed in the
 orbital axes (nadir, velocity, orbit normal), or point to the Sun or to a place on the ground. If the roll is
-free, the second direction follows from the attitude at the start of the law. The second direction is then
-fixed in the same axes, inertial or orbital, as the first direction, so that the body does not rotate about
-the first direction.
+free, the second direction follows from the attitude at which the attitude law begins. The second direction is
+then fixed in the same axes, inertial or orbital, as the first direction, so that the body does not rotate
+about the first direction.
 
 The law of a pointing target aligns the pointing axis with the goal and the body axis `across` with a second
 direction: the velocity for goals below, nadir for the velocity itself, the celestial pole for the Sun. A
-given roll is an additional rotation about the pointing axis. A free roll is the roll of the body when the law
-begins.
+given roll is an additional rotation about the pointing axis. A free roll is the roll of the body when the
+attitude law begins.
 """
 
 from __future__ import annotations
@@ -252,9 +252,9 @@ def approach(
 ) -> Attitudes:
     """Return the commanded transition from an attitude (4,) and a body rate (3,), rad/s, to an attitude law.
 
-    The transition lasts from `begin` to `end` s. The rotation vector relative to the law is a quintic
-    polynomial of time, which starts with the rate of the body and ends at zero rate. Raises UsageError unless
-    `end` is after `begin`.
+    The transition lasts from `begin` to `end` s. The rotation vector relative to the attitude law is a
+    quintic polynomial of time, which starts with the body's relative rate and ends at zero rate. Raises
+    UsageError unless `end` is after `begin`.
     """
     if not end > begin:
         raise UsageError(f"an approach from {begin} to {end} s: the end must be after the start")
