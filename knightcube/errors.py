@@ -15,7 +15,7 @@ class InputError(UsageError):
     """A file, or a value in a file, that cannot be used.
 
     Attributes:
-        where: file, or dotted name of the value.
+        where: path of the file, or dotted name of the configuration value.
         problem: description of the fault and its remedy.
     """
 

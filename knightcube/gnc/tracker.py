@@ -153,7 +153,7 @@ def tides(observer: FloatArray) -> FloatArray:
 def predict(
     state: LineOfSightState, time_ns: int, motion: MotionModel, tide: FloatArray | None = None
 ) -> LineOfSightState:
-    """Return the line of sight propagated to a later time. Raises ValueError for an earlier time.
+    """Return the line of sight propagated to `time_ns`. Raises ValueError for a time in its past.
 
     The gravity gradient is `tide` (3, 3), 1/s^2, or None if unknown.
     """

@@ -177,7 +177,7 @@ class AdaptiveController:
         inertia = plant.inertia / plant.torque_constant
         self._gain = inertia * settings.bandwidth
         begin = np.array([plant.inertia, plant.stiffness, plant.damping, 0.0]) / plant.torque_constant
-        # Stiffness may use half the current limit at 1 rad, and damping half the limit at 0.2 rad/s.
+        # The stiffness may need half the current limit at 1 rad, and the damping half the limit at 0.2 rad/s.
         self._range = np.array([0.5 * inertia, 0.5 * self._limit, 2.5 * self._limit, 0.5 * self._limit])
         self._low = np.maximum(begin - self._range, [0.5 * inertia, 0.0, 0.0, -np.inf])
         self._high = begin + self._range

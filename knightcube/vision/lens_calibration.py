@@ -75,7 +75,7 @@ _SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
 """Settings of the star tracker in later passes, which do not accept mirrored images."""
 _REVERSED = "it shows the mirrored sky, but the other pictures do not"
 _MIN_USED = 0.5
-"""Minimum fraction of accepted matches of a frame at which the frame belongs to the common lens."""
+"""Minimum fraction of accepted star matches for a frame to be included in the fit of the common lens."""
 
 
 class CalibrationError(FlightError):

@@ -109,7 +109,7 @@ def fit_elements(
 
 
 class _Fit:
-    """The least-squares problem of elements for states in ICRS axes: positions, m, and velocities, m/s."""
+    """The least-squares fit of two-line elements to states (m, and m/s) in ICRS axes."""
 
     def __init__(self, dates: FloatArray, states: FloatArray) -> None:
         """`states` has the shape (n, 3) of positions, or (n, 6) with velocities."""

@@ -158,7 +158,8 @@ class CoilMap:
     def linear_shares(self, used: BoolArray) -> FloatArray:
         """Return the matrix (n, n) from currents to the currents of least heat with the same dipole moment.
 
-        Only the coils `used` (n,) carry the currents of least heat, which are linear in the dipole moment.
+        Only the coils `used` (n,) carry the currents of least heat, which depend linearly on the given
+        currents because current limits are ignored.
         """
         weights = np.sqrt(self.resistance / self.resistance.max())
         inverse = np.linalg.pinv(self.dipoles * used / weights) / weights[:, None]

@@ -403,7 +403,7 @@ _COVERED = 1.25
 _LONGEST = 10_000.0
 """Longest prediction (s), a revolution and a quarter at an altitude of 2,200 km."""
 LEAD = 2.0
-"""Time (s) from the estimated state to the start of the table, in which the table is computed."""
+"""Time (s) between the estimated state and the start of the table, during which the table is computed."""
 FAR = math.radians(15.0)
 """Angle (rad) from the attitude law above which the body slews to the law, if slews are configured."""
 WAY = 4.0

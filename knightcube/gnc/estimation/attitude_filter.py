@@ -71,8 +71,8 @@ _MAXIMUM_CHANGE = 3.0
 """Largest innovation that a coil fault can explain, as a multiple of the largest change of the rate by the
 coils. A reversed coil causes twice the change of the rate, and the uncertain age of a sample adds to this."""
 _SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
-"""Bounds of the time (s) between gyro samples during which wrong coil currents may have acted. Wrong currents
-that may act for longer than the upper bound would explain any innovation after a long gap."""
+"""Bounds of the time (s) between gyro samples during which wrong coil currents may have acted. If wrong
+currents were assumed to act for longer, they would explain any innovation after a long gap."""
 _PROOF = 1.0
 """Time span (s) of the gyro samples that must confirm the commands before the commands are trusted again."""
 _SHARE_SIGMA = 0.2
@@ -164,7 +164,7 @@ class CommandCheck:
     def _follows(self, variance: FloatArray) -> bool:
         """Return whether the recorded rates are a constant plus the changes that the commands should cause.
 
-        If so, also set the scale of the gyro noise.
+        If the rates agree with the commands, the scale of the gyro noise is updated.
         """
         _, rates, commanded = zip(*self._samples, strict=True)
         weight = 1.0 / np.sqrt(variance)

@@ -52,7 +52,7 @@ class StateBlock:
 
 
 def slices(sizes: Mapping[str, int]) -> list[slice]:
-    """Return the indices of consecutive blocks as slices. The sizes of the blocks are given by name."""
+    """Return the slices of consecutive blocks whose numbers of elements are given by block name."""
     ends = np.cumsum(list(sizes.values())).tolist()
     return [slice(end - size, end) for end, size in zip(ends, sizes.values(), strict=True)]
 

@@ -19,7 +19,7 @@ dipole plus this matrix times the commanded dipole. The blocks `gyro_matrix` and
 factors and misalignments of gyro and magnetometer (Pittelkau 2001, JGCD 24(6)).
 
 The block `camera` is the misalignment of the star camera. The attitude of the star camera is known more
-accurately than the attitude of the body, which has the uncertainty of this misalignment in addition. The
+accurately than the attitude of the body, to whose uncertainty the misalignment of the star camera adds. The
 block `horizon` is the misalignment of the horizon cameras that measure Sun and nadir. When the body rotates,
 other horizon cameras are used, so this misalignment is a Gauss-Markov process with a long memory.
 

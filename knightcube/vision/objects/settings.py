@@ -36,8 +36,8 @@ class EndpointSettings:
         endpoint_bias: outward displacement of the endpoints that compensates the bias of the corner detector,
             px; measured for a point spread function (PSF) of 1 px.
         endpoint_floor: standard deviation of the position of an endpoint of a bright streak, px.
-        endpoint_noise: increase of the standard deviation of an endpoint, px, per ratio of pixel noise to the
-            streak's counts per px of length.
+        endpoint_noise: standard deviation of an endpoint due to pixel noise, px, if the pixel noise equals
+            the streak's counts per px of length.
         border: distance from the border of the frame within which streaks are rejected, px.
         least_length: minimum median length of the streaks in a frame, px.
         least_streaks: minimum number of streaks in a frame.

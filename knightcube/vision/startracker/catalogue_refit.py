@@ -131,7 +131,7 @@ def refit_motion(
     done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
-    # Without a list of hidden stars, the fit is not repeated with fewer streaks.
+    # A value of None for the hidden stars prevents a second fit with fewer streaks.
     done = replace(done, hidden=None)
     refit = with_rate(with_stars(motion, camera, done), camera, done, StreakVerdict.CONFIRMED)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:

@@ -60,8 +60,8 @@ class BatchSizes:
     """Numbers of triangles in successive batches of triangles that are looked up in the index.
 
     Attributes:
-        bright: numbers of triangles of the brightest stars in each batch, for each step of scale; they
-            identify most frames.
+        bright: numbers of triangles of the brightest stars in each batch, for each step of scale; these
+            batches identify most frames.
         spread: numbers of triangles of many stars in each batch, for frames whose brightest points are not
             stars.
     """
@@ -316,7 +316,7 @@ def _runs(
     lowest: FloatArray,
     highest: FloatArray,
 ) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
-    """Return the ranges of the sorted triangle keys that may contain triangles similar to the observed ones.
+    """Return the ranges of sorted triangle keys that may contain triangles similar to observed triangles.
 
     For each range, the result holds the index of the observed triangle (query), the cells of its two side
     ratios, and the first and last + 1 index in the sorted keys. Each side ratio of an observed triangle may

@@ -97,8 +97,8 @@ class Chance:
         The first matched star may be any star of the sky. The second matched star lies in a ring around the
         first star. The radius of the ring is the distance of the first two matched stars, and its width
         follows from the range of the scale and from the gate. Every further matched star lies within the gate
-        of an expected star. The probability is multiplied by the number of selections of the matched stars
-        from the observed stars. Because the fit reduces the distances of the matched stars, the distance of
+        of an expected star. The probability is multiplied by the number of ways to choose the matched stars
+        among the observed stars. Because the fit reduces the distances of the matched stars, the distance of
         each star is increased by the factor 1/(1 - leverage).
         """
         leverage = 2.0 / matched if matched > 2 else 0.5

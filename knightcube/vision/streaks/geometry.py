@@ -238,7 +238,7 @@ def sensitivities_and_velocity(
     # A change of the rate rotates the camera by a small vector psi, which moves the direction v by v x psi.
     # The vector psi at the time t is the integral over t' of the rotation from t' to t.
     flow = _flow(pinhole, there)
-    # The rotation in psi is that at the mean rate since mid-exposure, with an error of higher order.
+    # For psi, the body is assumed to rotate at the mean rate since mid-exposure (error of higher order).
     mean = motion.rate[:, None] + 0.5 * time * motion.acceleration[:, None]
     if motion.higher_terms.any():
         mean += motion.higher(time) / np.where(np.abs(time) < _TINY, 1.0, time)

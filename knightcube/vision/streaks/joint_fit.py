@@ -533,7 +533,7 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     if stretch == 0.0:
         return None
     off = beyond / np.maximum(length, 1.0)[:, None]
-    # Each measured streak end gives the time of mid-exposure on the uncorrected path of the star.
+    # Each measured streak end gives the time at which the uncorrected path reaches the true midpoint.
     middle = np.stack([0.5 * stretch - off[:, 0], off[:, 1] - 0.5 * stretch], axis=-1)
     known = np.isfinite(middle)
     time = np.where(known, middle, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)

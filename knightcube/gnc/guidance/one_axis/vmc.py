@@ -327,7 +327,7 @@ def plan(
     With `time_cost` in W the path minimises energy plus `time_cost` times horizon, over horizons from
     SHORTEST_WITH_TIME_COST s to `max_stretch` times `horizon`; the argument `horizon` is then the initial
     guess. The path followed until now is `last`, with an origin relative to the start of the new path. The
-    remainder of this path is the initial guess. The argument `cost` selects which energy is minimised.
+    initial guess is the remaining part of `last`. The argument `cost` selects which energy is minimised.
 
     Raises PlanningError if an argument is not finite or outside its limits, or if no allowed horizon is
     feasible.

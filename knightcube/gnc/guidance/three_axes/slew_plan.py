@@ -335,7 +335,7 @@ class OrderedSlew:
         task: planning task for the chosen start time.
         plan: planned path of the slew.
         begin: start of the slew, in s after the start of the ephemeris. In results of `knightcube.plan_slew`,
-            the start is in s after the argument `time`.
+            the start is measured from the argument `time`.
         compared: number of start times that were planned.
     """
 

@@ -413,8 +413,8 @@ ENOUGH = 3
 LONGER = 1.0, 1.4, 2.0, 2.8
 """Factors by which the requested duration is multiplied in turn until a path is found."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
-"""First and last ratio of successive durations in the continuation to shorter slews. The three pairs are for
-the coarse grid, for the fine grid, and for slews without a time cost on the fine grid."""
+"""Ratios of successive durations, in the first and in the last step, while a slew is shortened. The three
+pairs are for the coarse grid, for the fine grid, and for slews without a time cost on the fine grid."""
 _CROSSED = 1.3
 """Widening of a cone that a path crosses between two points, relative to the depth of the path inside the
 cone."""

@@ -442,7 +442,7 @@ def measure_near(
 def _peaks_near(
     pixels: Image, windows: StarWindows, predicted: FloatArray, ceiling: float, settings: DetectionSettings
 ) -> tuple[StarTargets, IntArray]:
-    """Return the highest peak near each prediction, if above the threshold, and its prediction (k,)."""
+    """Return the highest peaks above the threshold near predictions, and the predictions' indices (k,)."""
     level, noise, tail, correlation = _sky_of(windows, settings.search_radius)
     light = np.where(windows.good, windows.light - level[:, None, None], 0.0)
     smooth = smoothed(light)

@@ -5,9 +5,9 @@ The file begins with a header, which contains 8 magic bytes that identify the ki
 (uint32). The table of contents is in JSON format and is followed by the columns, which are little-endian and
 begin at multiples of 64 bytes. A file with the same columns always has the same bytes.
 
-Guide stars are the stars of the catalogue as a given lens images them (Michalski, section 3.3). Proper motion
-is applied up to the epoch of observation. Stars that an image cannot resolve are merged into one star at
-their centroid, with their joint magnitude. Aberration is not included in the index, because it depends on the
+Guide stars are the catalogue stars as a given lens resolves them (Michalski, section 3.3). Proper motion is
+applied up to the epoch of observation. Stars that an image cannot resolve are merged into one star at their
+centroid, with their joint magnitude. Aberration is not included in the index, because it depends on the
 velocity of the camera; it is applied to the matched directions on board.
 
 The index contains only triangles of stars that are bright relative to the size of the triangle. The reach of
@@ -211,7 +211,7 @@ CELL = 1.0 / CELLS
 FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
-"""Resolution of the longest side of a triangle, a chord below 1, in the triangle's key."""
+"""Resolution with which a triangle's key stores the longest side, a chord below 1."""
 RUN_BITS = 12
 """Binary logarithm of the interval of key values between two entries of `TriangleIndex.below`."""
 TIE = 1e-9
