@@ -304,7 +304,7 @@ class FlownRelease:
             self._done = True
 
     def end(self) -> None:
-        """Reset the count of starts of the release, because its flight ended in order."""
+        """Reset the count of starts of the release, because its flight ended regularly."""
         if self._path is not None:
             with suppress(OSError):
                 self._write(_proven(self._path))

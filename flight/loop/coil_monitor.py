@@ -685,7 +685,7 @@ class CoilMonitor:
             self._self_test.request()
 
     def tested(self, now_ns: int) -> str:
-        """Return the results of the last self-test as text, once they are known; otherwise "" ."""
+        """Return the results of the last self-test as text, or an empty text before they are known."""
         return "" if self._self_test is None else self._self_test.report(now_ns)
 
     @property

@@ -1,4 +1,4 @@
-"""Events, facts and streams, by which the loop detects and reports faults, and its shared services.
+"""Events, facts and streams, by which the loop detects and reports faults, and the services of all tasks.
 
 Events are written to the flight log and trigger their reactions. The first event of a kind is written at
 once. Later, at most one event of each kind is written per `THROTTLE_NS`, together with the number of events

@@ -437,7 +437,7 @@ class ModeControl:
 
     @property
     def acquires_sun(self) -> bool:
-        """Whether the body is being turned to the Sun without an attitude: in SAFE, once it is slow."""
+        """Whether the body is being turned to the Sun without an attitude: in SAFE, once the body is slow."""
         return self._attitude.acquires_sun
 
     def target(self, mission_time_ns: int) -> Target | None:
@@ -586,7 +586,7 @@ class ModeControl:
             self._enter(change, reason, now_ns)
 
     def _enter(self, change: ModeChange, reason: str, now_ns: int) -> None:
-        """Enter a mode: reset timers, discard an old path, and switch the coils off if it does not steer."""
+        """Enter a mode: reset timers, discard an old path, and set the coils to zero without steering."""
         self._facts.enter(change.after)
         for timer in (self._slow, self._arrived, self._pointing, self._attitude):
             timer.reset()

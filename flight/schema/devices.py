@@ -108,7 +108,7 @@ class Winding(Section, frozen=True, kw_only=True):
         return self.channels or (2 * index, 2 * index + 1)
 
     def strength(self) -> float:
-        """Return the dipole moment per ampere, m^2. Raises ConfigError if it is given twice or not at all."""
+        """Return the dipole moment per ampere, m^2. Raises ConfigError unless exactly one form is given."""
         if (self.turns is None) != (self.area is None):
             raise ConfigError("turns" if self.area is None else "area", "needs both `turns` and `area`")
         given = self.dipole_per_ampere

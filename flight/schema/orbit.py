@@ -37,7 +37,7 @@ _FIELD = 3.3e-5
 _PRESSURE = 5.0e-6
 """Expected pressure of air and sunlight on a face at an altitude of 500 km, Pa.
 
-The pressure is a tenth of that at solar maximum and perpendicular incidence on one face only.
+The expected pressure is a tenth of the largest pressure (solar maximum, perpendicular incidence).
 """
 _DIPOLE, _MOMENT = 3.0e-4, 1.047e-3
 """Dipole (A m^2) with the cost of an attitude error of 1 deg, tuned for a mean moment (kg m^2) of a 1U."""
@@ -57,7 +57,7 @@ class CraftAccuracy(Section, frozen=True, kw_only=True):
     `moments` is the relative error of the principal moments of inertia, and `axes_deg` the rotation of the
     principal axes about each body axis. `coil_gain` is the relative error of the dipole of each coil, and
     `coil_axes_deg` the misalignment of its axis. `residual_dipole` (A m^2) is the error of the residual
-    dipole along each body axis; without it, it is computed (`OrbitConfig.dipole_errors`).
+    dipole along each body axis, by default computed (`OrbitConfig.dipole_errors`).
     """
 
     moments: Annotated[float, Meta(ge=0.0, le=0.3)] = 0.1

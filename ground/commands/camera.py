@@ -162,7 +162,7 @@ def _truth(frame: Frame, lone: OpenCamera, rate: FloatArray) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class OpenCamera:
-    """An open camera, its clock and configuration; for a simulated camera also attitude (4,) by time (ns)."""
+    """An open camera with clock and configuration. A simulated camera has an attitude (4,) by time (ns)."""
 
     clock: Clock
     frames: FrameSource

@@ -128,8 +128,8 @@ def _widened(
 ) -> HorizonSolution:
     """Return the solution with the uncertainties of nadir and altitude due to the error of the field of view.
 
-    The limb is searched again with the field of view larger and smaller by one standard deviation. Without a
-    limb in either search, the solution is refused.
+    The limb is searched again with the field of view larger and smaller by one standard deviation. If both
+    searches find no limb, the solution is refused.
     """
     nadir = solution.nadir
     if nadir is None:

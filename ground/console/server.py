@@ -179,7 +179,7 @@ def application(console: Console, access: Access) -> web.Application:
             if request.path.startswith("/api/"):
                 return web.json_response({"error": NO_ACCESS}, status=401)
             raise web.HTTPUnauthorized(text=NO_ACCESS)
-        # The page is answered without a redirect, after which some browsers would not send the cookie.
+        # The page is sent without a redirect, because some browsers send no cookie after a redirect.
         response = await handler(request)
         response.set_cookie(name, session, httponly=True, samesite="Strict")
         return response

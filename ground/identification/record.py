@@ -61,7 +61,7 @@ class Record:
         rate: gyro reading (n,) about the thread, rad/s.
         switch_time: times (m,) from which each current flows, s.
         current: currents (m,) in the coil on body x, A.
-        clipped: whether (m,) a current is at the coil's limit and may differ from the commanded one.
+        clipped: whether (m,) a current is at the coil's limit and may differ from the commanded current.
         period: control period, s.
         field: measured magnetic field, or None if the coils were never off.
     """

@@ -39,8 +39,8 @@ PATH_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
 AXIS_COLOURS = {"x": BLUE, "y": ORANGE, "z": GREEN}
 DASHED = (0, (5, 2))
 _MAX_ERROR = 1e9
-"""Largest plausible rate error (mrad/s); a larger one comes from a damaged log and does not affect the
-scale."""
+"""Largest plausible rate error (mrad/s); a larger error comes from a damaged log and does not affect
+the scale."""
 
 
 @dataclass(frozen=True)

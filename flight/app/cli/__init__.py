@@ -192,7 +192,7 @@ def _available(words: Sequence[str]) -> dict[str, tuple[str, str, str]]:
     others: dict[str, tuple[str, str, str]] = {}
     for found in metadata.entry_points(group=ENTRY_POINTS):
         if importlib.util.find_spec(found.module.partition(".")[0]) is None:
-            continue  # a board has no ground package
+            continue  # the package ground is not installed on a board
         table: dict[str, tuple[str, str, str]] = found.load()
         others |= {
             name: (group, purpose, f"{found.module}.{target}")

@@ -64,7 +64,7 @@ from hal.buses.serial_port import PySerialPort
 from knightcube.errors import FlightError, UsageError
 
 _NICE = 10
-_WRITE_TIMEOUT_S = 0.5  # longest wait for a radio that takes telemetry more slowly than configured
+_WRITE_TIMEOUT_S = 0.5  # maximum wait for a radio that is slower than the configured rate
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,7 +85,7 @@ class DipoleHistory:
         return np.subtract(self._sum(to_ns), self._sum(from_ns)) / (to_ns - from_ns)
 
     def impulse(self, from_ns: int, to_ns: int) -> FloatArray:
-        """Return the integral (3,), A m^2 s, of the dipole until `to_ns`, averaged over its start time.
+        """Return the dipole integral (3,), A m^2 s, to the end of an interval, averaged over its start times.
 
         The torque of this impulse is the difference of the angular momentum at the end of the interval
         `from_ns` to `to_ns` from its mean over the interval.
@@ -452,9 +452,9 @@ class StepReplay:
     def _rate_change(self, step: FilterStep, since: float, impulse: FloatArray) -> FloatArray:
         """Return the difference (3,), rad/s, of the present rate from the mean rate over an interval.
 
-        The middle of the interval is `since` s ago. The argument `impulse` (3,), A m^2 s, is that of the
-        dipole (`DipoleHistory.impulse`) minus that of the newest dipole, which the present acceleration
-        includes.
+        The middle of the interval is `since` s ago. The argument `impulse` (3,), A m^2 s, is
+        `DipoleHistory.impulse` minus the impulse of the newest dipole, because the present acceleration
+        includes the torque of the newest dipole.
         """
         free = self.free
         shown = attitude_matrix(free.quaternion) @ step.around.field

@@ -77,8 +77,8 @@ class PathPoint:
 
 
 REST = 0.3
-"""Fraction of a slew before its end in which the slew is not planned again. A new plan would lead back small
-errors in a time that is too short for it; the feedback gains correct them instead."""
+"""Fraction of a slew before its end in which the slew is not planned again. The feedback
+gains correct small errors near the end, because the time is too short for a new plan."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +123,7 @@ class PointingPaths:
         """Follow the part of a new path table that has permitted rates.
 
         Return why the path is rejected, or an empty text if the path is followed. A table that continues a
-        running slew (`continues`) is followed from its begin on, and other tables are followed at once.
+        running slew (`continues`) is followed from its first time on, and other tables are followed at once.
         """
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
