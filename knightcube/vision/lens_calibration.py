@@ -529,9 +529,9 @@ def lens_accuracy(
 ) -> dict[str, float]:
     """Return the standard deviations of a lens by the keys of `camera.accuracy` in a configuration.
 
-    The accuracies of focal length and centre are taken from the fit `found` without the omitted terms. To the
-    error of the focal length, the difference from the focal length of the fit `whole` with all terms is
-    added. The accuracy of the distortion is given as the relative displacement of an image corner. The
+    The accuracies of focal length and centre are taken from the fit `found` without the omitted terms. The
+    accuracy of the focal length includes the difference from the focal length of the fit `whole` with all
+    terms. The accuracy of the distortion is given as the relative displacement of an image corner. The
     accuracy of the distortion includes the uncertainty with all terms and the difference between the fits
     with and without the omitted terms.
     """

@@ -174,7 +174,7 @@ _STEP = 0.5
 _ROUNDS = 3
 """Maximum number of times a rim is traced, each time from the centre of the last fitted circle."""
 _NEAR = 0.5
-"""Distance (px) between fitted centre and origin of the spokes at which the tracing stops."""
+"""Distance (px) of the fitted centre from the origin of the spokes below which the rim is not retraced."""
 
 
 def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = None) -> SunSolution:
@@ -487,7 +487,7 @@ def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
-    """Return the circle (x, y, radius) through three points with the most other points within `gate`.
+    """Return the circle (x, y, radius) with most points within `gate`, of circles through three points.
 
     The three points are evenly spaced, by an eighth to a third of the rim.
     """

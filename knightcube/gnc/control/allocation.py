@@ -66,7 +66,7 @@ def allocate(
     # Column i of the matrix `effect` is the torque about the free axes that one ampere in coil i causes.
     effect = turns[:, None] * np.cross(dipoles.T, field).T * usable
     wanted = wanted * turns
-    # The heat is proportional to the sum of the squares of current times root of resistance.
+    # The pseudo-inverse minimises the sum of (weights * currents)^2, which is proportional to the heat.
     weights = np.ones(len(usable)) if resistance is None else np.sqrt(resistance / resistance.max())
     currents = np.linalg.pinv(effect / weights, rcond=WEAKEST) @ wanted / weights * usable
     excess = float(np.max(np.abs(currents) / limits))

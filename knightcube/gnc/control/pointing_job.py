@@ -303,7 +303,7 @@ def _tracking(
     begin: SlewStart,
     weights: PointingWeights,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the tracking gains (n, 3, 6), and the dipole moments per torque size (n, 3, sizes).
+    """Return the tracking gains (n, 3, 6), and dipole moments per unit of torque size (n, 3, sizes).
 
     The motion `tracked` (n + 1,) contains the slew, for which `dipole` is planned, and the time after it.
     """

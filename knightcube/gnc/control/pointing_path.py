@@ -212,7 +212,7 @@ DEAR, PROHIBITIVE = 1e4, 1e6
 """Costs of a torque along the field, relative to the cost of the same torque across the field. The cost is
 increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
 SETTLED = math.radians(20.0)
-"""Largest angle (rad) from the attitude law in the second half of a path that counts as settled."""
+"""Largest angle (rad) from the attitude law, in the second half of a path, for a path that has settled."""
 SWEEPS = 8
 """Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. After
 this number of sweeps, the best motion is used even without convergence."""
@@ -463,7 +463,7 @@ def _swept(
 ) -> MotionGains:
     """Return the feedback gains about a motion.
 
-    If the motion is `given`, the attitudes and rates need not result from the controls of the motion.
+    If `given` is true, the attitudes and rates need not result from the controls of the motion.
     """
     count, state, end = len(motion.control), criterion.state, criterion.end
     first = motion.references(expected.wanted.times).until(count)

@@ -567,7 +567,7 @@ class FreeFilter:
         return _EYE + self._matrix(COILS)
 
     def description(self) -> dict[str, FloatArray]:
-        """Return the estimated description of body and sensors with standard deviations, by name.
+        """Return the estimated parameters of body and sensors with standard deviations, by name.
 
         The inertia `inertia` (6,), kg m^2, holds the elements xx, yy, zz, yz, zx and xy of the tensor. The
         entries `coils`, `gyro` and `field` (9,) are the matrices of coils, gyro and magnetometer, row by row.
@@ -731,7 +731,7 @@ class FreeFilter:
         return self._constants[at].reshape(3, 3)
 
     def _reset_field(self) -> None:
-        """Set the field model's error to zero, with its present standard deviation."""
+        """Set the estimated error of the field model to zero, and keep its standard deviation."""
         self._constants[FIELD] = 0.0
         self.covariance[FIELD] = self.covariance[:, FIELD] = 0.0
         self.covariance[FIELD, FIELD] = self.field_error**2 * _EYE

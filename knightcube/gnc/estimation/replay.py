@@ -195,7 +195,7 @@ class Replay:
         self._pending.append(measurement)
 
     def advance(self, maximum: int | None = None) -> None:
-        """Apply the next `maximum` measurements, or all remaining ones."""
+        """Apply the next `maximum` measurements, by default all remaining measurements."""
         for _ in range(len(self._pending) if maximum is None else min(maximum, len(self._pending))):
             self._ingest(self._pending.popleft())
 

@@ -45,7 +45,7 @@ SIGNATURE = b"SIMPLE  ="
 BLOCK = 2880
 CARD = 80
 _GZIP, _MOST_BYTES, _MOST_AXES = b"\x1f\x8b", 1 << 30, 999
-"""First bytes of a gzip file, largest size (bytes) of its content, and largest NAXIS of the FITS Standard."""
+"""First bytes of a gzip file, largest decompressed size (bytes), and largest NAXIS of the FITS Standard."""
 KINDS = {8: ">u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
 """NumPy types of the pixels of a FITS file by the value of its BITPIX keyword."""
 UNSIGNED = {"i2": (32768.0, np.uint16), "i4": (2147483648.0, np.uint32)}
@@ -116,7 +116,7 @@ def _axes(header: dict[str, str], name: str) -> list[int]:
 
 
 def _grey_of_planes(planes: Image) -> Image:
-    """Return the luminance (rows, columns) of red, green and blue planes (3, rows, columns), same type."""
+    """Return the luminance (rows, columns) of three colour planes (3, rows, columns), in their type."""
     grey = np.tensordot(_LUMINANCE, planes.astype(np.float64), 1)
     return np.asarray((np.rint(grey) if planes.dtype.kind in "iu" else grey).astype(planes.dtype))
 
@@ -165,7 +165,7 @@ def _scaled(stored: npt.NDArray[np.generic], zero: float, scale: float) -> Image
     if unsigned is not None and (zero, scale) == (offset, 1.0):
         # Adding the BZERO value of unsigned integers flips only the highest bit of a pixel.
         return np.asarray(native.view(unsigned) ^ unsigned(offset))
-    # Pixels beyond the range of float64 become infinite, which the caller refuses.
+    # Pixels beyond the range of float64 become infinite, and the calling function rejects infinite pixels.
     with np.errstate(over="ignore", invalid="ignore"):
         return np.asarray(zero + scale * native.astype(np.float64))
 

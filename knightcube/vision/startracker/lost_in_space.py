@@ -6,8 +6,8 @@ observed star and a guide star. Correct pairs occur in many triangles, and chanc
 matches with the most votes are verified against the whole field until one match is accepted. If no match is
 accepted, triangles of all observed stars, and not only of the brightest, are looked up. Even if most observed
 points are not stars, some of the thousand triangles that are looked up consist of true stars only. If no
-match is accepted, the mirrored field is tried. Finally, image scales outside the given range are tried if
-this range is narrow, because it may be wrong.
+match is accepted, the mirrored field is tried. Finally, image scales outside the given range are tried if the
+range is narrow, because a narrow range may be wrong.
 
 The shape of a triangle on the sphere depends slightly on the scale of the image. A wide range of image scales
 is divided into steps that are so narrow that the side ratios stay within the tolerance.

@@ -60,7 +60,7 @@ class FrameSolution:
         status: outcome of the frame; the attributes from `star` on are valid for SOLVED only.
         reason: why the frame was not solved, in one sentence; empty if it was solved.
         kind: whether the frame shows points or streaks.
-        camera: camera model; its focal length is the fitted one if the focal length was free.
+        camera: camera model, with the fitted focal length if the focal length was free.
         points: positions of the detected stars at mid-exposure (n, 2), px, the brightest first.
         covariance: covariances of the positions (n, 2, 2), px^2.
         late: displacement of the points (n, 2), px, due to an error of one standard deviation of the

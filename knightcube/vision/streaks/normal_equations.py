@@ -2,9 +2,9 @@
 
 Long streaks are fitted on strips of pixels along their paths, and stars with short or slow paths (spots) on
 square patches of pixels. The flux per px of a streak is inversely proportional to the speed of the star. The
-model of a streak on a strip expands the flux per px to first order around each block of pixels, which does
-not hold near zero speed. If the rate increases from zero or decreases to zero, a square patch of pixels
-covers the slow part of each streak.
+model of a streak on a strip expands the flux per px to first order around each block of pixels. This
+expansion does not hold near zero speed. If the rate increases from zero or decreases to zero, a square patch
+of pixels covers the slow part of each streak.
 
 The weight of a pixel is the inverse of the variance that the model predicts. The iteration therefore
 converges to the maximum likelihood for Poisson noise. The residual of a pixel is its value minus the modelled

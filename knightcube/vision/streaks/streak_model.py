@@ -60,7 +60,7 @@ LINES = 10
 STEEPEST = 0.68
 """Minimum cosine between a path and the normal of a line of pixels, slightly below the cosine of 45 deg."""
 
-# Largest camera rotation (rad) within one part of a path, for which its column or row changes monotonically.
+# Largest camera rotation (rad) in a part of a path, for a monotonic change of the star's column or row.
 _LONGEST_ROTATION = 1.1
 # Number of instants at which part of a path is evaluated to find where it crosses lines of pixels.
 _SAMPLES = 17

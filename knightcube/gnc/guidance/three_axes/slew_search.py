@@ -630,9 +630,10 @@ class SlewSearch:
                 yield self._fresh(found)
 
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
-        """Return a path outside cones that `found` crosses by `depths` (cones, 2 nodes), rad.
+        """Return a path outside the cones that the path `found` crosses with the given depths, rad.
 
-        Returns None if no path is found or the path was corrected too often.
+        The `depths` (cones, 2 nodes) are those between neighbouring points of the path. Returns None if no
+        path is found or the path was corrected too often.
         """
         self._widened += 1
         return self._walker.widened(found, depths) if self._widened <= _WIDENED else None

@@ -474,8 +474,8 @@ def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray
     """Return background (n,), noise of single and of smoothed pixels, each (n,), and noise correlation.
 
     Background and noise are measured in the rims of the windows around the predicted positions. The noise of
-    smoothed pixels includes faint stars, because the detection threshold depends on it. The noise correlation
-    is the ratio of the noise of a sum of pixels to that of a sum of independent pixels.
+    smoothed pixels, from which the detection threshold is derived, includes faint stars. The noise
+    correlation is the ratio of the noise of a sum of pixels to that of a sum of independent pixels.
     """
     step = np.abs(np.arange(-windows.half, windows.half + 1))
     rim = np.maximum(step[:, None], step) > radius + 1.0

@@ -133,7 +133,7 @@ def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) 
     alike = telling[np.abs(width - psf_sigma) < np.maximum(3.0 * error, 0.25 * psf_sigma)]
     part, windows = fitted.select(alike), shapes.windows.select(alike)
     noise = _noise_of(part, windows, settings)
-    # If the PSF is given, the second fit is omitted, because it takes half the time of a tracking frame.
+    # If the PSF is given, the second fit is omitted, which halves the time for a tracking frame.
     for _ in range(0 if given else 2):
         part = fit(windows, part.offset, part.flux, part.width, noise, free_width=True, steps=2)
         noise = _noise_of(part, windows, settings)

@@ -253,7 +253,7 @@ def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[
     deviations, and 2.3 % fall below it by more than two. If a sky is clipped at zero counts, its moments
     underestimate the noise. For each block, the median over the 3 x 3 blocks around it is used, because a
     textured foreground has a long tail while the sky beside it has not, and a few stars hardly change the
-    median. The relative tail is at least 1.
+    median. The returned relative noise tail is at least 1.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
