@@ -37,12 +37,12 @@ _SECOND_NS = 1_000_000_000
 def write_tracking_data(run: Run, path: Path) -> list[Path]:
     """Write the measured tracks of a run to the file `path`, and return the written files.
 
-    If the satellite's own orbit was known, the file with the suffix `.oem` beside it has the positions of the
-    camera at the sightings, as an Orbit Ephemeris Message.
-    Each object has one segment, with right ascension and declination measured in each frame, in ICRS at
-    mid-exposure. The aberration of the camera is corrected, and the light time is not corrected. Standard
-    deviations are written as comments, because the message format has no keyword for them. MAG is the mean
-    magnitude of the last sightings. Raises UsageError if no object was tracked or `path` cannot be written.
+    If the satellite's own orbit was known, the file with the suffix `.oem` beside `path` has the positions of
+    the camera at the sightings, as an Orbit Ephemeris Message. Each object has one segment, with right
+    ascension and declination measured in each frame, in ICRS at mid-exposure. The aberration of the camera is
+    corrected, and the light time is not corrected. Standard deviations are written as comments, because the
+    message format has no keyword for them. MAG is the mean magnitude of the last sightings. Raises UsageError
+    if no object was tracked or `path` cannot be written.
     """
     tracks = run["track"]
     measured = tracks[np.all(np.isfinite(tracks["measured"]), axis=1)] if len(tracks) else tracks

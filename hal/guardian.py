@@ -247,7 +247,7 @@ _NEWS = {
 
 
 class GuardianLine:
-    """Connection of the flight process to a running guardian. Only the control loop's thread may use it."""
+    """Connection of the flight process to a running guardian. Only one thread may use this object."""
 
     def __init__(self, reach: CoilReach) -> None:
         """Start the guardian without waiting until the guardian is ready."""

@@ -29,7 +29,7 @@ class DescriptionErrors:
         moments: ratios (3,) of the true to the described principal moments of inertia.
         axes: rotation vector (3,) from the described to the true principal axes, rad, body axes.
         coils: dipole of each coil divided by its described length, as the columns of a matrix (3, 3 g) for g
-            groups of three coils. The axes are those of `sim_hal.worlds.free_body.coil_frames`.
+            groups of three coils. The columns are in axes of `sim_hal.worlds.free_body.coil_frames`.
         gyro: matrix (3, 3) from the true rate to the rate that the gyro measures, without the gyro's bias.
         field: matrix (3, 3) from the true to the measured magnetic field, without the magnetometer's bias.
         field_bias: bias (3,) of the magnetometer, T.

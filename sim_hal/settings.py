@@ -75,11 +75,11 @@ class Disturbances(Section, frozen=True, kw_only=True):
     The unit of `drag` and `solar_pressure` is the torque on a box whose true centre of mass is as far from
     the described one as `craft.accuracy.centre_of_mass` permits, in a random direction. The worst case of
     `residual_dipole` is a constant part of 1e-3 A m^2, a part of 3e-4 A m^2 in sunlight and a random walk of
-    5e-5 A m^2. The worst case of `ring_current` is a field of 20 nT that varies over hours.
-    `day_bulge` scales the variation of the air density between day and night. `walks` scales the random walks
-    of air density and residual dipole. The angle between body axes and principal axes is between a third of
-    `principal_turn_deg` and the whole of it. `coil_scale` and `coil_tilt_deg` are the standard deviations of
-    the coils' scale errors and axis tilts.
+    5e-5 A m^2. The worst case of `ring_current` is a field of 20 nT that varies over hours. `day_bulge`
+    scales the variation of the air density between day and night. `walks` scales the random walks of air
+    density and residual dipole. The angle between body axes and principal axes is at least a third of
+    `principal_turn_deg` and at most `principal_turn_deg`. `coil_scale` and `coil_tilt_deg` are the standard
+    deviations of the coils' scale errors and axis tilts.
     """
 
     gravity_gradient: NotNegative = 1.0

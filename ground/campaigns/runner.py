@@ -210,7 +210,7 @@ def fly_here(campaign: Campaign, runs: int, seed: int) -> list[Result]:
 
 
 def _selected(campaign: Campaign, runs: int, seed: int, only: str) -> list[Case]:
-    """Return the cases whose key contains the text `only`. Raises UsageError if no key contains it."""
+    """Return the cases whose key contains the text `only`. Raises UsageError without such a case."""
     cases = [case for case in campaign.cases(runs, seed) if only in case.key]
     if only and not cases:
         raise UsageError(f"--only {only!r}: no case of {campaign.name} contains this text")

@@ -239,7 +239,7 @@ class Answers:
                 sys.stderr.write(f"  {error}\n")
 
     def _take(self, question: Question, texts: list[str]) -> None:
-        """Read the texts of a value, and keep it. Raises UsageError for an impossible value."""
+        """Read a value from its texts, and store it. Raises UsageError for an impossible value."""
         name = question.name
         for text in texts:
             value = read_value(name, text)

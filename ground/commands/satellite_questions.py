@@ -229,7 +229,7 @@ def read_value(name: str, text: str) -> Any:
 def check_values(name: str, values: Values) -> None:
     """Check the value of the question `name` against the values that are known so far.
 
-    Raises UsageError if they contradict each other.
+    Raises UsageError if the values contradict each other.
     """
     problem = ""
     if name in {"mass", "size"} and {"mass", "size"} <= set(values):

@@ -206,7 +206,7 @@ class LinkFeed:
 def flying(config: Path, out: Path) -> Iterator[str]:
     """Fly a simulated configuration into `out` in real time and yield the flight's command socket.
 
-    The flight ends when the context is left. Raises FlightError if it does not start.
+    The flight ends when the context is left. Raises FlightError if the flight does not start.
     """
     text = merged_text(read_text(config), str(config))
     parsed = parse(text, str(config))

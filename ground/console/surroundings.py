@@ -122,7 +122,7 @@ class FrameFolder:
         self._folder = folder
 
     def facts(self, sequence: int) -> Object | None:
-        """Return the results of a frame with its `columns` and `rows`, or None if it was not kept."""
+        """Return the results of a frame with its `columns` and `rows`, or None if the frame was not kept."""
         data = self._read(sequence)
         if data is None:
             return None

@@ -86,7 +86,7 @@ class AbsolutePlant:
         damping: N m s/rad.
         field_measured: whether the magnetometer contributed to the field.
         covariance: covariance (6, 6) of ln inertia, ln dipole, ln field, ln gain, torsion and damping; the
-            last three are those of the fit.
+            fit determines the last three.
     """
 
     inertia: ScaledValue

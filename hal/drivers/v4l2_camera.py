@@ -356,7 +356,7 @@ class VideoDevice:
     def dequeue(self) -> Filled | None:
         """Return the oldest filled buffer, None if there is none.
 
-        The caller must requeue it by `queue`.
+        The caller must return the buffer by `queue`.
         """
         buffer = _numbered(0)
         try:

@@ -359,7 +359,7 @@ def _given_or_drawn(bench: Bench, given: Parameters, name: str, values: Sequence
 
 
 def _upset_pwm(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
-    # A uniform draw over all registers would rarely select one of the three that configure the chip.
+    # A uniform draw over all registers would rarely select one of the three configuration registers.
     among = _SET_UP if bench.generator.random() < 0.5 else _OUTPUTS
     register = _given_or_drawn(bench, given, "register", among)
     bench.hardware.pwm.flip(register, _given_or_drawn(bench, given, "bit", range(8)))

@@ -2,11 +2,9 @@
 
 The flight software assumes nominal properties of the craft. The true properties of the craft have random
 errors drawn from one seed, as a built satellite differs from its design. The torques on the body come from
-the coils, the residual dipole, the gravity gradient, air drag and sunlight.
-
-- The drag on a face that meets the flow is given by Wertz 1978, eq. 17.61, with a drag coefficient of 2.2.
-- The force of sunlight on a lit face is given by Montenbruck & Gill 2000, eq. 3.73.
-- Shading of one face by another is not modelled, because a box has none.
+the coils, the residual dipole, the gravity gradient, air drag and sunlight. The drag on a face that meets the
+flow is given by Wertz 1978, eq. 17.61, with a drag coefficient of 2.2. The force of sunlight on a lit face is
+given by Montenbruck & Gill 2000, eq. 3.73. The faces of a box do not shade each other.
 
 Euler's equations are integrated in principal axes by the classical Runge-Kutta method. Every stage evaluates
 the torques that depend on the attitude, namely those of the dipole in the field and of the gravity gradient

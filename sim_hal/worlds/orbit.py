@@ -254,7 +254,7 @@ _PROFILE = np.array(
 Above 1,000 km, the values follow from the scale height at 1,000 km, 268 km.
 """
 _LOWEST_PERIGEE = 150e3
-"""Lowest height (m) of the perigee of a configured orbit. Below it a satellite decays within a revolution."""
+"""Lowest height (m) of the perigee of a configured orbit. A lower orbit decays within a revolution."""
 _NIGHT, _DAY = 0.4, 1.6
 """Factors of the air density opposite to the day bulge and at the apex of the day bulge."""
 _MEAN = _NIGHT + (_DAY - _NIGHT) / 3.0

@@ -295,8 +295,9 @@ class Recovery:
     def _seek(self, now_ns: int, packets: int, received: int) -> None:
         """Listen at the current baud rate and then either configure the unit or change the baud rate.
 
-        The unit is configured if valid packets arrive or if the line is silent. If neither is the case, the
-        unit is first asked at the configured baud rate, because it may send packets that are unknown.
+        The unit is configured if valid packets arrive or if the line is silent. If only
+        invalid bytes arrive, the unit is first asked at the configured baud rate, because these bytes may be
+        packets of an unknown layout.
         """
         assert self._listening_since_ns is not None
         if packets > self._packets:
