@@ -16,6 +16,7 @@ from flight.loop import horizon_cameras, imaging
 from flight.loop.body import PLANNER, ControlOutput
 from flight.loop.control_cycle import ATTITUDE_EVERY, ControlCycle
 from flight.loop.executive import Cycle
+from flight.loop.navigation import CurrentValidity
 from hal.interfaces.devices import MOST_COILS, CoilState
 
 PERIOD_NS = 25_000_000
@@ -158,6 +159,25 @@ def test_a_new_target_is_announced_and_aimed_at_once() -> None:
     bench.tasks.modes.step.assert_called_with(
         ESTIMATE, pytest.approx(0.5), overdue.return_value, True, bench.now_ns
     )
+
+
+def test_each_cycle_gives_the_coils_to_navigation_and_to_the_checks() -> None:
+    bench = Bench(Mode.HOLD)
+    drive, navigation = bench.tasks.drive, bench.tasks.navigation
+    drive.is_suspect = False
+    bench.run()
+    navigation.correct_coils.assert_called_once_with(drive.correction, drive.available)
+    validity = CurrentValidity(True, True, -1, None)
+    navigation.commanded.assert_called_once_with(STILL, drive.effective.return_value, validity)
+    drive.effective.assert_called_once_with(STILL)
+    readings = navigation.update.return_value
+    drive.look.assert_called_once_with(STILL, readings, bench.now_ns, known=True)
+    bench.tasks.imaging.serve.assert_called_once_with(bench.now_ns)
+    order = [name for name, _, _ in navigation.method_calls]
+    assert order[:4] == ["correct_coils", "commanded", "update", "estimate"]
+    drive.is_suspect = True
+    bench.run(1)
+    assert not navigation.commanded.call_args.args[2].now, "a suspected coil carries an unknown current"
 
 
 def test_coils_that_do_not_answer_are_not_noted_as_fresh() -> None:

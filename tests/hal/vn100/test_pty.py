@@ -109,6 +109,37 @@ def test_an_open_port_cannot_be_opened_again_until_the_driver_closes_it() -> Non
     os.close(far)
 
 
+def test_a_port_that_is_unplugged_and_plugged_in_again_receives_and_sends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serial_port, "_REOPEN_S", 0.005)
+    clock, name = SystemClock(), tmp_path / "imu"
+    first, second = os.openpty(), os.openpty()
+    name.symlink_to(os.ttyname(first[1]))
+    port = PySerialPort(str(name), 115200, clock)
+    assert port._thread.daemon, "a thread that waits must not keep the process alive"
+    name.unlink()
+    os.close(first[1])
+    os.close(first[0])
+    words, plugged, sent, deadline_ns = b"", False, False, clock.now_ns() + 20_000_000_000
+    while words != b"again" and clock.now_ns() < deadline_ns:
+        try:
+            words += b"".join(data for _, data in port.receive())
+            # Data that arrive before the port is open again are discarded, so they are sent afterwards.
+            sent = sent or (plugged and os.write(second[0], b"again") > 0)
+        except NotResponding:
+            if not plugged:
+                name.symlink_to(os.ttyname(second[1]))
+            plugged = True
+        clock.sleep_until_ns(clock.now_ns() + 1_000_000)
+    assert words == b"again"
+    port.send(b"answer")
+    assert os.read(second[0], 100).endswith(b"answer")
+    port.close()
+    for end in second:
+        os.close(end)
+
+
 def test_data_that_nobody_receives_are_dropped_oldest_first_and_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
