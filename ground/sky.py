@@ -34,7 +34,7 @@ Card = tuple[str, str | int | float | bool]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _TangentPlane:
-    """Tangent plane at a direction of the sky (3,), with east and north (3,)."""
+    """Tangent plane at a direction (3,) on the sky, with the unit vectors east and north (3,)."""
 
     middle: FloatArray
     east: FloatArray

@@ -29,7 +29,7 @@ WIDE = (11.0, 5.2)
 TALL = (11.0, 7.6)
 OVERVIEW = (10.9, 12.7)
 PATH_WINDOW_S = 20.0
-"""Length (s) of the time axis in the picture of the planned paths, from the command of a step on."""
+"""Length (s) of the time axis in the picture of the planned paths, which begins at the command of a step."""
 _MIN_FIELD_ROTATION = np.radians(20.0)
 """Smallest rotation (rad) of the field in a run for which the picture of the cage is drawn."""
 _FIELD_STRIDE = 40

@@ -201,7 +201,7 @@ def judged_steps(
     log_end = float(attitude.time[-1])
     if math.isfinite(planned_end):
         end = max(planned_end, float(times[-1]))
-    else:  # without the planned end, the last step is assumed to be as long as the longest one before
+    else:  # an unknown duration of the last step is assumed equal to the longest one
         end = float(times[-1] + np.max(np.diff(times))) if len(times) > 1 else max(log_end, float(times[-1]))
     release = float(np.interp(times[0], attitude.time, attitude.q2))
     listed = commanded_steps(targets["index"].tolist(), times, targets["q2"].astype(float), release, end)

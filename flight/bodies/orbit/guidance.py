@@ -578,7 +578,7 @@ class PointingPlanner:
         usable, duty = self._usable(), craft.duty
         limit, slewing = craft.coils.working(usable).limits, craft.coils.working(usable, ACROSS)
         wish = replace(craft.slew, residual=learned.residual, heat=slewing.heat, limit=duty * slewing.limits)
-        # A tensor that no body can have is not used.
+        # A physically impossible inertia tensor is not used.
         is_plausible = float(np.linalg.eigvalsh(learned.inertia)[0]) > self._smallest
         return PointingJob(
             self._count + 1,

@@ -262,8 +262,8 @@ class Planning:
     def due_angle(self, law: ThreadLaw, now_ns: int) -> float | None:
         """Return the angle (rad) that the target has at present, or None before the target is due.
 
-        A target is due when the first path to it ends, whatever is planned later. The strategy STEP has no
-        plans, so its targets are due one horizon after the command.
+        A target is due at the end of the first path to it, even if later paths end at another time. The
+        strategy STEP has no plans, so its targets are due one horizon after the command.
         """
         if self._due_ns is None or now_ns < self._due_ns:
             return None
