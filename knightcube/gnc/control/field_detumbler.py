@@ -228,13 +228,15 @@ BOUNDED = 0.02
 SILENT_PERIODS = 2
 """Number of coil pauses without an accepted sample after which the coils are switched off again."""
 DRIFT = 0.015
-"""Rotation (rad) by one standard deviation of the rate after which a driven phase ends. A measured field is
-about as accurate, so that the field that the detumbler predicts is nearly as accurate as a measured one."""
+"""Largest rotation error (rad) that one standard deviation of the rate may cause in a driven phase. The
+direction of a measured field has about the same error, so the predicted field is nearly as accurate as a
+measured field."""
 EXTRAPOLATED = 0.5
-"""Time after which the coils add no more energy to a body whose field is extrapolated, as a fraction of the
-horizon. A body that still rotates by then is in a field that does not rotate as extrapolated."""
+"""Time after which the coils add no more energy if the field is extrapolated without an attitude, as a
+fraction of the duration of the field prediction. If the body still rotates after this time, the true field
+does not rotate as extrapolated."""
 SHORTEST = 9
-"""Shortest driven phase, as a multiple of the pause, for a rate that is not accurate."""
+"""Shortest driven phase while the rate is uncertain, as a multiple of the coil pause."""
 OLDEST_NS = 100_000_000
 """Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
 INSTANTS = 150
@@ -394,7 +396,7 @@ class FieldDetumbler:
 
     @property
     def next_pause_ns(self) -> int:
-        """Time at which the coils are next switched off to measure the field, as of the last command."""
+        """Time (ns) of the next coil pause for a measurement of the field, as planned at the last command."""
         return self._begun_ns + self._pause_ns + self._act_ns
 
     @property

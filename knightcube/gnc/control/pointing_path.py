@@ -217,8 +217,8 @@ SWEEPS = 8
 """Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. After
 this number of sweeps, the best motion is used even without convergence."""
 SAVED = (0.05, 2e-3)
-"""Relative improvement by a sweep below which the cost of a torque along the field is increased, and relative
-improvement below which the sweeps at the largest cost end."""
+"""Relative improvements by a sweep. Below the first improvement, the cost of a torque along the field is
+increased. Below the second improvement, the sweeps at the largest cost end."""
 NEAR = math.radians(10.0)
 """Angle (rad) from the attitude law up to which the first sweeps do not need a torque along the field."""
 EXCESS = 3e-5

@@ -324,10 +324,10 @@ def plan(
     to at most `max_stretch` times the requested horizon. A stretched horizon is about 0.3 % longer than the
     shortest feasible horizon on `nodes` nodes, and at most 1.5 % longer than the bang-bang time.
 
-    With `time_cost` in W the path minimises energy plus `time_cost` times horizon, over horizons from
-    SHORTEST_WITH_TIME_COST s to `max_stretch` times `horizon`; the argument `horizon` is then the initial
-    guess. The path followed until now is `last`, with an origin relative to the start of the new path. The
-    initial guess is the remaining part of `last`. The argument `cost` selects which energy is minimised.
+    With `time_cost` in W the path minimises energy plus `time_cost` times horizon. The optimised horizon is
+    between SHORTEST_WITH_TIME_COST s and `max_stretch` times `horizon`, and `horizon` is the initial guess.
+    The path followed until now is `last`, with an origin relative to the start of the new path. The initial
+    guess is the remaining part of `last`. The argument `cost` selects which energy is minimised.
 
     Raises PlanningError if an argument is not finite or outside its limits, or if no allowed horizon is
     feasible.

@@ -232,8 +232,8 @@ _DAMPED = 1.0
 _LONGEST_STEP = 4.0
 """Largest step of the mode amplitudes in an iteration of the momentum fit."""
 _WEAK, _WEAK_END = 1e-3, 0.03
-"""Heat of a mode, relative to the largest, below which the mode is discarded, and singular value, relative to
-the largest, below which a direction of the end momentum is not controlled."""
+"""Heat of a mode below which the mode is discarded, and singular value below which a direction of the end
+momentum is not controlled. Each value is relative to the largest heat or singular value."""
 _MISSED, _INSIDE_CONE = 0.1, 0.02
 """End error (rad) and depth inside a cone (as a difference of cosines) above which a guess is tried after all
 other guesses."""

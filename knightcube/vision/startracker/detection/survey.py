@@ -250,10 +250,10 @@ def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[
     """Return each block's upper noise tail relative to a normal distribution, and where noise is clipped.
 
     In a normal distribution, 2.3 % of the pixels of a block exceed the mean by more than two standard
-    deviations, and 2.3 % fall below it by more than two. If a sky is clipped at zero counts, its moments
-    underestimate the noise. For each block, the median over the 3 x 3 blocks around it is used, because a
-    textured foreground has a long tail while the sky beside it has not, and a few stars hardly change the
-    median. The returned relative noise tail is at least 1.
+    deviations, and 2.3 % are below the mean by more than two standard deviations. If a sky is clipped at zero
+    counts, its moments underestimate the noise. For each block, the median over the 3 x 3 blocks around it is
+    used, because a textured foreground has a long tail while the sky beside it has not, and a few stars
+    hardly change the median. The returned relative noise tail is at least 1.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
