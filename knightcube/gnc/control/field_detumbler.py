@@ -14,10 +14,10 @@ well. The coils are switched off again if no sample was accepted for `SILENT_PER
 restarted sensor may give only unusable fields.
 
 The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
-momentum h obeys h' = m x B, with the dipole moment m and the field B but without inertia and attitude. By
-Pontryagin's principle, the dipole moment of minimum time has the maximum strength L and the direction of -B x
-y, where the costate y is a constant vector. The momentum can be reduced to at most r within the time T if and
-only if every vector y satisfies
+momentum h obeys h' = m x B, where m is the dipole moment and B the field. This equation contains neither
+inertia nor attitude. By Pontryagin's principle, the dipole moment of minimum time has the maximum strength L
+and the direction of -B x y, where the costate y is a constant vector. The momentum can be reduced to at most
+r within the time T if and only if every vector y satisfies
 
     h . y <= L integral of |B x y| over T + r |y|,
 

@@ -21,7 +21,7 @@ factors and misalignments of gyro and magnetometer (Pittelkau 2001, JGCD 24(6)).
 The block `camera` is the misalignment of the star camera. The attitude of the star camera is known more
 accurately than the attitude of the body, to whose uncertainty the misalignment of the star camera adds. The
 block `horizon` is the misalignment of the horizon cameras that measure Sun and nadir. When the body rotates,
-other horizon cameras are used, so this misalignment is a Gauss-Markov process with a long memory.
+other horizon cameras are used, so this misalignment is modelled as a Gauss-Markov process with a long memory.
 
 Further blocks are the biases of gyro and magnetometer, the residual dipole in shadow, its increase in
 sunlight, and the sizes of the disturbance torques of `knightcube.astro.earth.disturbance`.
@@ -239,8 +239,8 @@ class FreeFilterSettings:
         torque: expected size and random walk of the torque by air, N m. The expected sizes of the torque by
             sunlight and of the constant torque are fixed fractions of `torque`.
         torque_noise: density of the white noise of all other torques, N m sqrt(s).
-        coil_error: relative error of the coils' dipole in any direction that lasts for tens of seconds, in
-            addition to the constant matrix of the coils.
+        coil_error: relative error of the coils' dipole, which varies over tens of seconds and adds to the
+            error of the constant coil matrix.
         coil_noise: density of the white noise of each coil's dipole while the coils are driven, A m^2
             sqrt(s).
         coil_walk: random walk of the elements of the coils' matrix per sqrt(s), for example due to

@@ -19,8 +19,8 @@ _LENGTH = 1e-3
 class Goal(IntEnum):
     """The pointing goals, with the values that represent them in the command packet.
 
-    NADIR, VELOCITY and SUN take no numbers, INERTIAL takes a quaternion, and GROUND takes latitude and
-    longitude.
+    The goals NADIR, VELOCITY and SUN have no arguments, INERTIAL has a quaternion, and GROUND has latitude
+    and longitude.
     """
 
     NADIR = 0
