@@ -231,10 +231,6 @@ DRIFT = 0.015
 """Largest rotation error (rad) that one standard deviation of the rate may cause in a driven phase. The
 direction of a measured field has about the same error, so the predicted field is nearly as accurate as a
 measured field."""
-EXTRAPOLATED = 0.5
-"""Time after which the coils add no more energy if the field is extrapolated without an attitude, as a
-fraction of the duration of the field prediction. If the body still rotates after this time, the true field
-does not rotate as extrapolated."""
 SHORTEST = 9
 """Shortest driven phase while the rate is uncertain, as a multiple of the coil pause."""
 OLDEST_NS = 100_000_000
@@ -329,8 +325,6 @@ class FieldDetumbler:
         self._accepted_ns = now_ns
         self._fastest = self._most_energy = math.inf
         self._initial_known = False
-        self._known_ns = now_ns
-        self._extrapolated = True
         self._act_ns = self._shortest_ns
         self._filter.restart()
 
@@ -452,11 +446,9 @@ class FieldDetumbler:
         if not self._initial_known:
             if sigma >= max(KNOWN, KNOWN_SHARE * speed):
                 return without_growth(dipole, [works])
-            self._initial_known, self._known_ns = True, now_ns
+            self._initial_known = True
             multiple = braking.spin_up if speed > braking.gentle else 1.0
             self._fastest, self._most_energy = multiple * speed, multiple * multiple * energy
-        if self._extrapolated and (now_ns - self._known_ns) * _SECOND > EXTRAPOLATED * braking.horizon:
-            self._most_energy = min(self._most_energy, energy)
         # Each bound is compared with a value that is one standard deviation of the rate above the estimate.
         upper = speed + sigma
         grows = [works] if energy * upper**2 >= self._most_energy * speed**2 else []
@@ -486,7 +478,6 @@ class FieldDetumbler:
         """Return a momentum plan in the present body axes."""
         found, times = self._filter, self._braking.instants
         expected = self._expected(now_ns)
-        self._extrapolated = expected is None
         if expected is None:
             ahead = rotating_field(found.field, found.change, times)
         else:
