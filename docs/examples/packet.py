@@ -23,8 +23,9 @@ def main() -> None:
         log.close()
         run = read_run(folder)
         print("read:  ", run["thermal"]["celsius"][0].tolist())
-        (table,) = export(run, folder / "csv")
+        table, fields = export(run, folder / "csv")
         print("export:", table.read_text(encoding="utf-8").splitlines()[1])
+        print("fields:", fields.read_text(encoding="utf-8").splitlines()[2])
         print("document:" + markdown().split("## thermal\n")[1])
 
 

@@ -161,6 +161,9 @@ def test_a_release_whose_manifest_cannot_be_read_gives_way_and_the_reason_is_giv
     assert reason in said
 
 
+_NO_IMPORT = '    *"import flight"*) exit 1 ;;'
+"""Line of the stand-in for Python by which it cannot import the flight."""
+
 PYTHONS: dict[str, Callable[[Path], None]] = {
     "missing": Path.unlink,
     "a folder": _folder,
@@ -171,7 +174,7 @@ PYTHONS: dict[str, Callable[[Path], None]] = {
     "crashes": lambda path: _replace(path, "#!/bin/sh\nkill -SEGV $$\n"),
     "hangs": lambda path: _replace(path, "#!/bin/sh\nexec sleep 600\n"),
     "cannot import the flight": lambda path: _replace(
-        path, path.read_text().replace('*"import flight"*) ;;', '*"import flight"*) exit 1 ;;')
+        path, path.read_text().replace('    *"-m flight --v', f"{_NO_IMPORT}\n    *\"-m flight --v")
     ),
 }  # fmt: skip
 

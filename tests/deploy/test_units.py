@@ -173,7 +173,7 @@ def test_a_configuration_that_extends_another_is_refused_for_a_board(
     assert board_dropin.main([str(path)]) == 2
     words = capsys.readouterr().err
     assert f"install: {path}: `extends` cannot be used on a board" in words
-    assert "flight check FILE --merged NEW" in words
+    assert "knightcube check FILE --merged NEW" in words
     assert board_dropin.main([str(TESTBED)]) == 0
 
 

@@ -101,7 +101,8 @@ def test_a_new_command_is_obeyed_and_logged(tmp_path: Path) -> None:
 def test_a_new_packet_is_recorded_read_exported_and_documented(tmp_path: Path) -> None:
     printed = run([str(EXAMPLES / "packet.py")], patched("packet", tmp_path / "tree")).stdout
     assert "read:   [21.5, 19.0, 20.25, 20.5, 22.0, 18.75]" in printed
-    assert "# s,degree C" in printed
+    assert "export: 0.0,21.5,19.0,20.25" in printed
+    assert "fields: thermal,celsius_1,degree C,panels" in printed
     assert "| 15 | celsius | f4 x 6 | degree C |" in printed
 
 

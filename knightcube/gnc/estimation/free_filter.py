@@ -360,7 +360,7 @@ class FreeMemory:
 class FreeFilter:
     """The filter, with the present estimate.
 
-    The class is long, because every propagation and measurement changes the same estimate and covariance.
+    Over 350 lines, because every propagation and measurement changes the same estimate and covariance.
 
     Attributes:
         layout: the declared error state.

@@ -33,8 +33,12 @@ def orbit() -> LockStep:
 
 @pytest.fixture
 def lock() -> LockStep:
-    config = configuration.replace(demo_config(10.0))
-    return build_lockstep(config, demo_world(), None, SimClock())
+    """Return the devices of a testbed with six coils, so that the faults of all coils can be injected."""
+    config = demo_config(10.0)
+    windings = config.coils.windings
+    more = [configuration.replace(one, channels=(2 * k + 6, 2 * k + 7)) for k, one in enumerate(windings)]
+    coils = configuration.replace(config.coils, windings=(*windings, *more))
+    return build_lockstep(configuration.replace(config, coils=coils), demo_world(), None, SimClock())
 
 
 def is_sound(lock: LockStep) -> bool:
