@@ -133,7 +133,8 @@ def test_a_slew_during_which_a_coil_is_isolated_ends_at_its_target(tmp_path: Pat
     assert SLEW - 5.0 < ended - begun < SLEW + 5.0
     assert not {"astray", "planner-failed", "tumbling"} & set(event_names(run))
     arrived, there = part(run, ended, ended + 1.0), part(run, ended, ended + 30.0)
-    assert np.degrees(angle_between(arrived["quaternion"], arrived["target"])).max() < 0.3
+    # A 3U slews to its target within 0.5 deg in 95 % of the flights (requirement).
+    assert np.degrees(angle_between(arrived["quaternion"], arrived["target"])).max() < 0.5
     assert np.degrees(angle_between(there["quaternion"], there["target"])).max() < 2.0
 
 

@@ -133,7 +133,7 @@ def test_the_command_line_ends_with_one_line_and_status_2(
 ) -> None:
     assert main(["run", str(CONFIG), "--out", f"{tmp_path}/run", "--fault", fault]) == 2
     errors = capsys.readouterr().err
-    assert errors.startswith("flight: ")
+    assert errors.startswith("knightcube: ")
     assert errors.count("\n") == 1
 
 
