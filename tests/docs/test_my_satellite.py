@@ -79,4 +79,4 @@ def test_the_commands_of_a_newcomer_describe_and_detumble_a_satellite(tmp_path: 
         assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
     (phase,) = json.loads(done.stdout)["detumbling"]["periods"]
     assert phase["slowed"]
-    assert phase["duration_s"] < 300.0
+    assert phase["duration_s"] < 200.0
