@@ -2,8 +2,8 @@
 
 The position is propagated from the newest GPS fix, or from two-line elements before the first fix. The
 environment is predicted for about 20 s at once, which takes 2 ms, and then interpolated. Predictions for a
-whole revolution belong in a worker, because they take 0.3 ms for each 10 s.
-A check detects a magnetometer that repeats the same field.
+whole revolution belong in a worker, because they take 0.3 ms for each 10 s. The class `StuckFieldCheck`
+detects a magnetometer that repeats the same field.
 """
 
 from __future__ import annotations
