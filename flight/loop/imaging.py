@@ -569,7 +569,8 @@ class Imaging:
             self._events.report(events.CAMERA_FROZEN, now_ns, text)
         elif motion.status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
             text = f"frame {frame.sequence} is {motion.status.value}"
-            self._events.report(events.CAMERA_BLACK, now_ns, text)
+            black = motion.status is StreakStatus.BLACK
+            self._events.report(events.CAMERA_BLACK if black else events.CAMERA_SATURATED, now_ns, text)
         rate, attitude = self._measurer.mean_rate(frame, motion), self._measurer.attitude(frame, found)
         if is_strange(found.solution):
             rate = None  # the pixels are invalid

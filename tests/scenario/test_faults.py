@@ -228,7 +228,7 @@ def test_a_brown_out_of_the_pwm_chip_is_mended(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("fault", "event"),
-    [("black", "camera-black"), ("saturated", "camera-black"), ("frozen", "camera-frozen")],
+    [("black", "camera-black"), ("saturated", "camera-saturated"), ("frozen", "camera-frozen")],
 )
 def test_a_camera_that_shows_nothing_true_is_reported_and_gives_no_rate(
     tmp_path: Path, fault: str, event: str

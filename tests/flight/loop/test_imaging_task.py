@@ -400,7 +400,7 @@ def test_a_failed_job_is_reported_and_recorded() -> None:
     [
         (StreakStatus.FROZEN, [events.CAMERA_FROZEN]),
         (StreakStatus.BLACK, [events.CAMERA_BLACK]),
-        (StreakStatus.SATURATED, [events.CAMERA_BLACK]),
+        (StreakStatus.SATURATED, [events.CAMERA_SATURATED]),
         (StreakStatus.TOO_SHORT, []),
         (StreakStatus.TOO_FEW, [events.FRAME_UNUSED]),
     ],

@@ -22,7 +22,8 @@ OWN: Mapping[str, frozenset[str]] = {
     "coil": frozenset({"coil-broken", "coil-corrected", "coil-suspect"}),
     "bridge": frozenset({"coil-broken", "coil-suspect"}),
     "camera": frozenset(
-        {"camera-lost", "camera-frozen", "camera-black", "camera-torn", "camera-strange", "camera-late"}
+        {"camera-lost", "camera-frozen", "camera-black", "camera-saturated"}
+        | {"camera-torn", "camera-strange", "camera-late"}
         | _STARS
     ),
     "planner": frozenset({"planner-busy", "planner-failed", "plan-refused", "holding"}),
