@@ -15,7 +15,7 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.ndimage import binary_dilation, gaussian_filter, zoom
+from scipy.ndimage import gaussian_filter
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro.arrays import Float32Array, FloatArray, Image, IntArray, tangent_basis
@@ -24,6 +24,7 @@ from sim_hal.earth_camera.scene import (
     EarthScene,
     darkening,
     look,
+    near_earth,
     radiance,
     towards_sun,
     transmission,
@@ -168,8 +169,15 @@ def pixel_rays(lens: CameraModel) -> FloatArray:
 def _pixel_rays(lens: Lens) -> FloatArray:
     rows, columns = np.mgrid[0 : lens.rows, 0 : lens.columns]
     rays = lens.unit_vectors(np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float))
+    rays = np.asfortranarray(rays)  # so that the computations along the rays are fast
     rays.setflags(write=False)
     return rays
+
+
+@lru_cache(maxsize=4)
+def _coarse_rays(lens: Lens) -> Float32Array:
+    """Return the `pixel_rays` as 32-bit numbers."""
+    return pixel_rays(lens).astype(np.float32, order="F")
 
 
 _SUBPIXELS = 6
@@ -215,6 +223,8 @@ def add_glare(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -
     if axis[2] <= 0.0 or model.scatter == 0.0:
         return
     light = visible_share(scene) * float(axis[2]) * scatter_centre(model)
+    if light == 0.0:
+        return
     squares = 2.0 - 2.0 * (pixel_rays(model.lens) @ axis).reshape(image.shape)
     image += (light / (1.0 + squares / model.scatter_angle**2)).astype(np.float32)
 
@@ -259,6 +269,8 @@ def blurred(model: EarthCameraModel, image: Float32Array) -> Float32Array:
 
     The image is continued beyond its edges with the values of its edge pixels.
     """
+    if not image.any():
+        return image
     narrow = gaussian_filter(image, model.blur, mode="nearest", truncate=4.0) if model.blur > 0.0 else image
     if model.scatter == 0.0:
         return np.asarray(narrow)
@@ -272,8 +284,15 @@ def _scattered(model: EarthCameraModel, image: Float32Array) -> Float32Array:
     bins = padded.reshape(down, _BIN, across, _BIN).mean(axis=(1, 3))
     kernel, shape = _kernel(down, across, model.scatter, model.scatter_angle, model.lens.focal_length)
     spread = irfft2(rfft2(bins, shape) * kernel, shape)[:down, :across]
-    smooth = zoom(spread, _BIN, order=1, grid_mode=True, mode="nearest")
-    return np.asarray(smooth[:rows, :columns], dtype=np.float32)
+    smooth = _between(down, rows) @ spread @ _between(across, columns).T
+    return np.asarray(smooth, dtype=np.float32)
+
+
+@lru_cache(maxsize=4)
+def _between(bins: int, pixels: int) -> Float32Array:
+    """Return the matrix (pixels, bins) of the linear interpolation from the centres of bins to pixels."""
+    place = np.clip((np.arange(pixels) + 0.5) / _BIN - 0.5, 0.0, bins - 1.0)
+    return np.maximum(1.0 - np.abs(place[:, None] - np.arange(bins)), 0.0).astype(np.float32)
 
 
 @lru_cache(maxsize=4)
@@ -384,13 +403,23 @@ def _light(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
 def _earth(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
     """Return the Earth's radiance (rows, columns), averaged within the pixels that the limb crosses."""
     rays = pixel_rays(model.lens)
+    light = np.zeros(len(rays), dtype=np.float32)
+    near = near_earth(scene, _coarse_rays(Lens.of(model.lens)))
+    if not len(near):
+        return light.reshape(model.rows, model.columns)
+    rays = rays.T[:, near].T
     sight = look(scene, rays)
-    light = radiance(scene, rays, sight)
-    limb = (~sight.hits & (light > 0.0)).reshape(model.rows, model.columns)
-    # Pixels whose centre is on the ground next to the limb may extend beyond the limb.
-    at_limb = np.flatnonzero(binary_dilation(limb, np.ones((3, 3), dtype=bool)))
+    found = radiance(scene, rays, sight)
+    light[near] = found
+    at_limb = near[~sight.hits & (found > 0.0)]
     if len(at_limb):
+        # Pixels whose centre is on the ground next to the limb may extend beyond the limb.
+        wide = np.zeros((model.rows + 2, model.columns + 2), dtype=bool)
+        down, across = np.divmod(at_limb, model.columns)
+        for step in range(9):
+            wide[down + step // 3, across + step % 3] = True
+        at_limb = np.flatnonzero(wide[1:-1, 1:-1])
         pixels = np.stack([at_limb % model.columns, at_limb // model.columns], axis=1)
-        fine = model.lens.unit_vectors((pixels[:, None, :] + _FINE).reshape(-1, 2))
+        fine = np.asfortranarray(model.lens.unit_vectors((pixels[:, None, :] + _FINE).reshape(-1, 2)))
         light[at_limb] = radiance(scene, fine, look(scene, fine)).reshape(-1, len(_FINE)).mean(axis=1)
     return light.reshape(model.rows, model.columns)

@@ -29,7 +29,14 @@ from scipy.special import erfcx, ndtri
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro import quaternion
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, tangent_basis
+from knightcube.astro.arrays import (
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    cross_product,
+    tangent_basis,
+)
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, semi_axes
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 
@@ -166,9 +173,9 @@ class EarthScene:
     def earth_matrix(self) -> FloatArray:
         """Rotation matrix (3, 3) from ICRS into Earth-fixed axes with the pole as third axis."""
         # The coordinate axis farthest from the pole gives the most accurate cross product.
-        aside = np.cross(self.pole, np.eye(3)[int(np.argmin(np.abs(self.pole)))])
-        first = np.cross(aside / np.linalg.norm(aside), self.pole)
-        second = np.cross(self.pole, first)
+        aside = cross_product(self.pole, np.eye(3)[int(np.argmin(np.abs(self.pole)))])
+        first = cross_product(aside / np.linalg.norm(aside), self.pole)
+        second = cross_product(self.pole, first)
         cosine, sine = np.cos(self.rotation), np.sin(self.rotation)
         return np.stack([cosine * first + sine * second, cosine * second - sine * first, self.pole])
 
@@ -262,21 +269,39 @@ def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
     axes = semi_axes()
     origin = scene.in_earth(scene.position) / axes
     into_earth = (scene.camera_matrix @ scene.earth_matrix.T) / axes
-    scaled = rays @ into_earth
-    squares = np.einsum("ij,ij->i", scaled, scaled)
-    along = scaled @ origin
+    # The coordinates are computed as rows of contiguous numbers, which is several times faster.
+    scaled = into_earth.T @ rays.T
+    squares, along = np.sum(scaled * scaled, axis=0), origin @ scaled
     # The distance of the nearest point from the centre is more accurate than a quadratic's discriminant.
-    step = -along / squares
-    nearest = origin + step[:, None] * scaled
-    distance = np.einsum("ij,ij->i", nearest, nearest)
+    nearest = origin[:, None] - (along / squares) * scaled
+    nearest_squares = nearest * nearest
+    distance = np.sum(nearest_squares, axis=0)
     ahead = along < 0.0
     hits = ahead & (distance <= 1.0)
     back = np.sqrt(np.maximum(1.0 - distance, 0.0) / squares)
-    places = nearest - np.where(hits, back, 0.0)[:, None] * scaled
+    places = nearest - np.where(hits, back, 0.0) * scaled
     length = np.sqrt(distance)
-    local = np.sqrt(nearest**2 @ axes**2) / length
+    local = np.sqrt(axes**2 @ nearest_squares) / length
     heights = np.where(ahead, np.maximum(length - 1.0, 0.0) * local, np.inf).astype(np.float32)
-    return EarthIntersection(np.asarray(hits), heights, places)
+    return EarthIntersection(np.asarray(hits), heights, places.T)
+
+
+def near_earth(scene: EarthScene, rays: Float32Array) -> IntArray:
+    """Return the indices of the `rays` (n, 3), camera axes, that may pass the Earth below the height `TOP`.
+
+    The indices include all rays for which `look` finds such a height, and some others.
+    """
+    axes = semi_axes()
+    origin = scene.in_earth(scene.position) / axes
+    into_earth = (scene.camera_matrix @ scene.earth_matrix.T) / axes
+    reach = float(origin @ origin) - (1.0 + TOP / float(axes.min())) ** 2
+    if reach <= 0.0:
+        return np.arange(len(rays))
+    scaled = into_earth.T.astype(np.float32) @ rays.T
+    along = origin.astype(np.float32) @ scaled
+    squares = scaled[0] * scaled[0] + scaled[1] * scaled[1] + scaled[2] * scaled[2]
+    # The margin of 1e-5 is far larger than the rounding errors of 32-bit numbers.
+    return np.flatnonzero((along < 0.0) & (along * along > np.float32(reach * (1.0 - 1e-5)) * squares))
 
 
 def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> Float32Array:
@@ -286,16 +311,17 @@ def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> F
     """
     result = np.zeros(len(rays), dtype=np.float32)
     seen = np.flatnonzero(sight.heights < TOP)
-    normals = _unit(sight.places[seen] / semi_axes())
+    places = sight.places.T
+    normals = _unit((places[:, seen] / semi_axes()[:, None]).T)
     to_earth = scene.earth_matrix @ scene.camera_matrix.T
     distance = float(np.linalg.norm(scene.sun))
     sun = scene.in_earth(scene.sun / distance)
     sunward = normals @ sun
     lit = np.flatnonzero(sunward > _DARKEST)
-    seen, normals = seen[lit], normals[lit]
+    seen, normals = seen[lit], normals.T[:, lit].T
     solar = sunward[lit].astype(np.float32)
-    directions = rays[seen]
-    upward = np.maximum(-np.einsum("ij,ij->i", directions, normals @ to_earth), 0.0).astype(np.float32)
+    directions = rays.T[:, seen].T
+    upward = np.maximum(-np.sum(directions.T * (to_earth.T @ normals.T), axis=0), 0.0).astype(np.float32)
     # The cosine of the scattering angle is 1 (forward scattering) for a line of sight towards the Sun.
     turned = (directions @ (to_earth.T @ sun)).astype(np.float32)
     air, hits = scene.atmosphere, sight.hits[seen]
@@ -304,7 +330,8 @@ def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> F
     towards = air.slant_depth(solar)
     light = air.phase(turned) * air.scattered(depth, bottom, towards)
     ground = np.flatnonzero(hits & (solar > 0.0))
-    matt = albedo(_unit(sight.places[seen[ground]] * semi_axes()), scene.texture) * solar[ground]
+    beneath = _unit((places[:, seen[ground]] * semi_axes()[:, None]).T)
+    matt = albedo(beneath, scene.texture) * solar[ground]
     light[ground] += matt * np.exp(-depth[ground] - towards[ground])
     result[seen] = light * np.float32((ASTRONOMICAL_UNIT / distance) ** 2)
     return result

@@ -16,7 +16,7 @@ from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS, semi
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from sim_hal.earth_camera import Atmosphere, EarthCameraModel, EarthScene, nadir
 from sim_hal.earth_camera.image import expected_radiance, pixel_rays
-from sim_hal.earth_camera.scene import CLOUD, CLOUD_SHARE, LAND_SHARE, OCEAN, albedo, look
+from sim_hal.earth_camera.scene import CLOUD, CLOUD_SHARE, LAND_SHARE, OCEAN, TOP, albedo, look, near_earth
 from tests.sim_hal.earth_camera.scenes import limb_scene, pointing, random_direction, random_scene
 from tests.support.earth_truth import APPARENT_LIMB_HEIGHT, limb_directions, limb_truth
 
@@ -274,3 +274,25 @@ def test_a_camera_inside_the_earth_and_numbers_that_are_none_are_refused() -> No
         EarthCameraModel(lens=NOISELESS.lens, rows=100)
     with pytest.raises(OutOfRange, match="decades"):
         EarthCameraModel.fuga15d(decades=0.0)
+
+
+@pytest.mark.parametrize("altitude", [1e3, 110e3, 500e3, 36e6])
+def test_no_ray_below_the_top_of_the_air_is_left_out(altitude: float) -> None:
+    """Rays from all over the sphere, and many within a tenth of a degree of the top of the air."""
+    generator = np.random.default_rng(8)
+    for _ in range(5):
+        zenith = random_direction(generator)
+        attitude = pointing(random_direction(generator), random_direction(generator))
+        scene = EarthScene((SEMI_MAJOR_AXIS + altitude) * zenith, attitude, ASTRONOMICAL_UNIT * zenith)
+        rays = generator.standard_normal((20_000, 3))
+        heights = np.asarray(look(scene, rays).heights)
+        edge = rays[np.isfinite(heights)][np.argsort(np.abs(heights[np.isfinite(heights)] - TOP))[:200]]
+        rays = np.concatenate(
+            [rays, np.repeat(edge, 20, axis=0) + 1e-3 * generator.standard_normal((4000, 3))]
+        )
+        near = near_earth(scene, rays.astype(np.float32))
+        below = np.flatnonzero(look(scene, rays).heights < TOP)
+        assert len(below) > 20
+        assert np.isin(below, near).all()
+        if altitude > 200e3:
+            assert len(near) < 1.2 * len(below), "the choice saves no time"
