@@ -15,7 +15,6 @@ import io
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from typing import Any
 
 from flight import __version__
@@ -133,6 +132,10 @@ def _obey(words: Sequence[str]) -> int:
             raise FlightError(str(error)) from error
         _complete(parser)
         options = parser.parse_args(words)
+        if "numpy" in sys.modules:
+            from flight.loop.worker import lean_numpy  # noqa: PLC0415 - a command without numpy needs none of it
+
+            lean_numpy()
         status: int = options.command(options)
     finally:
         sys.stdout.flush()
@@ -189,6 +192,8 @@ def _available(words: Sequence[str]) -> dict[str, tuple[str, str, str]]:
     own = {name: (*about, f"{__name__}.{name}:configure") for name, about in COMMANDS.items()}
     if words and words[0] in own:
         return own
+    from importlib import metadata  # noqa: PLC0415 - takes half as long to load as the other modules together
+
     others: dict[str, tuple[str, str, str]] = {}
     for found in metadata.entry_points(group=ENTRY_POINTS):
         if importlib.util.find_spec(found.module.partition(".")[0]) is None:
