@@ -273,6 +273,11 @@ def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
         refuse("link.idle_rate", f"is {link.idle_rate:g}: must not be above `link.rate` ({link.rate:g})")
     if link.telemetry_to is not None and link.udp is None:
         refuse("link.telemetry_to", "goes with `link.udp`")
+    host = (link.telemetry_to or "localhost:0").rpartition(":")[0]
+    try:
+        IPv4Address("127.0.0.1" if host == "localhost" else host)
+    except ValueError:  # a query for the address of a name would block the link at each frame
+        refuse("link.telemetry_to", f"{host} is not an IPv4 address")
     try:
         peer_networks(link)
     except ValueError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import select
 import socket
@@ -57,6 +58,8 @@ _STORE_EVERY = 256
 _ANY_AHEAD = 2**63
 """Width of the anti-replay window, which accepts any gap after lost telemetry."""
 _READ_BYTES = 1 << 16
+_TURN_S = 1.0
+"""Longest time (s) to wait for another program that sends a frame with the same keys."""
 FRAME_OVERHEAD_BYTES = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + CRC_BYTES
 """Number of bytes in a telecommand frame besides the packet."""
 _LINK, _VERIFICATION = (LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION))
@@ -189,9 +192,10 @@ class Terminal:
             most = f"link.command_frame_bytes is {self._settings.command_frame_bytes}"
             raise FlightError(f"the command needs a frame of {length} bytes, but {most}")
         header = TelecommandHeader(self._settings.spacecraft, 0, self._sequence)
-        body, counter = sealer.seal(header.pack(length), packet)
-        self._sequence += 1
-        self._line.send(close_frame(body))
+        with _turn_to_send(self._vault.folder):
+            body, counter = sealer.seal(header.pack(length), packet)
+            self._sequence += 1
+            self._line.send(close_frame(body))
         return counter
 
     def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:
@@ -376,6 +380,28 @@ def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = 
     except ValueError as error:
         raise UsageError(f"{address}: give {ADDRESSES}") from error
     return Terminal(line, vault, settings, codes)
+
+
+@contextlib.contextmanager
+def _turn_to_send(keys: Path) -> Iterator[None]:
+    """Make the programs that share a folder of keys send one after the other.
+
+    The satellite refuses a frame that arrives after a frame with a higher counter. A program that blocks
+    while it sends is waited for at most `_TURN_S` s.
+    """
+    with _reaching(str(keys)):
+        file = os.open(keys / "uplink", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        until = time.monotonic() + _TURN_S
+        while time.monotonic() < until:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                time.sleep(0.001)
+        yield
+    finally:
+        os.close(file)
 
 
 @contextlib.contextmanager

@@ -98,7 +98,7 @@ def problem_of_name(name: str) -> str:
     An allowed name never leads out of the folder of received files.
     """
     parts = name.split("/")
-    if len(name.encode()) >= LONGEST_NAME or len(parts) > _MOST_PARTS:
+    if len(name.encode(errors="replace")) >= LONGEST_NAME or len(parts) > _MOST_PARTS:
         return f"{name[:LONGEST_NAME]!r} is too long for the name of a file"
     if not all(_PART.fullmatch(part) for part in parts):
         return f"{name!r} is not an allowed name: use letters, digits and . _ + -, but no leading . + -"

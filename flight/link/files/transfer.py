@@ -475,16 +475,18 @@ class Receiver:
         self._conclude(condition, complete=False, kept=kept, why=why)
 
     def _begin(self, metadata: Metadata) -> None:
+        # If the disk fails here, nothing is recorded, and the metadata are requested again.
+        problem = problem_of_name(metadata.name) or self._accept(metadata)
+        room = min(self._most, self._store.room())
         self.record = msgspec.structs.replace(
             self.record, name=metadata.name, size=metadata.size, kind=metadata.checksum_type
         )
         self._dirty = True
-        problem = problem_of_name(metadata.name) or self._accept(metadata)
         if not problem and metadata.checksum_type not in TYPES:
             problem = f"checksums of type {metadata.checksum_type} are not known"
             self.stop(Condition.UNSUPPORTED_CHECKSUM, problem)
             return
-        if not problem and metadata.size > min(self._most, self._store.room()):
+        if not problem and metadata.size > room:
             problem = f"{metadata.size} bytes are too many"
         if problem:
             self.stop(Condition.FILESTORE_REJECTION, problem)

@@ -370,9 +370,9 @@ class TncLine:
         if self._socket is None and now_ns >= self._next_ns:
             self._next_ns = now_ns + _RECONNECT_NS
             self._stream = self._framing.stream()
-            self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-            self._socket.setblocking(False)
             with contextlib.suppress(OSError):
+                self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+                self._socket.setblocking(False)
                 self._socket.connect(self._address)
         if self._socket is None:
             return

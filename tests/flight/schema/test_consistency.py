@@ -57,6 +57,10 @@ def test_without_a_word_the_peers_are_those_around_the_address(lines: str, expec
         ("spacecraft: 5", "`link` has no line"),
         ("tcp: '127.0.0.1:5', telemetry_to: '127.0.0.1:6'", "`link.telemetry_to` goes with `link.udp`"),
         (
+            "udp: '127.0.0.1:5', telemetry_to: 'ground.example:6'",
+            "`link.telemetry_to` ground.example is not an IPv4 address",
+        ),
+        (
             "tcp: '127.0.0.1:5', frame_bytes: 1116, coding: {reed_solomon: 5}",
             r"is 1116: must be a multiple of `link.coding.reed_solomon` \(5\), at most 1115",
         ),

@@ -6,16 +6,20 @@ import contextlib
 import os
 import socket
 import stat
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from flight.link.frames import TELECOMMAND_MASK
 from flight.link.process.commanding import Stage
-from flight.link.security import Vault
+from flight.link.process.station import parser_of
+from flight.link.security import COMMAND_SPIS, Gate, Vault
 from flight.link.telemetry.definitions import HEALTH, VERIFICATION
 from flight.link.telemetry.packets import Packer
+from ground.link import terminal as terminal_module
 from ground.link.terminal import DEFAULTS, Terminal, TerminalSettings, make_keys, open_terminal, report_of
 from knightcube.errors import FlightError, UsageError
 from tests.flight.link.telemetry.samples import plain_contents
@@ -49,6 +53,59 @@ def test_both_ends_get_the_same_new_keys_that_only_their_owner_can_read(tmp_path
 def test_the_defaults_are_those_of_the_configuration() -> None:
     assert (TerminalSettings().spacecraft, TerminalSettings().frame_bytes) == (0x1A5, 1115)
     assert (DEFAULTS.spacecraft, DEFAULTS.frame_bytes) == (0x1A5, 1115)
+
+
+class SharedLine:
+    """A line that several terminals have; `before` is called before each frame is on it."""
+
+    def __init__(self) -> None:
+        self.frames: list[bytes] = []
+        self.before: Callable[[], object] = lambda: None
+
+    def fileno(self) -> int:
+        raise AssertionError("nothing is received here")
+
+    def receive(self) -> list[bytes]:
+        return []
+
+    def send(self, frame: bytes) -> None:
+        self.before()
+        self.frames.append(frame)
+
+    def close(self) -> None:
+        pass
+
+
+def test_programs_that_share_the_keys_send_in_the_order_of_their_counters(keys: Path) -> None:
+    """The gateway has a block of counters and stops before its frame is on the line; the console sends."""
+    slow, line = SharedLine(), SharedLine()
+    slow.frames = line.frames
+    gateway, console = (Terminal(one, Vault(keys), TerminalSettings()) for one in (slow, line))
+    sealer = gateway.sealer(1, 64)
+    gateway.send_by(sealer, b"first")
+    threads: list[threading.Thread] = []
+
+    def overtake() -> None:
+        threads.append(threading.Thread(target=console.send, args=(b"second",)))
+        threads[0].start()
+        threads[0].join(0.2)
+
+    slow.before = overtake
+    gateway.send_by(sealer, b"first")
+    threads[0].join()
+    gate = Gate(Vault(keys.parent / "satellite"), COMMAND_SPIS, parser_of(0x1A5), TELECOMMAND_MASK)
+    assert [gate.admit(frame).data for frame in line.frames] == [b"first", b"first", b"second"]
+
+
+def test_a_program_that_blocks_while_it_sends_is_not_waited_for_long(
+    keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terminal_module, "_TURN_S", 0.05)
+    slow, line = SharedLine(), SharedLine()
+    blocked, other = (Terminal(one, Vault(keys), TerminalSettings()) for one in (slow, line))
+    slow.before = lambda: other.send(b"second")
+    blocked.send(b"first")
+    assert len(line.frames) == 1
 
 
 @contextlib.contextmanager

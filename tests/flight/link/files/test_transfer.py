@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import zlib
 from collections.abc import Sequence
@@ -25,8 +26,10 @@ from flight.link.files.transfer import (
 )
 from flight.link.files.units import (
     MOST_REQUESTS,
+    Condition,
     Eof,
     FileData,
+    FileStatus,
     Finished,
     Metadata,
     Nak,
@@ -214,6 +217,25 @@ def test_a_wrong_checksum_and_a_full_disk_are_reported_and_nothing_is_kept(
     folder = pair.store(GROUND)
     assert not folder.incoming()
     assert not [path for path in folder.received.rglob("*") if path.is_file()]
+
+
+def test_metadata_that_a_failing_disk_could_not_judge_are_judged_when_they_come_again(tmp_path: Path) -> None:
+    reasons: list[str | OSError] = [OSError(errno.EIO, "failed"), "not allowed"]
+
+    def accept(_: Metadata) -> str:
+        reason = reasons.pop(0)
+        if isinstance(reason, OSError):
+            raise reason
+        return reason
+
+    end = Entity(SATELLITE, Store(tmp_path), accept, SIZE, 0)
+    metadata = pack(Transaction(GROUND, 1, SATELLITE), Metadata(SIZE, "a", "a", CRC32))
+    with pytest.raises(OSError, match="failed"):
+        end.take(metadata, 0)
+    end.take(metadata, 0)
+    answer = end.unit(0)
+    assert answer is not None
+    assert unpack(answer)[1] == Finished(Condition.FILESTORE_REJECTION, False, FileStatus.REJECTED)
 
 
 def test_a_file_that_shrinks_or_is_cancelled_ends_at_both_ends(tmp_path: Path, file: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -116,6 +117,40 @@ def test_a_file_that_changes_while_it_is_checked_is_chosen_as_it_was_checked(
     link.turn(2.0)
     assert [report.stage.name for report in link.session.reports()][-1] == "COMPLETED"
     assert (folder / "chosen" / "elements" / "a.tle").read_bytes() == b"checked"
+
+
+def test_of_two_files_that_are_checked_at_once_each_is_chosen_as_it_was_checked(
+    link: FiledEnds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both are copied beside the same folder: the longer file first, so that the checks overlap."""
+    monkeypatch.setattr(filing, "_PORTION", 1)
+    folder = link.place / "keys" / "files"
+    (folder / "received" / "elements").mkdir()
+    for name, data in (("a.tle", b"a" * 9), ("b.tle", b"b" * 3)):
+        (folder / "received" / "elements" / name).write_bytes(data)
+        link.terminal.send(
+            directives.pack(UseFile(f"received/elements/{name}", hashlib.sha256(data).digest()), 1)
+        )
+    chosen: set[tuple[str, bytes]] = set()
+    for _ in range(100):
+        link.turn(0.02)
+        chosen |= {(path.name, path.read_bytes()) for path in (folder / "chosen" / "elements").glob("*")}
+    assert chosen == {("a.tle", b"a" * 9), ("b.tle", b"b" * 3)}
+    assert [path.name for path in (folder / "chosen" / "elements").iterdir()] == ["b.tle"]
+
+
+@pytest.mark.parametrize("name", [b"bad\xff", b"loop"])
+def test_a_strange_name_in_the_log_does_not_end_the_link(link: FiledEnds, name: bytes) -> None:
+    """A name that is not UTF-8, and a symbolic link to itself."""
+    link.record(*timing_packets(50))
+    run = link.place / "runs" / "run-000001"
+    if name == b"loop":
+        (run / "loop").symlink_to("loop")
+    else:
+        (run / os.fsdecode(name)).write_bytes(b"")
+    link.command(ListFiles())
+    assert link.command(SendFile(f"log/run-000001/{name.decode(errors='replace')}")) != "completed"
+    assert link.command(SendFile("log/run-000001/flight-0001.ccsds")) == "completed"
 
 
 def test_a_file_on_board_is_replaced_only_after_it_was_deleted(link: FiledEnds) -> None:

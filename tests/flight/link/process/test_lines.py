@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -9,8 +10,9 @@ from ipaddress import IPv4Network
 
 import pytest
 
+from flight.link.coding import LinkCodes
 from flight.link.frames import SYNC, TelecommandHeader, close_frame
-from flight.link.process.station import AT_MOST, TcpLine, UdpLine
+from flight.link.process.station import AT_MOST, TcpLine, TncLine, UdpLine
 from knightcube.errors import UsageError
 
 FRAME = close_frame(TelecommandHeader(1, 0, 0).pack(11) + b"data")
@@ -114,6 +116,23 @@ def test_a_connection_that_does_not_read_is_closed() -> None:
             line.send([bytes(1 << 16)], 0)
         assert line._connections == {}
     line.close()
+
+
+def test_a_tnc_line_without_a_free_file_descriptor_connects_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as tnc:
+        line = TncLine(f"127.0.0.1:{tnc.getsockname()[1]}", LinkCodes().on_board(kiss=True))
+        with monkeypatch.context() as patch:
+            patch.setattr(socket, "socket", lambda *_: os.open("/dev/null/none", os.O_RDONLY))
+            line.send([FRAME], 0)
+        line.send([FRAME], 4 * 10**9)
+        tnc.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            tnc.accept()
+        line.send([FRAME], 5 * 10**9)
+        tnc.setblocking(True)
+        tnc.settimeout(5.0)
+        tnc.accept()[0].close()
+        line.close()
 
 
 @pytest.mark.parametrize("kind", [UdpLine, TcpLine])
