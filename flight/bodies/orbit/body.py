@@ -15,7 +15,7 @@ import numpy as np
 
 from flight.bodies.orbit.coarse_attitude import CoarseSunFeed, horizon_camera_feed
 from flight.bodies.orbit.control import FieldDetumblingLaw, PointingTracker, SunAcquisitionLaw, expected_field
-from flight.bodies.orbit.environment import EstimatedEnvironment
+from flight.bodies.orbit.environment import LATEST_WITNESS_NS, EstimatedEnvironment, Witness
 from flight.bodies.orbit.filter import OrbitFeed, OrbitFilter, OrbitFilterSettings
 from flight.bodies.orbit.guidance import (
     LearnedBody,
@@ -174,6 +174,8 @@ class OrbitView:
         return f"{mode.label} {math.degrees(float(np.linalg.norm(rate))):.2f} deg/s by the magnetometer"
 
 
+SUNLIT_SHARE = 0.5
+"""Fraction of the peak current of a solar string above which the string is in sunlight."""
 _BELOW = 0.8
 """Largest rate of a planned path, as a fraction of the rate at which detumbling starts."""
 
@@ -194,6 +196,7 @@ class SatelliteEstimation(BodyEstimation):
         self.feed = OrbitFeed(self.orbit_filter)
         self.coil_monitor = _coil_monitor(config)
         self._coils, self._errors = config.coils.map(), description_errors(config)
+        self._field_bias = config.inertial_unit.accuracy.field_bias
         self._used = self.coil_monitor.available
         self._whole_body: Learned | None = None
         if COIL_FACTORS in learned:
@@ -268,7 +271,16 @@ class SatelliteEstimation(BodyEstimation):
 
     def accept_fix(self, reading: GpsReading) -> bool:
         """Accept a report of the GPS receiver, and return whether it is used."""
-        return self.environment.fix(reading)
+        field, sigma, sunlit = None, math.inf, False
+        measured = self.orbit_filter.field_at_rest
+        if measured is not None and abs(reading.time_ns - measured[0]) <= LATEST_WITNESS_NS:
+            field = measured[1]
+            sigma = math.hypot(_FIELD_ERROR, self._field_bias, self._errors.field_matrix * field)
+        sun = self._sun
+        if sun is not None and sun.newest is not None:
+            recent = abs(reading.time_ns - sun.newest.time_ns) <= LATEST_WITNESS_NS
+            sunlit = recent and float(np.max(sun.newest.currents / sun.strings.peaks)) >= SUNLIT_SHARE
+        return self.environment.fix(reading, Witness(field, sigma, sunlit))
 
     def accept_sun(self, reading: StringReading) -> str | None:
         """Pass a solar cell reading to the filter and to the Sun acquisition of SAFE."""

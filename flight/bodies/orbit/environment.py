@@ -4,11 +4,18 @@ The position is propagated from the newest GPS fix, or from two-line elements be
 environment is predicted for about 20 s at once, which takes 2 ms, and then interpolated. Predictions for a
 whole revolution belong in a worker, because they take 0.3 ms for each 10 s. The class `StuckFieldCheck`
 detects a magnetometer that repeats the same field.
+
+A GPS fix that contradicts the elements or the previous fixes is refused. Refused fixes that are consistent
+with one orbit for `CONFIRMED` seconds replace the contradicted knowledge, unless the magnetometer or the Sun
+contradicts them. Fixes that agree with elements of a low accuracy are used after the same time. A receiver
+that is deceived consistently, with a possible orbit, cannot be detected.
 """
 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,53 +24,184 @@ from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import Pressures, pressures
 from knightcube.astro.earth.ephemeris import STEP, Ephemeris, predict
-from knightcube.astro.earth.geomagnetism import extrapolation_sigma
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.geomagnetism import extrapolation_sigma, field
 from knightcube.astro.earth.orbit_knowledge import (
-    LOWEST_RADIUS,
     GpsFix,
     OrbitError,
     OrbitState,
     TwoLineElements,
 )
 from knightcube.astro.earth.orientation import terrestrial_time
-from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_velocity
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_from_sun, earth_velocity, sunlit_share
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
 """Time spans (s) after and before the requested time that the short prediction covers."""
 GPS_DELAY_NS = 100_000_000
 """Delay (ns) from the time of a GPS fix to the first byte of the receiver's report; at most 0.2 s."""
-GATE, LEAST_GATE = 5.0, 5e3
-"""Largest accepted deviation of a GPS fix from the known orbit in standard deviations, and deviation (m) that
-is always accepted.
+GATE = 5.0
+"""Largest accepted deviation of a GPS fix from the known orbit in standard deviations."""
+LEAST_GATE, FIX_GATE = 5e3, 500.0
+"""Deviations (m) of a GPS fix from the elements, and from earlier fixes, that are always accepted."""
+SPEED_GATE, ORBITAL_RATE = 20.0, 1.2e-3
+"""Deviation (m/s) of a fix's velocity that is always accepted, and rate (rad/s) of the lowest orbit."""
+CONFIRMED = 420.0
+"""Time (s) over which refused fixes must be consistent with one orbit to replace contradicted knowledge."""
+_LEAST_FIXES, _SEQUENCES, _LONGEST_GAP = 5, 4, 200.0
+"""Minimum number of fixes that replace contradicted knowledge, largest number of assumed orbits, and longest
+time (s) between two fixes of one sequence.
 """
-CONTRADICTED = 30
-"""Number of rejected GPS fixes in a row after which the last accepted fix is considered wrong."""
-TIME_GATE_NS = SECOND_NS // 2
-"""Largest accepted step (ns) of the receiver's time relative to the host's clock."""
+FIRST_FIXES, TIGHT = 3, 1e4
+"""Number of consistent fixes that begin an orbit without elements, and largest standard deviation (m) of
+elements that confirm a fix.
+"""
+UNCONFIRMED_SIGMA = 1e6
+"""Standard deviation (m) of a position that follows from a few fixes without elements."""
+EXACT, STEEPEST = 3e3, 3.0
+"""Position error (m) whose effect on the field is below the error of the field model, and gradient of the
+field times the radius, as a fraction of the field.
+"""
+LOWEST_ORBIT = 1.01 * EARTH_RADIUS
+"""Minimum radius (m) of a satellite's position and perigee."""
+EARLIEST = 2.0
+"""Largest time (days) before the epoch of the elements at which the elements are assumed to be published."""
+TIME_GATE_NS, CLOCK_DRIFT = SECOND_NS // 2, 1e-4
+"""Largest accepted step (ns) of the receiver's time relative to the host's clock, and drift of that clock."""
 UNKNOWN_SIGMA, UNKNOWN_VELOCITY_SIGMA = 100.0, 1.0
 """Standard deviations of position (m) and velocity (m/s) per axis if the receiver does not know them."""
+WITNESS_GATE, LATEST_WITNESS_NS = 4.0, 20 * SECOND_NS
+"""Deviation (standard deviations) at which the field strength refutes an orbit, and largest age (ns)."""
 _SHORTEST = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """Measurements of other sensors at the time of a GPS fix.
+
+    Attributes:
+        field: strength of the magnetic field, T, or None if unknown.
+        field_sigma: standard deviation of the field strength, T.
+        sunlit: whether the solar cells measure the Sun; a shadow is not measured.
+    """
+
+    field: float | None = None
+    field_sigma: float = 0.0
+    sunlit: bool = False
+
+
+class FixSequence:
+    """GPS fixes that agree with one orbit and with one offset of the receiver's time.
+
+    Attributes:
+        first: first fix.
+        joined: number of fixes that agree with the first fix.
+    """
+
+    def __init__(self, fix: GpsFix, offset_ns: int) -> None:
+        """`offset_ns` is the receiver's UTC minus the time of the host's clock."""
+        self.first = self._newest = fix
+        self.joined = 1
+        self._offset_ns = offset_ns
+        self._offered = 1
+        self._strength = np.zeros(3)  # sums of the deviations of the field from both orbits, and number
+        self._shadowed = np.zeros(2)  # number of fixes at which the Sun shines in the shadow of both orbits
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the fixes agree long enough to replace contradicted knowledge."""
+        span = (self._newest.julian_date - self.first.julian_date) * DAY
+        return span >= CONFIRMED and self.joined >= max(_LEAST_FIXES, self._offered // 2)
+
+    @property
+    def refuted(self) -> bool:
+        """Whether field or Sun contradict the orbit of the fixes, and agree with the orbit known before."""
+        strength, number = np.abs(self._strength[:2]), float(self._strength[2])
+        by_field = number > 0 and strength[0] > WITNESS_GATE * number > strength[1]
+        half = 0.5 * self.joined
+        return bool(by_field or self._shadowed[0] > half > self._shadowed[1])
+
+    def is_over(self, fix: GpsFix) -> bool:
+        """Return whether a new fix comes too late, or most fixes disagree, so that the sequence has ended."""
+        gap = abs(fix.julian_date - self._newest.julian_date) * DAY
+        return gap > _LONGEST_GAP or self._offered > 2 * (self.joined + _LEAST_FIXES)
+
+    def accept(self, fix: GpsFix, offset_ns: int) -> bool:
+        """Return whether a fix agrees with the first fix."""
+        self._offered += 1
+        if abs(offset_ns - self._offset_ns) > TIME_GATE_NS or not _agree(self.first, fix, FIX_GATE):
+            return False
+        self.joined += 1
+        self._newest = fix
+        return True
+
+    def compare(self, witness: Witness, here: OrbitState, known: OrbitState) -> None:
+        """Compare field and Sun with the position of the newest fix, and with the position known before."""
+        states = here, known
+        if witness.field is not None:
+            strengths = [float(np.linalg.norm(field(here.julian_date, one.position))) for one in states]
+            self._strength[:2] += (witness.field - np.array(strengths)) / witness.field_sigma
+            self._strength[2] += 1.0
+        if witness.sunlit:
+            date = float(terrestrial_time(here.julian_date))
+            sun = -earth_from_sun(date)[0]
+            lit = sunlit_share(np.array([one.position for one in states]), np.array([sun, sun]))
+            self._shadowed += lit < _DARK
+
+
+_DARK = 0.01
+"""Visible fraction of the solar disc below which the solar cells measure no Sun."""
+
+
+def _agree(known: GpsFix | TwoLineElements, fix: GpsFix, least: float) -> bool:
+    """Return whether a fix agrees with a known orbit; deviations in position up to `least` (m) agree.
+
+    Any fix agrees with elements that give no orbit at the time of the fix.
+    """
+    found = fix.at(fix.julian_date)
+    try:
+        expected = known.at(fix.julian_date)
+    except OrbitError:
+        return isinstance(known, TwoLineElements)
+    sigma = GATE * math.sqrt(3.0) * math.hypot(expected.sigma, found.sigma)
+    speed = math.hypot(GATE * math.sqrt(3.0) * fix.velocity_sigma, ORBITAL_RATE * max(sigma, least))
+    off, fast = found.position - expected.position, found.velocity - expected.velocity
+    return bool(np.linalg.norm(off) <= max(least, sigma) and np.linalg.norm(fast) <= max(SPEED_GATE, speed))
 
 
 class EstimatedEnvironment:
     """Knowledge of the orbit. The attribute `refused` counts the GPS fixes that contradict the orbit."""
 
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:
-        """`elements` are the two-line elements; without them the orbit is unknown until the first fix."""
+        """`elements` are the two-line elements; without them the orbit is unknown until the first fixes."""
         self._elements = elements
+        self._enlarged = 1.0  # factor of the elements' standard deviation, above 1 after fixes refuted them
         self._clock = clock
         self._fix: GpsFix | None = None
+        self._is_confirmed = False  # whether the newest fix belongs to a confirmed orbit
+        self._is_doubted = False  # whether an orbit that began with few fixes was not confirmed
+        self._start: FixSequence | None = None  # fixes since the start of an unconfirmed orbit
+        self._sequences: list[FixSequence] = []
         self._utc_offset_ns: int | None = None
-        self._newest_offset_ns: int | None = None  # time offset (ns) of the newest GPS fix, even if rejected
+        self._fixed_ns = 0
         self._near: Ephemeris | None = None
-        self._refused_in_a_row = 0
+        self._near_sigma = 0.0
         self.refused = 0
 
     @property
     def known(self) -> bool:
         """Whether the orbit was known at the last request."""
         return self._near is not None
+
+    @property
+    def clock_doubt(self) -> str:
+        """Why the host's clock is wrong according to the elements, or an empty text after the first fix."""
+        if self._utc_offset_ns is not None or self._elements is None:
+            return ""
+        early = self._elements.epoch - UNIX_EPOCH - self._clock.utc_ns() / (DAY * SECOND_NS)
+        if early <= EARLIEST:
+            return ""
+        return f"the wall clock is {early:.1f} days before the epoch of the elements: the orbit is unknown"
 
     def julian_date(self, now_ns: int) -> float:
         """Return the Julian date (UTC) at a time of the host's clock.
@@ -75,28 +213,24 @@ class EstimatedEnvironment:
             offset_ns = self._clock.utc_ns() - self._clock.now_ns()
         return UNIX_EPOCH + (now_ns + offset_ns) / (DAY * SECOND_NS)
 
-    def fix(self, reading: GpsReading) -> bool:
-        """Accept a report of the GPS receiver, and return whether it is used."""
+    def fix(self, reading: GpsReading, witness: Witness | None = None) -> bool:
+        """Accept a report of the GPS receiver, and return whether it is used.
+
+        `witness` holds the measurements of other sensors, which can contradict the receiver.
+        """
         if not reading.valid:
             return False
         date = UNIX_EPOCH + reading.utc_ns / (DAY * SECOND_NS)
-        offset_ns = reading.utc_ns + GPS_DELAY_NS - reading.time_ns
+        sigma = UNKNOWN_SIGMA if math.isnan(reading.sigma) else reading.sigma
+        speed_sigma = reading.velocity_sigma
+        speed_sigma = UNKNOWN_VELOCITY_SIGMA if math.isnan(speed_sigma) else speed_sigma
         try:
-            sigma = UNKNOWN_SIGMA if math.isnan(reading.sigma) else reading.sigma
-            speed_sigma = reading.velocity_sigma
-            speed_sigma = UNKNOWN_VELOCITY_SIGMA if math.isnan(speed_sigma) else speed_sigma
             fix = GpsFix(date, reading.position, reading.velocity, sigma, speed_sigma)
-            contradicts = self._is_out_of_time(offset_ns) or self._contradicts(fix)
+            used = self._is_possible(fix) and self._judge(fix, reading, witness or Witness())
         except OrbitError:
-            contradicts = True
-        if contradicts:
-            self.refused += 1
-            self._refused_in_a_row += 1
-            return False
-        self._refused_in_a_row = 0
-        self._fix = fix
-        self._utc_offset_ns = offset_ns
-        return True
+            used = False
+        self.refused += not used
+        return used
 
     def state(self, now_ns: int) -> OrbitState | None:
         """Return position and velocity (ICRS), or None while the orbit is unknown."""
@@ -113,12 +247,19 @@ class EstimatedEnvironment:
             near.position_at(times)[0],
             Pressures(shape.air, shape.light),
             float(near.sunlit_at(times)[0]),
-            self.field_sigma(now_ns),
+            math.hypot(self.field_sigma(now_ns), self._displaced_field(near)),
         )
 
     def field_sigma(self, now_ns: int) -> float:
         """Return the standard deviation (T per axis) that a field model past its validity adds, usually 0."""
         return extrapolation_sigma(self.julian_date(now_ns))
+
+    def _displaced_field(self, near: Ephemeris) -> float:
+        """Return the standard deviation (T per axis) of the field due to the position by old elements."""
+        strength = float(np.linalg.norm(near.field[0]))
+        if self._near_sigma <= EXACT:
+            return 0.0
+        return strength * min(1.0, STEEPEST * self._near_sigma / float(np.linalg.norm(near.position[0])))
 
     def sun(self, now_ns: int) -> FloatArray | None:
         """Return the Sun direction (3,), ICRS, without aberration (21"), or None for an unknown orbit."""
@@ -138,54 +279,128 @@ class EstimatedEnvironment:
         return (self.julian_date(now_ns) - ephemeris.julian_date) * DAY
 
     def _state(self, date: float) -> OrbitState | None:
-        for source in (self._fix, self._elements):
-            if source is not None:
-                try:
-                    return source.at(date)
-                except OrbitError:
-                    continue
+        """Return the state by the fixes, or else by the elements. A wrong clock leaves both unknown."""
+        fix = self._recent(date)
+        if fix is not None:
+            state = fix.at(date)
+            return state if self._is_confirmed else replace(state, sigma=UNCONFIRMED_SIGMA)
+        if self._elements is not None and not self.clock_doubt:
+            with suppress(OrbitError):
+                state = self._elements.at(date)
+                return replace(state, sigma=self._enlarged * state.sigma)
         return None
+
+    def _recent(self, date: float) -> GpsFix | None:
+        """Return the newest fix that was used, or None if it is too old; few fixes become old sooner."""
+        fix = self._fix
+        if fix is None:
+            return None
+        limit = fix.longest_age if self._is_confirmed else CONFIRMED
+        return fix if abs(date - fix.julian_date) * DAY <= limit else None
 
     def _prediction(self, now_ns: int) -> tuple[Ephemeris | None, FloatArray]:
         """Return the short prediction, renewed if needed, and the time (1,), s, since its start."""
         near = self._near
         seconds = math.inf if near is None else self._seconds_into(near, now_ns)
         if near is None or not 0.0 <= seconds <= float(near.times[-1]) - _SHORTEST:
-            state = self._state(self.julian_date(now_ns) - BEHIND / DAY)
+            date = self.julian_date(now_ns) - BEHIND / DAY
+            state = self._state(date)
             near = None if state is None else predict(state, BEHIND + AHEAD)
             self._near = near
+            self._near_sigma = 0.0 if state is None or self._recent(date) is not None else state.sigma
             seconds = BEHIND if near is None else self._seconds_into(near, now_ns)
         return near, np.array([seconds])
 
-    def _is_out_of_time(self, offset_ns: int) -> bool:
-        """Return whether the receiver's time has stopped or jumped; a lasting jump is accepted later."""
-        last_offset_ns, self._newest_offset_ns = self._newest_offset_ns, offset_ns
-        if last_offset_ns is not None and abs(offset_ns - last_offset_ns) > TIME_GATE_NS:
-            return True
+    def _is_possible(self, fix: GpsFix) -> bool:
+        """Return whether radius and velocity are those of an orbit, and the date follows the elements."""
+        perigee, radius = fix.at(fix.julian_date).perigee_radius, float(np.linalg.norm(fix.position))
+        if not (perigee >= LOWEST_ORBIT and radius >= LOWEST_ORBIT):
+            return False
+        return self._elements is None or fix.julian_date >= self._elements.epoch - EARLIEST
+
+    def _judge(self, fix: GpsFix, reading: GpsReading, witness: Witness) -> bool:
+        """Return whether a possible fix agrees with the known orbit or replaces it, and use it then."""
+        time_ns, offset_ns = reading.time_ns, reading.utc_ns + GPS_DELAY_NS - reading.time_ns
+        last = self._recent(fix.julian_date)
+        if last is None and self._fix is not None:
+            self._is_doubted |= not self._is_confirmed
+            self._fix, self._is_confirmed = None, False
+        by_time = self._is_in_time(offset_ns, time_ns)
+        by_fixes = by_time and (last is None or _agree(last, fix, FIX_GATE))
+        by_elements = self._agrees_with_elements(fix)
+        if self._is_confirmed and by_fixes and by_elements:
+            self._sequences = []
+            return self._use(fix, offset_ns, time_ns, confirmed=True)
+        sequence = self._followed(fix, offset_ns)
+        known = self._state(fix.julian_date)
+        if known is not None:
+            sequence.compare(witness, fix.at(fix.julian_date), known)
+        if sequence.confirmed and not sequence.refuted and not self._has_false_time(fix, time_ns):
+            self._enlarge(fix)
+            self._sequences, self._is_doubted = [], False
+            return self._use(fix, offset_ns, time_ns, confirmed=True)
+        tight = self._is_tight(fix.julian_date)
+        if not (by_fixes and by_elements and (tight or self._is_begun(sequence, last))):
+            return False
+        return self._use(fix, offset_ns, time_ns, confirmed=tight)
+
+    def _is_begun(self, sequence: FixSequence, last: GpsFix | None) -> bool:
+        """Return whether a sequence begins or continues an orbit that only a few fixes describe."""
+        if self._elements is not None or self._is_doubted or sequence.joined < FIRST_FIXES:
+            return False
+        if last is None:
+            self._start = sequence
+        return sequence is self._start
+
+    def _use(self, fix: GpsFix, offset_ns: int, time_ns: int, *, confirmed: bool) -> bool:
+        self._fix, self._utc_offset_ns, self._fixed_ns = fix, offset_ns, time_ns
+        self._is_confirmed = confirmed
+        return True
+
+    def _followed(self, fix: GpsFix, offset_ns: int) -> FixSequence:
+        """Return the longest sequence that a fix continues, or a new sequence that begins with the fix."""
+        continued = [one for one in self._sequences if one.accept(fix, offset_ns)]
+        if continued:
+            return max(continued, key=lambda one: one.joined)
+        fresh = [one for one in self._sequences if not one.is_over(fix)]
+        longest = sorted(fresh, key=lambda one: -one.joined)[: _SEQUENCES - 1]
+        self._sequences = [*longest, FixSequence(fix, offset_ns)]
+        return self._sequences[-1]
+
+    def _is_in_time(self, offset_ns: int, time_ns: int) -> bool:
+        """Return whether the receiver's time continues the time of the fixes that were used."""
         known = self._utc_offset_ns
-        jumped = known is not None and abs(offset_ns - known) > TIME_GATE_NS
-        return jumped and self._refused_in_a_row < CONTRADICTED
+        gate = TIME_GATE_NS + CLOCK_DRIFT * abs(time_ns - self._fixed_ns)
+        return known is None or abs(offset_ns - known) <= gate
 
-    def _contradicts(self, fix: GpsFix) -> bool:
-        """Return whether a GPS fix is impossible, or contradicts the two-line elements or the last fix.
-
-        A lasting contradiction of the last fix is accepted later.
-        """
-        found = fix.at(fix.julian_date)
-        if not found.perigee_radius >= LOWEST_RADIUS:
-            return True
-        last = None if self._refused_in_a_row >= CONTRADICTED else self._fix
-        for known in (self._elements, last):
-            if known is None:
-                continue
-            try:
-                expected = known.at(fix.julian_date)
-            except OrbitError:
-                continue
-            off = float(np.linalg.norm(found.position - expected.position))
-            if off > max(LEAST_GATE, GATE * math.sqrt(3.0) * math.hypot(expected.sigma, found.sigma)):
-                return True
+    def _is_tight(self, date: float) -> bool:
+        """Return whether the elements are accurate enough to confirm a fix."""
+        if self._elements is not None:
+            with suppress(OrbitError):
+                return self._enlarged * self._elements.at(date).sigma <= TIGHT
         return False
+
+    def _agrees_with_elements(self, fix: GpsFix) -> bool:
+        """Return whether a fix agrees with the elements; refuted elements contradict nothing."""
+        elements = self._elements
+        return elements is None or self._enlarged > 1.0 or _agree(elements, fix, LEAST_GATE)
+
+    def _has_false_time(self, fix: GpsFix, time_ns: int) -> bool:
+        """Return whether a fix agrees with the elements at the time known before, but not at its own time."""
+        if self._elements is None or self._agrees_with_elements(fix):
+            return False
+        known = self.julian_date(time_ns - GPS_DELAY_NS)
+        return self._is_tight(known) and self._agrees_with_elements(replace(fix, julian_date=known))
+
+    def _enlarge(self, fix: GpsFix) -> None:
+        """Enlarge the standard deviation of elements that a confirmed orbit contradicts."""
+        elements = self._elements
+        if elements is None or self._agrees_with_elements(fix):
+            return
+        with suppress(OrbitError):
+            expected = elements.at(fix.julian_date)
+            off = float(np.linalg.norm(fix.at(fix.julian_date).position - expected.position))
+            self._enlarged = max(1.0, off / expected.sigma)
 
 
 STUCK, FIELDS_CONTRADICTED = 20, 4

@@ -602,6 +602,7 @@ class OrbitFilter:
 
     Attributes:
         restarts: number of estimates that were discarded.
+        field_at_rest: time (ns) and strength (T) of the newest magnetic field measured with the coils off.
     """
 
     def __init__(
@@ -626,6 +627,7 @@ class OrbitFilter:
         self._shares = settings.coils.linear_shares(np.ones(len(settings.coils.current_limits), dtype=bool))
         self._placed_ns = 0  # time of the last attitude that was used
         self.restarts = 0
+        self.field_at_rest: tuple[int, float] | None = None
 
     @property
     def knowledge(self) -> Knowledge:
@@ -761,6 +763,8 @@ class OrbitFilter:
         usable = self._field_check.accept(reading.field)
         rest_ns = self._dipoles.at_rest_since()
         settled = rest_ns is not None and reading.time_ns - rest_ns >= self._settings.settle_ns
+        if settled and usable:
+            self.field_at_rest = reading.time_ns, math.hypot(*reading.field.tolist())
         self._open.add(reading, self._dipoles.total(reading.time_ns), settled and usable)
         if self._open.is_over(self._acts(), self._settings.step_ns):
             self._close()

@@ -746,12 +746,11 @@ class FreeFilter:
             square = (float(error @ error) + float(covariance[FIELD, FIELD].trace())) / 3.0
             variance = self.field_error**2 + dt / FIELD_LEARNED * (square - self.field_error**2)
             self.field_error = max(math.sqrt(variance), MINIMUM_FIELD_ERROR)
-        self.field_error = max(self.field_error, least)
         kept = math.exp(-dt / self._settings.field_memory)
         error *= kept
         covariance[FIELD] *= kept
         covariance[:, FIELD] *= kept
-        covariance.reshape(-1)[_FIELD_DIAGONAL] += (1.0 - kept**2) * self.field_error**2
+        covariance.reshape(-1)[_FIELD_DIAGONAL] += (1.0 - kept**2) * max(self.field_error, least) ** 2
 
     def _propagate_horizon(self, dt: float) -> None:
         """Propagate the Gauss-Markov process of the horizon cameras' misalignment."""
@@ -817,7 +816,8 @@ class FreeFilter:
             density = density + coils * (across @ across.T)
         if square:
             across = motion.inverse @ cross_matrix(dipole)
-            density = density + LASTING * self.field_error**2 * (across @ across.T)
+            error = max(self.field_error, around.field_sigma)
+            density = density + LASTING * error**2 * (across @ across.T)
         return np.asarray(density)
 
     def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
 
 import numpy as np
 import pytest
 
-from flight.bodies.orbit.environment import CONTRADICTED, GPS_DELAY_NS, EstimatedEnvironment
+from flight.bodies.orbit.environment import (
+    CONFIRMED,
+    FIRST_FIXES,
+    GPS_DELAY_NS,
+    EstimatedEnvironment,
+    Witness,
+)
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from hal.interfaces.devices import GpsReading
@@ -64,9 +71,12 @@ def test_the_place_the_sun_and_the_shadow_are_known_after_the_field_model_has_en
     elements: TwoLineElements, years: int
 ) -> None:
     known = EstimatedEnvironment(None, SimClock(UTC_NS))
-    first = reading(elements, 0)
-    assert known.fix(replace(first, utc_ns=UTC_NS + round(years * 365.25) * 86_400 * SECOND_NS))
-    around, sun, velocity = known.at(SECOND_NS), known.sun(SECOND_NS), known.velocity(SECOND_NS)
+    later_ns = round(years * 365.25) * DAYS_NS
+    for second in range(FIRST_FIXES):
+        sound = reading(elements, second * SECOND_NS)
+        used = known.fix(replace(sound, utc_ns=sound.utc_ns + later_ns))
+    assert used
+    around, sun, velocity = known.at(3 * SECOND_NS), known.sun(3 * SECOND_NS), known.velocity(3 * SECOND_NS)
     assert around is not None
     assert sun is not None
     assert velocity is not None
@@ -81,20 +91,12 @@ def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLin
     assert known.at(0) is None
     assert known.velocity(0) is None
     assert known.state(0) is None
-    assert known.fix(reading(elements, 10 * SECOND_NS))
+    used = [known.fix(reading(elements, second * SECOND_NS)) for second in (8, 9, 10)]
+    assert used == [False, False, True]
     found = known.at(12 * SECOND_NS)
     assert found is not None
     expected = elements.at(UNIX_EPOCH + (UTC_NS + 12 * SECOND_NS) / (DAY * SECOND_NS))
     assert found.position == pytest.approx(expected.position, abs=50.0), "the receiver's time, not the host's"
-
-
-def test_a_false_fix_is_refused_by_the_elements_however_often_it_comes(elements: TwoLineElements) -> None:
-    known = EstimatedEnvironment(elements, SimClock(UTC_NS))
-    shift = np.array([3e4, 0.0, 0.0])
-    answers = [known.fix(reading(elements, k * SECOND_NS, shift)) for k in range(CONTRADICTED + 5)]
-    assert not any(answers)
-    assert known.refused == CONTRADICTED + 5
-    assert known.fix(reading(elements, 60 * SECOND_NS))
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.9, 1.5])
@@ -106,43 +108,202 @@ def test_a_fix_with_an_impossible_velocity_is_refused(elements: TwoLineElements,
     ):
         sound = reading(elements, 0)
         assert not known.fix(replace(sound, velocity=speed * sound.velocity))
-        assert known.fix(reading(elements, SECOND_NS))
+        assert any([known.fix(reading(elements, second * SECOND_NS)) for second in range(1, 4)])
+
+
+DAYS_NS = 86_400 * SECOND_NS
+FIRST = "1 99001U 26001A   26079.50000000  .00000000  00000-0  00000+0 0  9996"
+SECOND = "2 99001  97.4640 337.4170 0011973 295.7805  64.3547 15.30000000000102"
+
+
+def summed(line: str) -> str:
+    return line[:68] + str(sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10)
+
+
+def dragged(drag: str) -> TwoLineElements:
+    """Return elements like FIRST and SECOND with another drag term."""
+    return TwoLineElements(summed(FIRST[:53] + drag + FIRST[61:]), SECOND)
+
+
+def ahead(degrees: float) -> TwoLineElements:
+    """Return elements of a satellite that flies ahead of FIRST and SECOND on the same orbit."""
+    return TwoLineElements(FIRST, summed(f"{SECOND[:43]}{(64.3547 + degrees) % 360.0:8.4f}{SECOND[51:]}"))
+
+
+class Flight:
+    """Receiver of a satellite with true elements, some days after their epoch, read every ten seconds."""
+
+    def __init__(self, known: TwoLineElements | None, true: TwoLineElements, days: int = 0) -> None:
+        self.true, self.days_ns = true, days * DAYS_NS
+        self.environment = EstimatedEnvironment(known, SimClock(UTC_NS + self.days_ns))
+        self.seconds = 0
+
+    def reading(self, shift: FloatArray | None = None, seconds: float = 0.0) -> GpsReading:
+        """Return the present fix, shifted in position and in its UTC."""
+        sound = reading(self.true, self.days_ns + self.seconds * SECOND_NS, shift)
+        time_ns = self.seconds * SECOND_NS + GPS_DELAY_NS
+        utc_ns = sound.utc_ns + round(seconds * SECOND_NS)
+        return replace(sound, time_ns=time_ns, arrival_ns=time_ns, utc_ns=utc_ns)
+
+    def fly(
+        self, duration: int, made: Callable[[], GpsReading], witness: Witness | None = None
+    ) -> list[bool]:
+        """Return which of the fixes of the next `duration` seconds are used."""
+        used = []
+        for _ in range(duration // 10):
+            used.append(self.environment.fix(made(), witness))
+            self.seconds += 10
+        return used
+
+    def off(self) -> tuple[float, float]:
+        """Return the error of the present position, m, and its claimed standard deviation, m."""
+        state = self.environment.state(self.seconds * SECOND_NS)
+        assert state is not None
+        return float(np.linalg.norm(state.position - self.true.at(state.julian_date).position)), state.sigma
 
 
 @pytest.mark.parametrize("age", [1, 6, 14, 30, 60])
 @pytest.mark.parametrize("drag", [" 25000-3", " 50000-3"])
 def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(age: int, drag: str) -> None:
     """Elements with B* 0 of a satellite with B* 2.5e-4 and 5e-4; later fixes are judged by earlier fixes."""
-    first = "1 99001U 26001A   26079.50000000  .00000000  00000-0  00000+0 0  9996"
-    second = "2 99001  97.4640 337.4170 0011973 295.7805  64.3547 15.30000000000102"
-    dragged = first[:53] + drag + first[61:68]
-    total = sum(int(c) if c.isdigit() else c == "-" for c in dragged) % 10
-    old, true = TwoLineElements(first, second), TwoLineElements(f"{dragged}{total}", second)
-    utc_ns = UTC_NS + age * 86_400 * SECOND_NS
-    known = EstimatedEnvironment(old, SimClock(utc_ns))
+    flight = Flight(TwoLineElements(FIRST, SECOND), dragged(drag), age)
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma
+    used = flight.fly(round(CONFIRMED) + 40, flight.reading)
+    assert used.index(True) == 0 if age == 1 else used.index(True) <= CONFIRMED // 10 + 1
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma < 100.0
+    assert not any(flight.fly(30, lambda: flight.reading(np.array([0.0, 4e4, 0.0]))))
+    assert all(flight.fly(30, flight.reading))
 
-    def fix(seconds: int, shift: FloatArray | None = None) -> GpsReading:
-        time_ns = age * 86_400 * SECOND_NS + seconds * SECOND_NS
-        sound = reading(true, time_ns, shift)
-        return replace(sound, time_ns=seconds * SECOND_NS + GPS_DELAY_NS)
 
-    before = known.state(0)
+@pytest.mark.parametrize("degrees", [1.0, 15.0, -120.0])
+def test_consistent_fixes_replace_elements_that_they_contradict(degrees: float) -> None:
+    """The elements are those of another satellite or of a time before a manoeuvre."""
+    flight = Flight(ahead(degrees), TwoLineElements(FIRST, SECOND))
+    flight.fly(50, lambda: flight.reading(np.array([2e5, 0.0, 0.0])))
+    used = flight.fly(600, flight.reading)
+    assert CONFIRMED // 10 <= used.index(True) <= CONFIRMED // 10 + 1
+    assert all(used[used.index(True) :])
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma < 100.0
+    flight.seconds += 2000
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma, "without fixes the elements are used, with the error that the fixes have shown"
+    assert any(flight.fly(600, flight.reading))
+
+
+@pytest.mark.parametrize("shift", [(7e3, 0.0, 0.0), (0.0, -3e4, 0.0), (0.0, 2e5, 3e5)])
+@pytest.mark.parametrize("days", [6, 30])
+def test_a_shifted_receiver_is_not_confirmed(days: int, shift: tuple[float, float, float]) -> None:
+    """Its positions and velocities are not those of an orbit, however old the elements are."""
+    flight = Flight(TwoLineElements(FIRST, SECOND), dragged(" 50000-3"), days)
+    assert not any(flight.fly(1200, lambda: flight.reading(np.array(shift))))
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma
+    assert any(flight.fly(600, flight.reading))
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma < 100.0
+
+
+def test_a_receiver_that_jumps_is_refused_by_old_elements_too() -> None:
+    flight, random = Flight(TwoLineElements(FIRST, SECOND), dragged(" 50000-3"), 40), np.random.default_rng(3)
+    used = flight.fly(1500, lambda: flight.reading(2e5 * random.standard_normal(3)))
+    assert not any(used)
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma
+
+
+def test_single_false_fixes_do_not_delay_the_replacement() -> None:
+    flight, random = Flight(ahead(15.0), TwoLineElements(FIRST, SECOND)), np.random.default_rng(4)
+    false = iter(random.random(100) < 0.2)
+    used = flight.fly(600, lambda: flight.reading(1e5 * random.standard_normal(3) if next(false) else None))
+    assert any(used)
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma < 400.0
+
+
+def test_a_receiver_with_a_false_time_is_refused_although_its_orbit_is_consistent() -> None:
+    known = TwoLineElements(FIRST, SECOND)
+    flight = Flight(known, known)
+    assert not any(flight.fly(1200, lambda: flight.reading(seconds=100.0)))
+    assert all(flight.fly(60, flight.reading))
+
+
+@pytest.mark.parametrize("days", [-30.0, -3.0])
+def test_a_date_before_the_elements_is_refused(days: float) -> None:
+    known = TwoLineElements(FIRST, SECOND)
+    flight = Flight(known, known)
+    assert not any(flight.fly(600, lambda: flight.reading(seconds=86_400 * days)))
+
+
+def strength(flight: Flight, elements: TwoLineElements) -> float:
+    """Return the field strength, T, at the present place of a satellite."""
+    date = UNIX_EPOCH + (UTC_NS + flight.seconds * SECOND_NS) / (DAY * SECOND_NS)
+    return float(np.linalg.norm(field(date, elements.at(date).position)))
+
+
+def test_the_field_decides_between_elements_and_a_consistent_false_orbit() -> None:
+    """The magnetometer contradicts a quarter of an orbit, and confirms the same replacement if it is true."""
+    there, here = ahead(90.0), TwoLineElements(FIRST, SECOND)
+    for known, true, used in ((here, there, False), (there, here, True)):
+        flight = Flight(known, true)
+        answers = []
+        for _ in range(60):
+            witness = Witness(strength(flight, here), 1e-6)
+            answers += flight.fly(10, flight.reading, witness)
+        assert any(answers) is used
+
+
+def test_a_magnetometer_that_contradicts_both_orbits_decides_nothing() -> None:
+    flight = Flight(ahead(90.0), TwoLineElements(FIRST, SECOND))
+    assert any(flight.fly(600, flight.reading, Witness(9e-5, 1e-6)))
+
+
+def test_the_sun_refutes_an_orbit_in_the_shadow() -> None:
+    """At half past ten the orbit is sunlit at its start, and in the shadow half a revolution later."""
+    lit, dark = TwoLineElements(FIRST, SECOND), ahead(180.0)
+    used = {}
+    for name, known, true in (("dark", lit, dark), ("lit", dark, lit)):
+        flight = Flight(known, true)
+        flight.seconds = 500
+        used[name] = any(flight.fly(600, flight.reading, Witness(sunlit=True)))
+    assert sorted(used.values()) == [False, True]
+
+
+def test_a_clock_before_the_elements_leaves_the_orbit_unknown_until_a_fix() -> None:
+    elements = TwoLineElements(FIRST, SECOND)
+    flight = Flight(elements, elements, 1)
+    flight.environment = EstimatedEnvironment(elements, SimClock(UTC_NS - 5 * DAYS_NS))
+    assert flight.environment.clock_doubt.startswith("the wall clock is 5.0 days before the epoch")
+    assert flight.environment.state(0) is None
+    assert all(flight.fly(30, flight.reading))
+    assert flight.environment.clock_doubt == ""
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma < 100.0
+
+
+def test_old_elements_widen_the_field_and_a_fix_narrows_it() -> None:
+    flight = Flight(TwoLineElements(FIRST, SECOND), dragged(" 50000-3"), 20)
+    before = flight.environment.at(0)
     assert before is not None
-    off = np.linalg.norm(before.position - true.at(before.julian_date).position)
-    assert off < 4.0 * before.sigma
-    assert known.fix(fix(0))
-    state = known.state(0)
-    assert state is not None
-    assert state.sigma < 20.0
-    assert not known.fix(fix(1, np.array([0.0, 4e4, 0.0])))
-    assert known.fix(fix(2))
+    off = np.linalg.norm(before.field - field(flight.environment.julian_date(0), before.position))
+    assert 5e-7 < before.field_sigma < 6e-5
+    assert off < before.field_sigma
+    flight.fly(600, flight.reading)
+    after = flight.environment.at(600 * SECOND_NS)
+    assert after is not None
+    assert after.field_sigma == 0.0
 
 
-def test_without_elements_a_first_fix_that_was_false_is_given_up(elements: TwoLineElements) -> None:
-    known = EstimatedEnvironment(None, SimClock(UTC_NS))
-    assert known.fix(reading(elements, 0, np.array([3e4, 0.0, 0.0])))
-    answers = [known.fix(reading(elements, k * SECOND_NS)) for k in range(1, CONTRADICTED + 2)]
-    assert answers == [False] * CONTRADICTED + [True]
+def test_without_elements_a_first_orbit_that_was_false_is_given_up() -> None:
+    flight = Flight(None, TwoLineElements(FIRST, SECOND))
+    assert any(flight.fly(60, lambda: flight.reading(np.array([3e4, 0.0, 0.0]))))
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma
+    assert any(flight.fly(600, flight.reading))
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma < 100.0
 
 
 def test_a_fix_that_the_receiver_does_not_vouch_for_is_not_used(elements: TwoLineElements) -> None:
@@ -152,7 +313,7 @@ def test_a_fix_that_the_receiver_does_not_vouch_for_is_not_used(elements: TwoLin
 
 
 def test_a_fix_of_unknown_accuracy_is_used_with_a_wide_one(elements: TwoLineElements) -> None:
-    known = EstimatedEnvironment(None, SimClock(UTC_NS))
+    known = EstimatedEnvironment(elements, SimClock(UTC_NS))
     assert known.fix(replace(reading(elements, 0), sigma=np.nan, velocity_sigma=np.nan))
     state = known.state(100 * SECOND_NS)
     assert state is not None
@@ -181,11 +342,13 @@ def test_a_receiver_whose_time_stands_is_refused_for_as_long_as_it_does(elements
     assert known.julian_date(60 * SECOND_NS) == pytest.approx(date, abs=1e-8), "the time goes on"
 
 
-def test_a_receiver_whose_bytes_come_late_is_believed_only_after_a_while(elements: TwoLineElements) -> None:
-    known, late_ns = EstimatedEnvironment(elements, SimClock(UTC_NS)), 2 * SECOND_NS
-    assert known.fix(reading(elements, 10 * SECOND_NS))
-    used = []
-    for seconds in range(11, 60):
-        sent = reading(elements, seconds * SECOND_NS)
-        used.append(known.fix(replace(sent, time_ns=sent.time_ns + late_ns)))
-    assert used.index(True) == CONTRADICTED
+def test_a_receiver_whose_bytes_come_late_is_believed_only_after_a_while() -> None:
+    elements = TwoLineElements(FIRST, SECOND)
+    flight = Flight(elements, elements)
+    assert all(flight.fly(10, flight.reading))
+
+    def late() -> GpsReading:
+        sent = flight.reading()
+        return replace(sent, time_ns=sent.time_ns + 2 * SECOND_NS)
+
+    assert CONFIRMED // 10 <= flight.fly(600, late).index(True) <= CONFIRMED // 10 + 1
