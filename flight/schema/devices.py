@@ -6,6 +6,7 @@ Values are in SI units, unless their name contains another unit.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -25,12 +26,17 @@ from flight.schema.values import (
     Sign,
     Vector,
 )
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.errors import UsageError
 from knightcube.gnc.control.coil_map import LEAST_SPREAD, CoilMap, missing_direction
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
+from knightcube.vision.horizon.structure import polygon_mask
 from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
 
 _KNOWN = CameraKnowledge()
+_MOST_HIDDEN = 0.5
+"""Largest fraction of a horizon camera's image that the configured structure may cover."""
+Polygon = Annotated[tuple[tuple[float, float], ...], Meta(min_length=3, max_length=64)]
 ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
 
 
@@ -382,11 +388,13 @@ class WideCamera(Section, frozen=True, kw_only=True):
     """A wide-angle camera for Sun and horizon.
 
     A logarithmic `response` maps `decades` decades of intensity to the counts above `pedestal`; all
-    wide-angle cameras must have the same response. All cameras are triggered together, with the shortest
-    `period` of the cameras or, while the attitude is known to 0.05 deg, with the shortest `fine_period`. The
-    angle `lens_error_deg` is the residual error of the calibrated lens. The angle
-    `mounting_deg` is the largest rotation of a camera about each body axis from its `mounting`; the true
-    rotation is assumed to be uniform within it.
+    wide-angle cameras must have the same response. The polygons `structure` and the image file
+    `structure_file` show where the spacecraft itself is in view. Each polygon is a list of corners (x, y) in
+    px. Pixels above 0 of the file, a PGM or PNG image of the camera's size, show the spacecraft. All cameras
+    are triggered together, with the shortest `period` of the cameras or, while the attitude is known to
+    0.05 deg, with the shortest `fine_period`. The angle `lens_error_deg` is the residual error of the
+    calibrated lens. The angle `mounting_deg` is the largest rotation of a camera about each body axis from
+    its `mounting`; the true rotation is assumed to be uniform within it.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -405,6 +413,8 @@ class WideCamera(Section, frozen=True, kw_only=True):
     lens_error_deg: NotNegative = 0.02
     mounting_deg: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.1
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    structure: Annotated[tuple[Polygon, ...], Meta(max_length=32)] = ()
+    structure_file: Annotated[str, Meta(min_length=1)] | None = None
 
     def counts_per_decade(self) -> float:
         """Return the increase of a logarithmic camera's counts for a tenfold increase of the intensity."""
@@ -420,6 +430,27 @@ def camera_model(camera: Camera | WideCamera) -> CameraModel:
         return Pinhole.from_field_of_view(camera.columns, camera.rows, math.radians(camera.field_of_view_deg))
     lens = camera.lens
     return Lens(camera.columns, camera.rows, lens.focal_length, lens.centre, lens.k1, lens.k2)
+
+
+def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:
+    """Return the mask (rows, columns) of the pixels that show the spacecraft itself.
+
+    Without `of_file`, only the polygons are used. Raises UsageError for a file that cannot be read or has
+    another size, and if more than half of the image is hidden.
+    """
+    mask = polygon_mask(camera.rows, camera.columns, camera.structure)
+    if of_file and camera.structure_file is not None:
+        from knightcube.vision.camera.images import read_image  # noqa: PLC0415 - only with a file
+
+        pixels = read_image(Path(camera.structure_file))
+        if pixels.shape != mask.shape:
+            sizes = [f"{shape[1]} x {shape[0]}" for shape in (pixels.shape, mask.shape)]
+            raise UsageError(f"{camera.structure_file}: {sizes[0]} pixels, but the camera has {sizes[1]}")
+        mask |= pixels > 0
+    if np.mean(mask) > _MOST_HIDDEN:
+        share = 100.0 * float(np.mean(mask))
+        raise UsageError(f"structure covers {share:.0f} % of the image: at most half may be hidden")
+    return mask
 
 
 def camera_knowledge(camera: Camera) -> CameraKnowledge:

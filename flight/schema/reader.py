@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from flight.schema.devices import Camera, Coils, SolarStringsSection
+from flight.schema.devices import Camera, Coils, SolarStringsSection, structure_mask
 from flight.schema.document import ConfigError, Document, convert, read_document, read_text
 from flight.schema.orbit import Craft, ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
@@ -83,6 +83,10 @@ def check_consistency(config: Config, document: Document) -> None:
         _check_matrix(f"inertial_unit.calibration.{name}", getattr(unit.calibration, name), refuse)
     for index, camera in enumerate(config.wide_cameras):
         _check_length(f"wide_cameras[{index}].mounting", camera.mounting, refuse)
+        try:
+            structure_mask(camera, of_file=False)
+        except UsageError as error:
+            refuse(f"wide_cameras[{index}].structure", f"is refused: {error}")
         first = config.wide_cameras[0]
         for name in ("response", "decades", "bits", "pedestal"):
             if (value := getattr(camera, name)) != (wanted := getattr(first, name)):

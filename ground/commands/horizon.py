@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from ground.commands.options import (
     read_picture,
 )
 from ground.pictures import draw_circle, draw_horizon
-from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.errors import UsageError
 from knightcube.reference.horizon import (
     LINES,
@@ -39,7 +39,12 @@ from knightcube.reference.horizon import (
 )
 from knightcube.vision.camera.images import grey_stretch, read_image, write_picture
 from knightcube.vision.camera.lens import CameraModel, Pinhole
-from knightcube.vision.horizon.nadir import HorizonSolution, HorizonStatus, NadirMeasurement, find_nadir
+from knightcube.vision.horizon.nadir import (
+    HorizonSolution,
+    NadirMeasurement,
+    find_nadir,
+    nadir_of_uncertain_field,
+)
 from knightcube.vision.horizon.settings import (
     LEAST_ALTITUDE,
     EdgeSettings,
@@ -64,7 +69,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--fov-error",
         type=positive,
         metavar="DEG",
-        help="standard deviation of --fov, which widens the uncertainties (default 0)",
+        help="standard deviation of --fov; pictures of other fields of view are tried too (default 0)",
     )
     height = parser.add_mutually_exclusive_group()
     height.add_argument(
@@ -78,6 +83,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar=("LEAST", "MOST"),
         default=(low, high),
         help=f"limits of an unknown altitude, km (default {low:g} {high:g})",
+    )
+    parser.add_argument(
+        "--mask",
+        type=Path,
+        metavar="IMAGE",
+        help="image (PNG, PGM or FITS) of the picture's size; its pixels above 0 show the spacecraft itself",
     )
     parser.add_argument(
         "--log-response",
@@ -105,9 +116,13 @@ def run(options: argparse.Namespace) -> int:
     least, most = (1e3 * bound for bound in options.altitudes)
     settings = HorizonSettings(edges=EdgeSettings(response=response), altitudes=(least, most))
     knowledge = HorizonKnowledge(altitude=altitude)
-    solution = find_nadir(pixels, camera, knowledge, settings)
-    if options.fov_error is not None:
-        solution = _widened(solution, options, pixels, knowledge, settings)
+    hidden = _mask(options, pixels)
+    if options.fov_error is None:
+        solution = find_nadir(pixels, camera, knowledge, settings, hidden)
+    else:
+        # The focal length changes by df / f = -d(fov) / sin(fov).
+        sigma = math.radians(options.fov_error) / math.sin(math.radians(options.fov))
+        solution = nadir_of_uncertain_field(pixels, camera, sigma, knowledge, settings, hidden)
     if options.json:
         sys.stdout.write(json.dumps(_facts(solution, altitude is None), allow_nan=False) + "\n")
     else:
@@ -119,36 +134,15 @@ def run(options: argparse.Namespace) -> int:
     return 0 if solution.nadir is not None else 1
 
 
-def _widened(
-    solution: HorizonSolution,
-    options: argparse.Namespace,
-    pixels: Image,
-    knowledge: HorizonKnowledge,
-    settings: HorizonSettings,
-) -> HorizonSolution:
-    """Return the solution with the uncertainties of nadir and altitude due to the error of the field of view.
-
-    The limb is searched again with the field of view larger and smaller by one standard deviation. If both
-    searches find no limb, the solution is refused.
-    """
-    nadir = solution.nadir
-    if nadir is None:
-        return solution
-    rows, columns = pixels.shape
-    others = []
-    for sign in (-1.0, 1.0):
-        field = math.radians(options.fov + sign * options.fov_error)
-        found = find_nadir(pixels, Pinhole.from_field_of_view(columns, rows, field), knowledge, settings)
-        others += [found.nadir] if found.nadir is not None else []
-    if not others:
-        reason = f"no limb is found with the field of view {options.fov_error:g} deg larger or smaller"
-        return replace(solution, status=HorizonStatus.REFUSED, reason=reason, nadir=None, candidates=(nadir,))
-    across = np.eye(3) - np.outer(nadir.direction, nadir.direction)
-    moved = np.array([each.direction - nadir.direction for each in others]) @ across
-    higher = np.array([each.altitude - nadir.altitude for each in others])
-    covariance = nadir.covariance + moved.T @ moved / len(others)
-    sigma = math.hypot(nadir.altitude_sigma, float(np.sqrt(np.mean(higher**2))))
-    return replace(solution, nadir=replace(nadir, covariance=covariance, altitude_sigma=sigma))
+def _mask(options: argparse.Namespace, pixels: Image) -> BoolArray | None:
+    """Return the mask of the structure in the picture, or None without one."""
+    if options.mask is None:
+        return None
+    hidden = read_image(options.mask) > 0
+    if hidden.shape != pixels.shape:
+        sizes = [f"{shape[1]} x {shape[0]}" for shape in (hidden.shape, pixels.shape)]
+        raise UsageError(f"--mask {options.mask}: {sizes[0]} pixels, but {options.image} has {sizes[1]}")
+    return hidden
 
 
 def _camera(options: argparse.Namespace, pixels: Image) -> CameraModel:
@@ -282,8 +276,15 @@ def _check_method(options: argparse.Namespace) -> None:
         return
     if options.lines is not None and not 3 <= options.lines <= 512:
         raise UsageError(f"--lines {options.lines}: give 3 to 512")
-    if options.log_response is not None:
-        raise UsageError(f"--log-response: --method {options.method} uses the counts directly")
+    for name in ("mask", "log_response"):
+        if getattr(options, name) is not None:
+            option = f"--{name.replace('_', '-')}"
+            raise UsageError(f"{option}: --method {options.method} uses the counts directly")
+    _check_second(options)
+
+
+def _check_second(options: argparse.Namespace) -> None:
+    """Raise UsageError unless the options give all values that a method of Meller et al. needs."""
     if options.method != "circle" and options.second is None:
         raise UsageError(f"--method {options.method}: give the other picture with --second")
     if options.method == "graphic" and options.turned is None:

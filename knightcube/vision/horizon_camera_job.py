@@ -10,14 +10,15 @@ because the control process does not need them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.lens import MountedCamera
 from knightcube.vision.horizon.settings import HorizonKnowledge, LogarithmicResponse, SensedDirection
+from knightcube.vision.horizon.structure import StructureMap
 from knightcube.vision.solar_cells import SolarStringModel
 
 SUNLIT_COUNTS = 30.0
@@ -41,6 +42,7 @@ class HorizonCameraJob:
         strings: model of the solar strings and the currents (n,), A, of the strings. Without a recent reading
             of the currents, `strings` is None.
         response: response of the cameras' detectors to light intensity; None: linear.
+        structure: maps of the spacecraft's own structure in the images, by the index of the camera.
     """
 
     frames: Mapping[int, Image]
@@ -48,6 +50,7 @@ class HorizonCameraJob:
     knowledge: HorizonKnowledge
     strings: tuple[SolarStringModel, FloatArray] | None
     response: LogarithmicResponse | None = None
+    structure: Mapping[int, StructureMap] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,21 +79,25 @@ class HorizonCameraResult:
         sun, nadir: measured directions of Sun and nadir, body axes; None if there is none.
         false: reasons, by camera index, why the content of an image contradicts an accurately known attitude.
             If the attitude is not accurately known, images are not checked and `false` is None.
+        structure: maps of the spacecraft's own structure after these images, by camera index.
     """
 
     sun: MeasuredDirection | None
     nadir: MeasuredDirection | None
     false: Mapping[int, str] | None = None
+    structure: Mapping[int, StructureMap] = field(default_factory=dict)
 
 
 def run(job: HorizonCameraJob) -> HorizonCameraResult:
     """Return Sun and nadir. The worker process imports this function by its name."""
+    structure = {n: each.after(job.frames[n]) for n, each in job.structure.items() if n in job.frames}
+    job = replace(job, structure=structure)
     sun = _sun(job)
     knowledge = job.knowledge
     if sun is not None and knowledge.sun is not None:
         known = SensedDirection(sun.direction, knowledge.sun, sun.sigma)
         knowledge = replace(knowledge, sensed=(*knowledge.sensed, known))
-    return HorizonCameraResult(sun, _nadir(job, knowledge, sun), _false_images(job))
+    return HorizonCameraResult(sun, _nadir(job, knowledge, sun), _false_images(job), structure)
 
 
 def _sun(job: HorizonCameraJob) -> MeasuredDirection | None:
@@ -117,12 +124,16 @@ def _nadir(
     from knightcube.vision.horizon.settings import EdgeSettings, HorizonSettings  # noqa: PLC0415
 
     settings = HorizonSettings(edges=EdgeSettings(response=job.response))
-    found = nadir_of_cameras(job.frames, job.cameras, knowledge, settings)
+    masks = _masks(job)
+    found = nadir_of_cameras(job.frames, job.cameras, knowledge, settings, masks)
     if found.nadir is not None:
         return MeasuredDirection(found.nadir.direction, found.nadir.covariance, found.cameras)
     if found.status is not HorizonStatus.NO_HORIZON or knowledge.position is None:
         return None
-    looks = [image_brightness(image, job.cameras[n], SUNLIT_COUNTS) for n, image in job.frames.items()]
+    looks = [
+        image_brightness(image, job.cameras[n], SUNLIT_COUNTS, masks.get(n))
+        for n, image in job.frames.items()
+    ]
     altitude = float(np.linalg.norm(knowledge.position)) - MEAN_RADIUS
     sunward = _expected_sun(knowledge) if sun is None else sun.direction
     coarse = coarse_nadir(looks, altitude, sunward)
@@ -142,9 +153,18 @@ def _false_images(job: HorizonCameraJob) -> dict[int, str] | None:
     if rough is None or rough.sigma > JUDGING_SIGMA or position is None or nadir is None or sun is None:
         return None
     altitude = float(np.linalg.norm(position)) - MEAN_RADIUS
-    looks = {n: image_brightness(image, job.cameras[n], SUNLIT_COUNTS) for n, image in job.frames.items()}
+    masks = _masks(job)
+    looks = {
+        n: image_brightness(image, job.cameras[n], SUNLIT_COUNTS, masks.get(n))
+        for n, image in job.frames.items()
+    }
     reasons = {n: why_false(look, nadir, altitude, sun) for n, look in looks.items()}
     return {n: reason for n, reason in reasons.items() if reason}
+
+
+def _masks(job: HorizonCameraJob) -> dict[int, BoolArray]:
+    """Return the masks (rows, columns) of the spacecraft's structure, by camera index."""
+    return {n: mask for n, each in job.structure.items() if (mask := each.mask) is not None}
 
 
 def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:

@@ -25,7 +25,7 @@ from flight.app.devices import linux_camera, unit_settings
 from flight.app.run import RunRequest, RunResult
 from flight.loop.flight_loop import FlightEnding
 from flight.schema import reader as configuration
-from flight.schema.devices import Camera, WideCamera
+from flight.schema.devices import Camera, WideCamera, structure_mask
 from flight.schema.document import ConfigError, config_path, merged_text, names, read_document
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
@@ -133,6 +133,13 @@ def _files(config: Config) -> Iterator[Probed]:
         there = Path(tracker.index).is_file()
         cure = "no such file: make it with `knightcube index --camera CONFIG --out FILE`"
         yield Probed("camera.star_tracker.index", tracker.index, there, "is there" if there else cure)
+    for index, camera in enumerate(config.wide_cameras):
+        if camera.structure_file is not None:
+            try:
+                text, there = f"hides {100.0 * float(structure_mask(camera).mean()):.0f} % of the image", True
+            except UsageError as error:
+                text, there = str(error), False
+            yield Probed(f"wide_cameras[{index}].structure_file", camera.structure_file, there, text)
     if config.commands.socket is not None:
         there = Path(config.commands.socket).parent.is_dir()
         cure = "no such folder: systemd creates it for a service (RuntimeDirectory), otherwise create it"

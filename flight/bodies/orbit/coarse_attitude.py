@@ -18,19 +18,15 @@ import numpy as np
 
 from flight.bodies.orbit.environment import EstimatedEnvironment
 from flight.bodies.orbit.filter import OrbitFilter
-from flight.schema.devices import WideCamera, camera_model
+from flight.schema.devices import WideCamera, camera_model, structure_mask
 from hal.interfaces.devices import Frame, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import chi_square
 from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.attitude.solvers import VectorObservation, field_observation, weighted_fit
 from knightcube.astro.attitude.wahba import AttitudeError
-from knightcube.astro.quaternion import (
-    attitude_matrix,
-    conjugate,
-    multiply,
-    to_rotation_vector,
-)
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from knightcube.errors import UsageError
 from knightcube.gnc.estimation.estimate import ATTITUDE, Knowledge
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
@@ -41,6 +37,7 @@ from knightcube.vision.horizon.settings import (
     RoughAttitude,
     SensedDirection,
 )
+from knightcube.vision.horizon.structure import StructureMap
 from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult
 from knightcube.vision.solar_cells import FieldAndStrings, KnownDirections, SolarStringModel, StringFix
 
@@ -183,12 +180,13 @@ class HorizonCameraFeed:
         environment: EstimatedEnvironment,
         sun: CoarseSunFeed | None,
         response: LogarithmicResponse | None,
+        structure: Mapping[int, StructureMap],
     ) -> None:
         """Update `filter_` from frames of the given cameras.
 
         The residual lens error after calibration is `lens_error` (rad per axis). The object `sun` holds the
         newest reading of the solar cells. The intensity response of all cameras is `response`, or linear if
-        None is given.
+        None is given. The maps `structure` show where the images show the spacecraft, by camera index.
         """
         self._cameras = tuple(cameras)
         self._lens = lens_error**2 * np.eye(3)
@@ -196,6 +194,7 @@ class HorizonCameraFeed:
         self._environment = environment
         self._sun = sun
         self._response = response
+        self._structure = dict(structure)
         self._against = 0
 
     @property
@@ -213,7 +212,12 @@ class HorizonCameraFeed:
         time_ns = sum(times) // len(times)
         pixels = {number: frame.pixels for number, frame in frames.items()}
         return HorizonCameraJob(
-            pixels, self._cameras, self._known(time_ns), self._strings(time_ns), self._response
+            pixels,
+            self._cameras,
+            self._known(time_ns),
+            self._strings(time_ns),
+            self._response,
+            self._structure,
         )
 
     def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
@@ -221,6 +225,7 @@ class HorizonCameraFeed:
 
         Return whether the direction of the Sun was used, and whether nadir was used.
         """
+        self._structure |= found.structure
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
         if around is None or sun is None:
             return False, False
@@ -317,13 +322,23 @@ def horizon_camera_feed(
     environment: EstimatedEnvironment,
     sun: CoarseSunFeed | None,
 ) -> HorizonCameraFeed:
-    """Return the horizon camera feed of a configuration."""
+    """Return the horizon camera feed of a configuration.
+
+    A structure file that cannot be used, which `knightcube check` reports, does not prevent the flight.
+    """
     cameras = [MountedCamera(camera_model(one), np.array(one.mounting)) for one in sections]
     error = math.radians(max(one.lens_error_deg for one in sections))
     first, response = sections[0], None
     if first.response == "logarithmic":
         response = LogarithmicResponse(first.pedestal, first.counts_per_decade())
-    return HorizonCameraFeed(cameras, error, filter_, environment, sun, response)
+    structure = {}
+    for number, one in enumerate(sections):
+        try:
+            mask = structure_mask(one)
+        except UsageError:
+            mask = structure_mask(one, of_file=False)
+        structure[number] = StructureMap.of(mask)
+    return HorizonCameraFeed(cameras, error, filter_, environment, sun, response, structure)
 
 
 def _spread(

@@ -57,7 +57,9 @@ _STANDS_OUT = 6.0
 """Threshold above which a pixel counts as bright, in standard deviations of the dark pixels."""
 _LEAST_LIT = 16
 """Minimum number of bright pixels next to an edge, because fewer pixels may be a hot pixel or a star."""
-_PROFILE: IntArray = np.arange(-9, 6)
+_WINDOW = 9
+"""Minimum distance (px) along a scan line of an edge from hidden pixels."""
+_PROFILE: IntArray = np.arange(-_WINDOW, 6)
 """Positions of the samples of a stored brightness profile, in px from the edge towards the bright side."""
 
 
@@ -81,6 +83,7 @@ class ScanLines:
         column_light, row_light: brightness of the pixels of the columns and of the rows (n, m).
         space: distance between neighbouring columns, and between neighbouring rows, px.
         levels: brightness levels of dark and bright pixels.
+        hidden: mask of the image's pixels that show the spacecraft's own structure (rows, columns), or None.
     """
 
     columns: IntArray
@@ -91,6 +94,7 @@ class ScanLines:
     row_light: FloatArray
     space: float
     levels: Levels
+    hidden: BoolArray | None = None
 
     @property
     def pixels(self) -> int:
@@ -145,11 +149,12 @@ class ScanEdges:
 
 
 def find_edges(
-    image: Image, settings: EdgeSettings, part: ImagePart | None = None
+    image: Image, settings: EdgeSettings, part: ImagePart | None = None, hidden: BoolArray | None = None
 ) -> tuple[ScanEdges, ScanLines]:
     """Return edges on evenly spaced columns and rows of an image (rows, columns), and the lines searched.
 
-    If a `part` of the image is given, only scan lines that cross this part are searched.
+    If a `part` of the image is given, only scan lines that cross this part are searched. Pixels in the mask
+    `hidden` (rows, columns) are not evaluated, and edges next to them are dropped.
     """
     places = []
     for axis, size in enumerate((image.shape[1], image.shape[0])):
@@ -161,34 +166,59 @@ def find_edges(
     columns, rows = places
     space = max(1.0, max(image.shape) / settings.lines)
     light = [light_of(each, settings.response) for each in (image[:, columns].T, image[rows])]
-    levels = part.levels if part is not None else _levels(light)
+    masked = None if hidden is None else [hidden[:, columns].T, hidden[rows]]
+    levels = part.levels if part is not None else _levels(light, masked)
     span = levels.bright - levels.dark
     threshold = levels.dark + max(settings.threshold * span, _STANDS_OUT * levels.noise)
     bright = [run_filtered(each > threshold, settings.run) for each in light]
-    read = ScanLines(columns, rows, bright[0], bright[1], light[0], light[1], space, levels)
+    read = ScanLines(columns, rows, bright[0], bright[1], light[0], light[1], space, levels, hidden)
     if not levels.bright > levels.dark or not len(columns) + len(rows):
         none = np.zeros(0)
         empty = np.zeros((0, 2))
         return ScanEdges(empty, empty, none, none, none, np.zeros((0, len(_PROFILE)))), read
     edges = _line_edges(light, bright, (columns, rows), settings.contrast * span)
+    if hidden is not None:
+        edges = select(edges, ~_touches(hidden, edges))
     most = settings.most * settings.lines
     if len(edges) > most:
         edges = select(edges, np.argsort(edges.background, kind="stable")[:most])
     return edges, read
 
 
-def _levels(light: list[FloatArray]) -> Levels:
+def _touches(hidden: BoolArray, edges: ScanEdges) -> BoolArray:
+    """Return which edges (n,) have hidden pixels among the pixels that determine their position."""
+    reach = np.maximum(_WINDOW, (_REACH + _TAIL) * edges.scale)
+    steps = np.linspace(-1.0, 1.0, 2 * _WINDOW + 1)
+    points = edges.points[:, None] + edges.towards[:, None] * (reach[:, None] * steps)[..., None]
+    return np.asarray(_at(hidden, points).any(axis=1))
+
+
+def _at(mask: BoolArray, points: FloatArray) -> BoolArray:
+    """Return the values of a mask (rows, columns) at the nearest pixels to points (..., 2), px."""
+    rows, columns = mask.shape
+    x = np.clip(np.rint(points[..., 0]), 0, columns - 1).astype(int)
+    y = np.clip(np.rint(points[..., 1]), 0, rows - 1).astype(int)
+    return np.asarray(mask[y, x])
+
+
+def _levels(light: list[FloatArray], masked: list[BoolArray] | None = None) -> Levels:
     """Return the brightness levels of scan lines; dark and bright level are equal if no pixel is bright.
 
     The bright level is the median of all pixels that exceed the noise of the dark pixels, so that the Sun's
-    disc and hot pixels have no effect.
+    disc and hot pixels have no effect. Pixels in the masks `masked` of the scan lines are not used.
     """
     samples, steps = [], []
-    for lines in light:
+    for number, lines in enumerate(light):
+        here, after = lines[:, :-1].ravel(), lines[:, 1:].ravel()
+        if masked is not None:
+            used = ~(masked[number][:, :-1] | masked[number][:, 1:]).ravel()
+            here, after = here[used], after[used]
         pace = max(1, lines.size // _SAMPLES)
-        samples.append(lines[:, :-1].ravel()[::pace])
-        steps.append(lines[:, 1:].ravel()[::pace] - samples[-1])
+        samples.append(here[::pace])
+        steps.append(after[::pace] - samples[-1])
     values = np.concatenate(samples)
+    if len(values) < _LEAST_LIT:
+        return Levels(0.0, 0.0, 0.0)
     order = np.sort(values)
     least, most = float(order[len(order) // 50]), float(order[-1 - len(order) // 200])
     dark = np.abs(np.concatenate(steps)[values <= least + 0.1 * (most - least)])
@@ -376,6 +406,7 @@ class Observation:
         rays: edges of the image as directions.
         across, down: change of an edge's unit vector per pixel to the right and per pixel downwards (n, 3).
         samples: directions and brightness of sampled pixels on the scan lines.
+        hidden: mask of the pixels that show the spacecraft's own structure (rows, columns), or None.
     """
 
     space: float
@@ -384,6 +415,16 @@ class Observation:
     across: FloatArray
     down: FloatArray
     samples: Samples
+    hidden: BoolArray | None = None
+
+    def visible(self, points: FloatArray) -> BoolArray:
+        """Return which points (n, 2), px, have no hidden pixels around them, at which edges can be found."""
+        if self.hidden is None:
+            return np.ones(len(points), dtype=bool)
+        around = np.stack(np.meshgrid(*(_WINDOW * np.arange(-1.0, 2.0),) * 2), axis=-1).reshape(-1, 2)
+        finite = np.asarray(np.isfinite(points).all(axis=1))
+        covered = _at(self.hidden, np.where(finite[:, None], points, 0.0)[:, None] + around).any(axis=1)
+        return np.asarray(finite & ~covered)
 
 
 def observe(
@@ -409,11 +450,16 @@ def observe(
         binary, lit = (lines.column_bright, lines.row_bright), (lines.column_light, lines.row_light)
         bright = np.concatenate([each[:, _sample_places(each.shape[1])].ravel() for each in binary])
         level, mottle = np.concatenate([_sample_levels(each, lines.levels) for each in lit], axis=1)
+        if lines.hidden is not None:
+            masked = lines.hidden[:, lines.columns].T, lines.hidden[lines.rows]
+            seen = ~np.concatenate([_hidden_samples(each) for each in masked])
+            sampled, imaged = sampled[seen[imaged]], imaged & seen
         noise = lines.levels.noise / (_span(lines.levels) * _AVERAGED**0.5)
         floor = lines.levels.dark / lines.levels.bright if lines.levels.bright > 0.0 else 0.0
         samples = Samples(sampled, bright[imaged], level[imaged], mottle[imaged], noise, floor)
     pixel = np.sqrt(np.einsum("ij,ij->i", brighter, brighter))
-    return Observation(lines.space, edges, EdgeRays(here, brighter, pixel), across, down, samples)
+    rays_of_edges = EdgeRays(here, brighter, pixel)
+    return Observation(lines.space, edges, rays_of_edges, across, down, samples, lines.hidden)
 
 
 def _sample_places(size: int) -> IntArray:
@@ -436,6 +482,13 @@ def _sample_levels(light: FloatArray, levels: Levels) -> FloatArray:
     )
     mottle = (before - 2.0 * here + after) / 6.0**0.5
     return np.stack([here - levels.dark, mottle]) / _span(levels)
+
+
+def _hidden_samples(masked: BoolArray) -> BoolArray:
+    """Return which sampled pixels of scan lines with a mask (n, m) have hidden pixels in their averages."""
+    size, half = masked.shape[1], _AVERAGED + _AVERAGED // 2
+    index = _sample_places(size)[:, None] + np.arange(-half, half + 1)
+    return np.asarray(masked[:, np.clip(index, 0, size - 1)].any(axis=2).ravel())
 
 
 @lru_cache(maxsize=8)

@@ -290,7 +290,7 @@ def examine(
     # The part of the limb that is known to be on the night side is not expected to show edges.
     rays = limb_rays(view, _FINE_RAYS)
     points = camera.project(rays)
-    inside = camera.contains(points, -_BORDER)
+    inside = camera.contains(points, -_BORDER) & observation.visible(points)
     due: BoolArray = inside if sun is None else sun_elevation(view, rays, sun) > _LOWEST_SUN
     columns, rows = (max(1.0, size / settings.edges.lines) for size in (camera.columns, camera.rows))
     others = (limb_residuals(view, observation.rays.rays) / observation.rays.pixel)[~used]
@@ -360,7 +360,7 @@ def _coverage(
         plain = (sun_elevation(view, rays, sun) > DAYLIGHT) & (rays @ (view.rotation @ sun) < np.cos(GLARE))
         rays = rays[plain]
     points = camera.project(rays)
-    points = points[camera.contains(points, -_BORDER)]
+    points = points[camera.contains(points, -_BORDER) & observation.visible(points)]
     if not len(points):
         return 1.0
     edges = observation.edges.points[used]

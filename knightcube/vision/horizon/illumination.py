@@ -199,8 +199,12 @@ class CoarseNadir:
         return float(np.sqrt(0.5 * np.trace(self.covariance)))
 
 
-def image_brightness(image: Image, camera: MountedCamera, bright: float) -> ImageBrightness:
+def image_brightness(
+    image: Image, camera: MountedCamera, bright: float, hidden: BoolArray | None = None
+) -> ImageBrightness:
     """Return which of 8 x 8 samples of an image (rows, columns) are bright, with their directions.
+
+    Samples in the mask `hidden` (rows, columns) are left out.
 
     The argument `bright` is the threshold, counts. The threshold must be below the brightness of a dark sea
     under a low Sun, and above stray light beside the Earth.
@@ -208,7 +212,11 @@ def image_brightness(image: Image, camera: MountedCamera, bright: float) -> Imag
     rows, columns = (_sample_indices(size) for size in image.shape)
     lit = bright < image[np.ix_(rows, columns)].T
     rays, imaged = _sample_rays(Lens.of(camera.lens))
-    return ImageBrightness(camera.in_body(rays), lit.ravel()[imaged])
+    lit = lit.ravel()[imaged]
+    if hidden is not None:
+        seen = ~hidden[np.ix_(rows, columns)].T.ravel()[imaged]
+        rays, lit = rays[seen], lit[seen]
+    return ImageBrightness(camera.in_body(rays), lit)
 
 
 def coarse_nadir(

@@ -221,6 +221,21 @@ class Prior:
     altitude: float = UNKNOWN
 
 
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """Misfit of a fitted limb.
+
+    Attributes:
+        loss: chi-square of the edges by Huber's loss, for independent residuals.
+        correlation: factor by which correlation of the residuals increases the variance of their mean.
+        prior: chi-square of the prior.
+    """
+
+    loss: float
+    correlation: float
+    prior: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedLimb:
     """A limb fitted to edges.
@@ -230,12 +245,14 @@ class FittedLimb:
         covariance: covariance (5, 5) of the fitted parameters.
         residuals: angles of the edges from the fitted limb (n,), rad, positive outside the limb.
         used: mask of the edges that lie within five standard deviations of the limb (n,).
+        misfit: misfit of the edges and of the prior.
     """
 
     view: LimbView
     covariance: FloatArray
     residuals: FloatArray
     used: BoolArray
+    misfit: Misfit
 
     @property
     def nadir_covariance(self) -> FloatArray:
@@ -275,9 +292,14 @@ def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior)
         if not _is_outside(view):
             return None
         last = float(np.max(np.abs(step[:3])))
-    inflated = (normal - information) / _correlation_factor(view.nadir, rays[used], (residuals / sigma)[used])
-    covariance = _solved(inflated + information, np.eye(PARAMETERS))
-    return None if covariance is None else FittedLimb(view, covariance, residuals, used)
+    factor = _correlation_factor(view.nadir, rays[used], (residuals / sigma)[used])
+    covariance = _solved((normal - information) / factor + information, np.eye(PARAMETERS))
+    if covariance is None:
+        return None
+    scaled = np.minimum(np.abs(residuals / sigma), _BEYOND)
+    loss = float(np.sum(np.where(scaled < _HUBER, scaled**2, _HUBER * (2.0 * scaled - _HUBER))))
+    misfit = Misfit(loss, factor, float(moved @ information @ moved))
+    return FittedLimb(view, covariance, residuals, used, misfit)
 
 
 def shared_error(

@@ -19,6 +19,7 @@ nadir only if a single side of the limb is visible.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -44,10 +45,12 @@ from knightcube.vision.horizon.initial_guess import (
     place_of,
 )
 from knightcube.vision.horizon.limb import (
+    ALTITUDE,
     UNIT_DEPTH_HEIGHT,
     UNKNOWN,
     FittedLimb,
     LimbView,
+    Misfit,
     Prior,
     fit_limb,
     shared_error,
@@ -122,6 +125,7 @@ class HorizonSolution:
         limb: unit vectors (k, 3) to the limb points on the best horizon, camera axes.
         limb_sigma: standard deviations of the limb points normal to the limb (k,), rad.
         view: position and attitude of the camera from the best fit, even if refused, or None without a fit.
+        misfit: misfit of the best fit, or None without a fit.
         pixels_read: number of pixels that the search read.
     """
 
@@ -134,6 +138,7 @@ class HorizonSolution:
     limb: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     limb_sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
     view: LimbView | None = None
+    misfit: Misfit | None = None
     pixels_read: int = 0
 
     def __bool__(self) -> bool:
@@ -160,6 +165,8 @@ _MOST_CHANCE = -6.0
 """Largest accepted log10 of the expected number of cones that chance edges fit as well as a horizon."""
 _BREADTH = 0.125, 2.0
 """Minimum and maximum ratio of the width of the limb's edges to the width expected from the air."""
+_OFF = 9.0
+"""Chi-square of an edge that lies on no horizon, in the comparison of horizons of different focal lengths."""
 _GAIN = 1.5
 """Minimum ratio by which a second search on more scan lines must increase the number of horizon edges."""
 
@@ -169,6 +176,7 @@ def find_nadir(
     camera: CameraModel,
     knowledge: HorizonKnowledge | None = None,
     settings: HorizonSettings | None = None,
+    hidden: BoolArray | None = None,
 ) -> HorizonSolution:
     """Return the nadir from the Earth's limb in an image, or the reason why no nadir is found.
 
@@ -182,15 +190,18 @@ def find_nadir(
         knowledge: prior knowledge of position, altitude, Sun and attitude. If `knowledge` contains neither
             position nor altitude, the altitude is fitted too.
         settings: settings of the search, or None for the defaults.
+        hidden: mask of the pixels that show the spacecraft's own structure (rows, columns), or None.
 
     Raises:
-        ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
+        ValueError: if image or mask do not have the size of the camera, or if pixels are not finite.
 
     Source: Meller et al., chapter 3; the fit of the limb follows Christian & Robinson 2016.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     check_image(image, camera)
-    search = _search(image, camera, knowledge, settings)
+    if hidden is not None:
+        check_image(hidden, camera)
+    search = _search(image, camera, knowledge, settings, hidden)
     found = search.solution()
     if found.nadir is not None and found.nadir.used >= settings.enough_edges:
         return found
@@ -205,8 +216,103 @@ def find_nadir(
         if second.nadir is not None and second.nadir.used >= _GAIN * found.nadir.used:
             # The first search has already compared this horizon with the other horizons in the image.
             return replace(second, candidates=found.candidates, pixels_read=read)
-    second = _search(image, camera, knowledge, again).solution()
+    second = _search(image, camera, knowledge, again, hidden).solution()
     return replace(second, pixels_read=read + second.pixels_read)
+
+
+_FIELD_STEPS: FloatArray = np.linspace(-2.5, 2.5, 11)
+"""Trial focal lengths, in standard deviations from the most probable one."""
+_FIELD_ROUNDS, _RESOLVED = 4, 0.3
+"""Maximum number of refinements of the trial focal lengths, and standard deviation that ends them."""
+
+
+def nadir_of_uncertain_field(
+    image: Image,
+    camera: CameraModel,
+    sigma: float,
+    knowledge: HorizonKnowledge | None = None,
+    settings: HorizonSettings | None = None,
+    hidden: BoolArray | None = None,
+) -> HorizonSolution:
+    """Return the nadir if the camera's focal length has the relative standard deviation `sigma`.
+
+    The image is searched with eleven focal lengths, which are refined around the most probable ones. The
+    weight of a horizon is the probability of its focal length and of its misfit. Nadir and altitude are the
+    weighted means of all horizons, and their uncertainties include the differences between the horizons. The
+    other arguments are those of `find_nadir`.
+    """
+    knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
+    first = find_nadir(image, camera, knowledge, settings, hidden)
+    if len(first.points) < settings.some_edges:
+        return first
+    edges = settings.edges
+    for lines in (edges.lines, edges.more_lines):
+        trial = replace(settings, edges=replace(edges, lines=lines))
+        found, weights = _by_field(image, camera, sigma, knowledge, trial, hidden)
+        if found and max(each.nadir.used for each in found if each.nadir) >= settings.enough_edges:
+            break
+    nadirs = [each.nadir for each in found if each.nadir is not None]
+    if not nadirs:
+        reason = first.reason or "no limb is found with other fields of view within the uncertainty"
+        status = HorizonStatus.REFUSED if first.nadir is not None else first.status
+        return replace(first, status=status, reason=reason, nadir=None)
+    directions = np.array([each.direction for each in nadirs])
+    mean = weights @ directions
+    mean /= np.linalg.norm(mean)
+    off = (directions - mean) @ (np.eye(3) - np.outer(mean, mean))
+    covariance = np.einsum("k,kij->ij", weights, np.array([each.covariance for each in nadirs]))
+    altitudes = np.array([[each.altitude, each.altitude_sigma] for each in nadirs])
+    altitude = float(weights @ altitudes[:, 0])
+    variance = float(weights @ (altitudes[:, 1] ** 2 + (altitudes[:, 0] - altitude) ** 2))
+    best = found[int(np.argmax(weights))]
+    nadir = replace(
+        nadirs[int(np.argmax(weights))],
+        direction=mean,
+        covariance=covariance + (off * weights[:, None]).T @ off,
+        altitude=altitude,
+        altitude_sigma=math.sqrt(variance),
+    )
+    return replace(best, nadir=nadir)
+
+
+def _by_field(
+    image: Image,
+    camera: CameraModel,
+    sigma: float,
+    knowledge: HorizonKnowledge,
+    settings: HorizonSettings,
+    hidden: BoolArray | None,
+) -> tuple[list[HorizonSolution], FloatArray]:
+    """Return the horizons found with trial focal lengths, and their probabilities (k,)."""
+    centre, width = 0.0, 1.0
+    found: list[HorizonSolution] = []
+    misfits: list[Misfit] = []
+    weights = np.zeros(0)
+    for _ in range(_FIELD_ROUNDS):
+        steps, found, misfits = [], [], []
+        for step in centre + width * _FIELD_STEPS:
+            lens = camera.rescaled(math.exp(step * sigma))
+            solution = _search(image, lens, knowledge, settings, hidden).solution()
+            if solution.nadir is not None and solution.misfit is not None:
+                steps.append(step)
+                found.append(solution)
+                misfits.append(solution.misfit)
+        if not found:
+            break
+        places, loss = np.array(steps), np.array([each.loss for each in misfits])
+        # The best fit shows how much of the misfit and of its correlation is due to ground and clouds.
+        used = np.array([np.count_nonzero(each.on_horizon) for each in found])
+        best = int(np.argmin(loss - _OFF * used))
+        scatter = max(1.0, loss[best] / used[best]) * misfits[best].correlation
+        cost = places**2 + (loss - _OFF * used) / scatter + np.array([each.prior for each in misfits])
+        weights = np.exp(-0.5 * (cost - cost.min()))
+        weights /= weights.sum()
+        centre = float(weights @ places)
+        spread = math.sqrt(float(weights @ (places - centre) ** 2))
+        if spread > _RESOLVED * width or len(found) == 1:
+            break
+        width = max(spread, 0.25 * width)
+    return found, weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,12 +324,14 @@ class _Search:
         levels: brightness levels of the dark and bright pixels of the image.
         hypotheses: horizons that were fitted to the edges, the best first.
         read: number of pixels read.
+        altitudes: range of an unknown altitude, m.
     """
 
     observation: Observation
     levels: Levels
     hypotheses: list[Hypothesis]
     read: int
+    altitudes: tuple[float, float]
 
     def solution(self) -> HorizonSolution:
         """Return the result of the horizon search."""
@@ -242,7 +350,7 @@ class _Search:
         status, reason = _judged(hypotheses)
         best, found = hypotheses[0], status is HorizonStatus.FOUND
         measured = [
-            _measurement(each.fit, each.covariance, each.guess.place.located, each.residual)
+            _measurement(each.fit, each.covariance, each.guess.place, self.altitudes, each.residual)
             for each in hypotheses
         ]
         return HorizonSolution(
@@ -255,18 +363,23 @@ class _Search:
             best.limb.rays,
             best.limb.sigma,
             best.fit.view,
+            best.fit.misfit,
             self.read,
         )
 
 
 def _search(
-    image: Image, camera: CameraModel, knowledge: HorizonKnowledge, settings: HorizonSettings
+    image: Image,
+    camera: CameraModel,
+    knowledge: HorizonKnowledge,
+    settings: HorizonSettings,
+    hidden: BoolArray | None,
 ) -> _Search:
     """Search a whole image for horizons."""
-    edges, lines = find_edges(image, settings.edges)
+    edges, lines = find_edges(image, settings.edges, hidden=hidden)
     observation = observe(edges, lines, camera)
     hypotheses = _hypotheses(observation, place_of(knowledge, settings), knowledge, settings, camera)
-    return _Search(observation, lines.levels, hypotheses, lines.pixels)
+    return _Search(observation, lines.levels, hypotheses, lines.pixels, settings.altitudes)
 
 
 def _closer_search(
@@ -280,14 +393,14 @@ def _closer_search(
     best, before = search.hypotheses[0], search.observation
     points = before.edges.points[best.members]
     box = np.stack([points.min(axis=0) - before.space, points.max(axis=0) + before.space])
-    edges, lines = find_edges(image, settings.edges, ImagePart(box, search.levels))
+    edges, lines = find_edges(image, settings.edges, ImagePart(box, search.levels), before.hidden)
     # The samples of the first search are used again, because they cover the whole image.
     observation = observe(edges, lines, camera, before.samples)
     members = near_limb(best.fit.view, observation, 2.0 * settings.tolerance)
     again = replace(best.guess, view=best.fit.view, members=members)
     found = examine(again, observation, knowledge, settings, camera)
     hypotheses = [] if found is None or not _is_limb(found) else [found]
-    return _Search(observation, search.levels, hypotheses, lines.pixels)
+    return _Search(observation, search.levels, hypotheses, lines.pixels, settings.altitudes)
 
 
 def _hypotheses(
@@ -372,17 +485,41 @@ def _flaw(one: Hypothesis) -> str:
     return one.not_space
 
 
-def _measurement(fit: FittedLimb, covariance: FloatArray, located: bool, residual: float) -> NadirMeasurement:
-    """Return the nadir of a fitted limb; The flag `located` states whether the camera's position is known."""
-    view = fit.view
-    return NadirMeasurement(
-        view.nadir,
-        covariance,
-        view.surface.height_of(view.position),
-        fit.altitude_sigma(0.0 if located else SPHERE_ALTITUDE_SIGMA),
-        residual,
-        int(np.count_nonzero(fit.used)),
-    )
+def _measurement(
+    fit: FittedLimb,
+    covariance: FloatArray,
+    place: Place | None,
+    altitudes: tuple[float, float],
+    residual: float,
+) -> NadirMeasurement:
+    """Return the nadir of a fitted limb, with an unknown altitude limited to the range `altitudes`, m.
+
+    `place` is the camera's position from prior knowledge; its altitude may be unknown.
+    """
+    view, used = fit.view, int(np.count_nonzero(fit.used))
+    altitude, nadir = view.surface.height_of(view.position), view.nadir
+    sigma = fit.altitude_sigma(0.0 if place is not None and place.located else SPHERE_ALTITUDE_SIGMA)
+    if place is None or place.altitude_sigma >= UNKNOWN:
+        mean, share = limited_normal(altitude, sigma, altitudes)
+        # The altitude is correlated with the rotation d (3,) of the camera, which displaces nadir n by d x n.
+        gain = np.cross(fit.covariance[:3, ALTITUDE] / sigma**2, nadir)
+        nadir = nadir + (mean - altitude) * gain
+        nadir = nadir / np.linalg.norm(nadir)
+        covariance = covariance - (1.0 - share) * sigma**2 * np.outer(gain, gain)
+        altitude, sigma = mean, math.sqrt(share) * sigma
+    return NadirMeasurement(nadir, covariance, altitude, sigma, residual, used)
+
+
+def limited_normal(mean: float, sigma: float, limits: tuple[float, float]) -> tuple[float, float]:
+    """Return the mean of a normal distribution limited to a range, and its variance divided by sigma^2."""
+    low, high = ((limit - mean) / sigma for limit in limits)
+    x = np.linspace(max(low, min(-8.0, high - 1.0)), min(high, max(8.0, low + 1.0)), 2001)
+    # The exponent is relative to the most probable value, so that a distant range does not underflow.
+    nearest = min(max(0.0, low), high)
+    weight = np.exp(0.5 * (nearest**2 - x**2))
+    weight /= weight.sum()
+    offset = float(weight @ x)
+    return mean + sigma * offset, float(weight @ (x - offset) ** 2)
 
 
 _IMPROBABLE = 1e-6
@@ -441,6 +578,7 @@ def nadir_of_cameras(
     cameras: Sequence[MountedCamera],
     knowledge: HorizonKnowledge | None = None,
     settings: HorizonSettings | None = None,
+    hidden: Mapping[int, BoolArray] | None = None,
 ) -> JointNadir:
     """Return the nadir in body axes from the images of several cameras.
 
@@ -449,15 +587,20 @@ def nadir_of_cameras(
         cameras: all cameras of the body.
         knowledge: prior knowledge as for `find_nadir`, but in body axes instead of camera axes.
         settings: settings of the search, or None for the defaults.
+        hidden: masks (rows, columns) of structure in the images, by the index of the camera.
 
     Raises:
-        ValueError: if an image does not have the size of its camera, or has pixels that are not finite.
+        ValueError: if an image or a mask does not have the size of its camera, or if pixels are not finite.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
-    each = {
-        number: find_nadir(image, cameras[number].lens, _in_camera(cameras[number], knowledge), settings)
-        for number, image in images.items()
-    }
+    masks = hidden or {}
+
+    def searched(number: int, known: HorizonKnowledge) -> HorizonSolution:
+        camera = cameras[number]
+        seen = _in_camera(camera, known)
+        return find_nadir(images[number], camera.lens, seen, settings, masks.get(number))
+
+    each = {number: searched(number, knowledge) for number in images}
     votes = [vote for number, solution in each.items() for vote in _votes(number, solution, cameras[number])]
     group, rival = _agreed(votes)
     if rival:
@@ -471,12 +614,10 @@ def nadir_of_cameras(
     sigma = float(np.sqrt(0.5 * np.trace(vote.covariance)))
     sensed = (*knowledge.sensed, SensedDirection(vote.nadir, -position, _COMMON * sigma))
     known = replace(knowledge, sensed=sensed)
-    for number, image in images.items():
-        if each[number].nadir is None and len(each[number].points) >= settings.some_edges:
-            camera = cameras[number]
-            second = find_nadir(image, camera.lens, _in_camera(camera, known), settings)
-            read = each[number].pixels_read + second.pixels_read
-            each[number] = replace(second, pixels_read=read)
+    for number, first in list(each.items()):
+        if first.nadir is None and len(first.points) >= settings.some_edges:
+            second = searched(number, known)
+            each[number] = replace(second, pixels_read=first.pixels_read + second.pixels_read)
     votes = [v for k, s in each.items() if s.nadir is not None for v in _votes(k, s, cameras[k])]
     group, rival = _agreed(votes)
     if rival or not group:
@@ -581,5 +722,5 @@ def _joint_fit(
     covariance = fit.nadir_covariance + allowance**2 * (np.eye(3) - np.outer(nadir, nadir))
     pixel = 1.0 / camera.lens.focal_length
     residual = float(np.sqrt(np.mean(fit.residuals[fit.used] ** 2))) / pixel
-    measured = _measurement(fit, covariance, located, residual)
+    measured = _measurement(fit, covariance, place, settings.altitudes, residual)
     return JointNadir(HorizonStatus.FOUND, "", measured, numbers, each, fit.view.limb_height)

@@ -184,12 +184,11 @@ def test_an_uncertain_field_of_view_is_in_the_uncertainty(folder: Path) -> None:
         )
         assert done.returncode == 0, done.stderr
         facts[field, error] = json.loads(done.stdout)
-    assert facts[67.0, 3.3]["nadir_camera"] == facts[67.0, None]["nadir_camera"]
     assert facts[67.0, 3.3]["sigma_deg"] > 1.5 * facts[67.0, None]["sigma_deg"]
-    wrong = facts[70.3, 3.3]
-    off = np.array(wrong["nadir_camera"]) - facts[67.0, None]["nadir_camera"]
-    spread, axes = np.linalg.eigh(np.array(wrong["covariance_rad2"]))
-    assert np.all(np.abs(off @ axes[:, 1:]) < 3.0 * np.sqrt(spread[1:]))
+    for uncertain in (facts[67.0, 3.3], facts[70.3, 3.3]):
+        off = np.subtract(uncertain["nadir_camera"], facts[67.0, None]["nadir_camera"])
+        spread, axes = np.linalg.eigh(np.array(uncertain["covariance_rad2"]))
+        assert np.all(np.abs(off @ axes[:, 1:]) < 3.0 * np.sqrt(spread[1:]))
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,7 @@ from tests.studies.campaigns.soak import SOAK
 from tests.studies.campaigns.start import START
 from tests.studies.campaigns.streaked import STREAKED
 from tests.studies.campaigns.streaks import STREAKS, STREAKS_THESIS
+from tests.studies.campaigns.structured_limbs import STRUCTURED_LIMBS
 from tests.studies.campaigns.unknown_body import UNKNOWN_BODY
 from tests.studies.campaigns.unlike_inertia import UNLIKE_INERTIA
 from tests.studies.campaigns.worlds import WORLD_COMPARISON
@@ -66,6 +67,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         LOST_IN_SPACE,
         NADIR,
         FALSE_HORIZONS,
+        STRUCTURED_LIMBS,
         HORIZON_METHODS,
         CONTROLLERS_CAMPAIGN,
         ROBUST_CONTROLLERS,

@@ -170,6 +170,8 @@ def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) 
             ([0.0, 1.0, 0.0], 0x49, 0), ([0.0, -1.0, 0.0], 0x49, 1),
         )
     ]  # fmt: skip
+    mask = tmp_path / "structure.pgm"
+    mask.write_bytes(b"P5 384 384 255\n" + bytes([255] * 384 * 96 + [0] * 384 * 288))
     master, slave = os.openpty()
     try:
         for device, answer in ((unit, True), (Path(os.ttyname(slave)), False)):
@@ -180,7 +182,12 @@ def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) 
                 "camera": "none",
                 "gps": {"device": str(device)},
                 "solar_strings": {"strings": strings},
-                "wide_cameras": [{"device": {"kind": "v4l2", "path": str(tmp_path / "none")}}],
+                "wide_cameras": [
+                    {
+                        "device": {"kind": "v4l2", "path": str(tmp_path / "none")},
+                        "structure_file": str(mask),
+                    }
+                ],
             }
             path.write_text(yaml.safe_dump({**tree, **changes}), encoding="utf-8")
             done = command("check", path, "--json")
@@ -189,6 +196,10 @@ def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) 
             assert found["gps"]["found"] is answer, found["gps"]
             assert {"solar_strings, 0x48", "solar_strings, 0x49", "wide_cameras[0]"} < set(found)
             assert "no byte arrived" in found["gps"]["text"] or answer
+            hidden = found["wide_cameras[0].structure_file"]
+            assert hidden["found"] is answer, hidden
+            assert ("hides 25 % of the image" if answer else "cannot be read") in hidden["text"]
+            mask.unlink(missing_ok=True)
     finally:
         os.close(master)
         os.close(slave)

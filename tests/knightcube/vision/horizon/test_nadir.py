@@ -28,6 +28,7 @@ from knightcube.vision.horizon.nadir import (
     HorizonStatus,
     JointNadir,
     find_nadir,
+    limited_normal,
     nadir_of_cameras,
 )
 from knightcube.vision.horizon.settings import (
@@ -123,6 +124,38 @@ def test_without_the_flattenings_direction_the_allowance_covers_the_error(
         assert found.nadir is not None
         assert _error_deg(found, scene) < 3.0 * np.degrees(found.nadir.sigma)
         assert found.nadir.sigma > SETTINGS.sphere_sigma
+
+
+def test_the_fitted_altitude_stays_within_the_given_range(day: tuple[EarthScene, Image]) -> None:
+    """The range begins two sigmas above the best fit, and nadir moves as with an altitude above the fit."""
+    frame = day[1]
+    free = find_nadir(frame, MODEL.lens, HorizonKnowledge(), SETTINGS).nadir
+    assert free is not None
+    low = free.altitude + 2.0 * free.altitude_sigma
+    settings = replace(SETTINGS, altitudes=(low, 2000e3))
+    found = find_nadir(frame, MODEL.lens, HorizonKnowledge(), settings).nadir
+    held = find_nadir(frame, MODEL.lens, HorizonKnowledge(altitude=low), SETTINGS).nadir
+    assert found is not None
+    assert held is not None
+    assert low < found.altitude < low + free.altitude_sigma
+    assert found.altitude_sigma < 0.7 * free.altitude_sigma
+    assert (found.direction - free.direction) @ (held.direction - free.direction) > 0.0
+
+
+@pytest.mark.parametrize(("limits", "mean", "share"), [
+    ((-np.inf, np.inf), 0.0, 1.0),
+    ((0.0, 1e9), np.sqrt(2.0 / np.pi), 1.0 - 2.0 / np.pi),
+    ((-1.0, 1.0), 0.0, 0.291125),
+    ((20.0, 1e9), 20.04975, 0.00246),
+    ((-50.0, -49.0), -49.0204, 0.000416),
+])  # fmt: skip
+def test_a_limited_normal_distribution_has_the_published_moments(
+    limits: tuple[float, float], mean: float, share: float
+) -> None:
+    """Johnson, Kotz and Balakrishnan, Continuous Univariate Distributions 1, section 13.10.1."""
+    found = limited_normal(7.0, 3.0, (7.0 + 3.0 * limits[0], 7.0 + 3.0 * limits[1]))
+    assert found[0] == pytest.approx(7.0 + 3.0 * mean, abs=0.01)
+    assert found[1] == pytest.approx(share, rel=0.02)
 
 
 def test_an_unknown_altitude_is_fitted_with_its_spread(day: tuple[EarthScene, Image]) -> None:
