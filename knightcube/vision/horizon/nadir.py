@@ -593,12 +593,11 @@ def nadir_of_cameras(
         ValueError: if an image or a mask does not have the size of its camera, or if pixels are not finite.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
-    masks = hidden or {}
 
     def searched(number: int, known: HorizonKnowledge) -> HorizonSolution:
         camera = cameras[number]
         seen = _in_camera(camera, known)
-        return find_nadir(images[number], camera.lens, seen, settings, masks.get(number))
+        return find_nadir(images[number], camera.lens, seen, settings, (hidden or {}).get(number))
 
     each = {number: searched(number, knowledge) for number in images}
     votes = [vote for number, solution in each.items() for vote in _votes(number, solution, cameras[number])]
