@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import cast
 
 import numpy as np
+import pytest
 
 from flight.bodies.orbit.coarse_attitude import CONTRADICTED, HorizonCameraFeed
 from flight.bodies.orbit.environment import EstimatedEnvironment
@@ -25,7 +26,8 @@ from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
-from knightcube.vision.horizon_camera_job import HorizonCameraResult, MeasuredDirection
+from knightcube.vision.horizon.structure import StructureMap
+from knightcube.vision.horizon_camera_job import HorizonCameraResult, MeasuredDirection, run
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])
 POSITION = np.array([4e6, -4e6, 3.9e6])
@@ -50,9 +52,9 @@ class Still:
             history_ns=12 * SECOND_NS,
         )
         self.filter = OrbitFilter(settings, self.at)
-        self.feed = HorizonCameraFeed(
-            [CAMERA], LENS, self.filter, cast(EstimatedEnvironment, self), None, None
-        )
+        around = cast(EstimatedEnvironment, self)
+        bare = {0: StructureMap.of(np.zeros((64, 64), dtype=bool))}
+        self.feed = HorizonCameraFeed([CAMERA], LENS, self.filter, around, None, None, bare)
         self.now_ns = 0
         self.sunlit = 1.0
 
@@ -177,3 +179,14 @@ def test_the_worker_gets_what_is_known_in_body_axes() -> None:
     rough = craft.feed.job({0: frame}).knowledge.attitude
     assert rough is not None
     assert angle_between(rough.quaternion, craft.attitude) < 0.01
+
+
+def test_structure_learned_from_frames_is_known_to_the_next_job() -> None:
+    """The worker returns the map after each frame, also while the filter does not run."""
+    craft = Still(3)
+    bright = np.full((64, 64), 200, dtype=np.uint8)
+    for sequence in range(2):
+        frame = Frame(sequence, craft.now_ns, 0, craft.now_ns, bright)
+        found = run(craft.feed.job({0: frame}))
+        craft.look(found)
+    assert craft.feed.job({0: frame}).structure[0].level == pytest.approx(200.0)
