@@ -1,3 +1,3 @@
 """The on-board application of the satellite."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -7,6 +7,7 @@ installer's own modules, is run by the real Python.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -15,8 +16,12 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from flight import __version__
+from flight.link.regular_files import to_record
 from tests.deploy.scripts import DEPLOY, ROOT, TESTBED
 
+FIRST, SECOND = f"{__version__}+1", f"{__version__}+2"
+"""Names of the first two releases that are installed from this repository."""
 _PYTHON = f"""#!/bin/sh
 home=$(dirname "$(dirname "$0")")
 packages=$home/lib/python3/site-packages
@@ -36,6 +41,11 @@ case "$*" in
         PYTHONPATH={ROOT} exec {sys.executable} "$@" ;;
 esac
 """
+
+
+def starts_record(starts: dict[str, int], *proven: str) -> bytes:
+    """Return the record of the starts of releases that are not proven, and of the proven releases."""
+    return to_record(json.dumps({"starts": starts, "proven": proven}).encode())
 
 
 @dataclass(frozen=True)

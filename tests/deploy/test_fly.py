@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flight import __version__
 from flight.app.service import TRIALS
-from flight.link.regular_files import to_record
-from tests.deploy.boards import FakeBoard
+from tests.deploy.boards import FIRST, SECOND, FakeBoard, starts_record
 from tests.deploy.scripts import DEPLOY, ROOT, script
 
 releases = script("releases")
@@ -98,12 +98,12 @@ CHOOSERS: dict[str, Callable[[Path], None]] = {
     "waits, deaf to SIGTERM": _text(
         "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\ntime.sleep(600)"
     ),
-    "prints without end": _text("while True: print('0.1.0')"),
-    "names no release": _text("print('0.1.0+7 ')"),
+    "prints without end": _text(f"while True: print('{__version__}')"),
+    "names no release": _text(f"print('{__version__}+7 ')"),
     "names a path": _text("print('../../../tmp ')"),
     "names the folder": _text("print('. ')"),
     "names a pattern": _text("print('* ')"),
-    "names a folder that is not a release": _text("print('0.1.0+2/venv ')"),
+    "names a folder that is not a release": _text(f"print('{SECOND}/venv ')"),
 }
 
 
@@ -114,13 +114,14 @@ def test_without_a_usable_answer_of_releases_py_the_current_release_flies_and_sa
     damage(_chooser(board))
     label, said = board.fly()
     assert label == "new"
-    assert re.search(r"^fly: release 0\.1\.0\+2 flies \(whole\): releases\.py answered '.*', not", said, re.M)
+    named = rf"^fly: release {re.escape(SECOND)} flies \(whole\): releases\.py answered '.*', not"
+    assert re.search(named, said, re.M)
 
 
 def test_an_answer_counts_although_releases_py_does_not_end(board: FakeBoard) -> None:
     """The count of the start waits for a disk, which may hang."""
     _chooser(board).write_text(
-        "import time\nprint('0.1.0+1 as asked', flush=True)\ntime.sleep(600)", encoding="ascii"
+        f"import time\nprint('{FIRST} as asked', flush=True)\ntime.sleep(600)", encoding="ascii"
     )
     label, said = board.fly()
     assert (label, "flies (whole): as asked" in said) == ("old", True)
@@ -130,7 +131,7 @@ RECORDS: dict[str, Callable[[Path], None]] = {
     "a FIFO": _fifo,
     "sparse": _sparse,
     "a folder": Path.mkdir,
-    "truncated": _text('{"starts": {"0.1.0+2": 2}, "prov'),
+    "truncated": _text(f'{{"starts": {{"{SECOND}": 2}}, "prov'),
     "other bytes": lambda path: void(path.write_bytes(bytes(range(256)))),
     "a FIFO for its next version": lambda path: _fifo(path.with_suffix(".part")),
 }
@@ -148,8 +149,8 @@ def test_a_damaged_record_keeps_releases_py_from_nothing(
     ("damage", "reason"),
     [
         pytest.param(_sparse, "is not a regular file of at most", id="sparse"),
-        pytest.param(_fifo, "the link current names no complete release; 0.1.0+1 flies", id="a FIFO"),
-        pytest.param(Path.unlink, "the link current names no complete release; 0.1.0+1 flies", id="missing"),
+        pytest.param(_fifo, f"the link current names no complete release; {FIRST} flies", id="a FIFO"),
+        pytest.param(Path.unlink, f"the link current names no complete release; {FIRST} flies", id="missing"),
     ],
 )
 def test_a_release_whose_manifest_cannot_be_read_gives_way_and_the_reason_is_given(
@@ -189,12 +190,12 @@ def test_a_release_that_cannot_start_gives_way_to_the_other(
         _chooser(board).unlink()
     label, said = board.fly()
     assert label == "old"
-    assert "fly: release 0.1.0+1 flies (whole): " in said
+    assert f"fly: release {FIRST} flies (whole): " in said
 
 
 def test_a_proven_release_that_no_longer_starts_gives_way_too(board: FakeBoard) -> None:
     """Starts of a proven release are not counted."""
-    (board.root / "state" / TRIALS).write_bytes(to_record(b'{"starts": {}, "proven": ["0.1.0+2"]}'))
+    (board.root / "state" / TRIALS).write_bytes(starts_record({}, SECOND))
     PYTHONS["cannot import the flight"](_python(board, "current"))
     assert [board.fly()[0] for _ in range(4)] == ["old"] * 4
 
@@ -212,12 +213,12 @@ def test_without_releases_py_a_damaged_release_gives_way_but_flies_where_none_is
     _hurt(board, "previous")
     label, said = board.fly()
     assert label == "hurt"
-    assert "fly: release 0.1.0+2 flies (imports): " in said
+    assert f"fly: release {SECOND} flies (imports): " in said
     for link in ("current", "previous"):
         PYTHONS["cannot import the flight"](_python(board, link))
     label, said = board.fly()
     assert label == "hurt"
-    assert "fly: release 0.1.0+2 flies (runs): " in said
+    assert f"fly: release {SECOND} flies (runs): " in said
 
 
 def test_without_releases_py_a_damaged_manifest_gives_way(board: FakeBoard) -> None:
@@ -238,10 +239,10 @@ def test_without_its_links_the_release_with_the_highest_number_flies(board: Fake
     for link in ("current", "previous"):
         (board.prefix / link).unlink()
     releases = board.prefix / "releases"
-    (releases / "0.1.0+1").rename(releases / "0.1.0+10")
-    (releases / "0.1.0+2").rename(releases / "0.1.0+9")
+    (releases / FIRST).rename(releases / f"{__version__}+10")
+    (releases / SECOND).rename(releases / f"{__version__}+9")
     assert board.fly()[0] == "old"
-    (board.prefix / "current").symlink_to("releases/0.1.0+9")
+    (board.prefix / "current").symlink_to(f"releases/{__version__}+9")
     assert board.fly()[0] == "new"
 
 
@@ -266,7 +267,7 @@ def _start(board: FakeBoard) -> subprocess.Popen[str]:
     ("chooser", "note"),
     [
         ("healthy", ""),
-        ("missing", "releases.py answered '', not the name of a release that starts; 0.1.0+2 flies"),
+        ("missing", f"releases.py answered '', not the name of a release that starts; {SECOND} flies"),
     ],
 )
 def test_the_flight_is_the_process_that_systemd_started(board: FakeBoard, chooser: str, note: str) -> None:
@@ -284,7 +285,7 @@ def test_the_flight_is_the_process_that_systemd_started(board: FakeBoard, choose
         line = process.stdout.readline()
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == -signal.SIGTERM
-    assert line == f"{process.pid} /a b 0.1.0+2 {note}\n"
+    assert line == f"{process.pid} /a b {SECOND} {note}\n"
 
 
 def test_sigterm_ends_the_choice(board: FakeBoard, tmp_path: Path) -> None:
@@ -321,7 +322,7 @@ def test_a_whole_release_flies_after_any_flipped_bit_of_releases_py(board: FakeB
 
 
 def test_a_whole_release_flies_after_any_flipped_bit_of_the_record(board: FakeBoard) -> None:
-    whole = to_record(b'{"starts": {"0.1.0+2": 2}, "proven": ["0.1.0+1"]}')
+    whole = starts_record({SECOND: 2}, FIRST)
     flown = []
     for damaged in _flips(whole, FLIPS):
         (board.root / "state" / TRIALS).write_bytes(damaged)

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from flight import __version__
 from flight.app.service import NAME, NOTE, TRIALS, FlownRelease
 from flight.link.regular_files import line_of, to_record
-from tests.deploy.boards import FakeBoard
+from tests.deploy.boards import FIRST, SECOND, FakeBoard
 from tests.deploy.scripts import script
 
 releases = script("releases")
@@ -47,21 +48,21 @@ def test_a_new_release_that_is_never_proven_gives_way_to_the_old_one_which_repor
     assert _flown(board, 3) == ["new", "new", "new"]
     label, complaint = board.fly()
     assert label == "old"
-    assert "ended 3 times before it was proven; 0.1.0+1 flies" in complaint
-    FlownRelease({NAME: "0.1.0+2", "STATE_DIRECTORY": str(board.root / "state")}).prove()
+    assert f"ended 3 times before it was proven; {FIRST} flies" in complaint
+    FlownRelease({NAME: SECOND, "STATE_DIRECTORY": str(board.root / "state")}).prove()
     assert _flown(board, 5) == ["new"] * 5, "proven: power cuts no longer count"
 
 
 def test_a_release_that_ends_by_itself_has_its_starts_forgiven(board: FakeBoard) -> None:
     assert _flown(board, 2) == ["new", "new"]
-    FlownRelease({NAME: "0.1.0+2", "STATE_DIRECTORY": str(board.root / "state")}).end()
+    FlownRelease({NAME: SECOND, "STATE_DIRECTORY": str(board.root / "state")}).end()
     assert _flown(board, 3) == ["new", "new", "new"]
     assert _flown(board, 1) == ["old"]
 
 
 DAMAGED = (
     *("", "[", "[]", "{}", '{"starts": [], "proven": 7}', '{"starts": {"a": "b"}}', '{"starts": {}}'),
-    *('{"starts": {"0.1.0+2": Infinity}, "proven": []}', '{"starts": {"0.1.0+2": NaN}, "proven": []}'),
+    *(f'{{"starts": {{"{SECOND}": {number}}}, "proven": []}}' for number in ("Infinity", "NaN")),
     pytest.param("[" * 100_000, id="deep"),
 )
 
@@ -73,7 +74,7 @@ def test_a_damaged_record_of_the_starts_keeps_nothing_from_flying(board: FakeBoa
     assert _flown(board, 1) == ["new"]
     line = line_of((board.root / "state" / TRIALS).read_bytes())
     assert line is not None
-    assert json.loads(line)["starts"] == {"0.1.0+2": 1}
+    assert json.loads(line)["starts"] == {SECOND: 1}
 
 
 @pytest.mark.parametrize("content", DAMAGED[1:-1])
@@ -95,12 +96,13 @@ def test_a_damaged_release_gives_way_to_a_whole_one_but_flies_where_there_is_non
     label, complaint = board.fly()
     assert label == "old"
     assert (
-        "release 0.1.0+2: venv/lib/python3/site-packages/flight/label is damaged; 0.1.0+1 flies" in complaint
+        f"release {SECOND}: venv/lib/python3/site-packages/flight/label is damaged; {FIRST} flies"
+        in complaint
     )
     _ours(board, "previous").write_text("oLd", encoding="ascii")
     label, complaint = board.fly()
     assert label == "nEw"
-    assert "0.1.0+1: venv/lib/python3/site-packages/flight/label is damaged; 0.1.0+2 flies" in complaint
+    assert f"{FIRST}: venv/lib/python3/site-packages/flight/label is damaged; {SECOND} flies" in complaint
 
 
 @pytest.mark.parametrize("package", ["flight", "hal", "knightcube", "sim_hal"])
@@ -138,7 +140,7 @@ def test_rollback_flies_the_previous_release_and_back_again(board: FakeBoard) ->
     words = [*board.words("new")[:2], "--rollback"]
     for label in ("old", "new"):
         done = subprocess.run(words, env=board.environment(), capture_output=True, text=True, check=True)
-        assert "rolled back to 0.1.0+" in done.stdout
+        assert f"rolled back to {__version__}+" in done.stdout
         assert board.fly()[0] == label
 
 
@@ -147,7 +149,7 @@ def test_an_update_keeps_two_releases_and_a_second_run_of_it_none_more(board: Fa
     before = sorted((board.prefix / "releases").iterdir())
     board.install("newest")
     assert sorted((board.prefix / "releases").iterdir()) == before
-    assert [path.name for path in before] == ["0.1.0+2", "0.1.0+3"]
+    assert [path.name for path in before] == [SECOND, f"{__version__}+3"]
     assert not list((board.prefix / "current").glob("venv/lib/python3/site-packages/ground"))
 
 

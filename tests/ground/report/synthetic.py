@@ -118,7 +118,7 @@ def _identity(packer: Packer, recipe: Recipe) -> bytes:
         0,
         config_name="made-up",
         config_crc=0x12345678,
-        software="0.1.0",
+        software="0.2.0",
         seed=7,
         utc_ns=1_700_000_000_000_000_000,
         simulated=recipe.truth,

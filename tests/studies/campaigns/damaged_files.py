@@ -20,12 +20,11 @@ import numpy as np
 
 from flight.link.files.store import Incoming, Store
 from flight.link.process.commanding import Timetable
-from flight.link.regular_files import to_record
 from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Association, Gate, Vault, new_key
 from flight.loop.state import StateStore, StoredState, note_boot
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from hal.interfaces.guardian import CoilReach
-from tests.deploy.boards import FakeBoard
+from tests.deploy.boards import FIRST, SECOND, FakeBoard, starts_record
 from tests.flight.link.vaults import gate
 
 FLIPS = 25
@@ -43,9 +42,7 @@ class DamagedBoard:
             self.board.install(label)
         self._state, self._link = self.board.root / "state", self.board.root / "link"
         self._state.mkdir()
-        (self._state / "releases.json").write_bytes(
-            to_record(b'{"starts": {"0.1.0+2": 1}, "proven": ["0.1.0+1"]}')
-        )
+        (self._state / "releases.json").write_bytes(starts_record({SECOND: 1}, FIRST))
         note_boot([self._state], 7)
         StateStore(self._state, lambda *_: None).store(StoredState(boot_count=7))
         CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", 0x42).note(self._state)

@@ -13,7 +13,6 @@ import shutil
 import signal
 import subprocess
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Sequence
 from functools import cache
@@ -140,12 +139,11 @@ def _step(ends: RenewedEnds, rng: np.random.Generator) -> bool:
         start_new_session=True,
     )
     if rng.random() < 0.5:
-        time.sleep(float(LONGEST_S ** rng.uniform(-2.0, 1.0)))
-        ended = process.poll() is not None
-        if not ended:
+        try:
+            process.wait(float(LONGEST_S ** rng.uniform(-2.0, 1.0)))
+        except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        if not ended:
+            process.wait()
             return True
     process.wait()
     ends.services()
