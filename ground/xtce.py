@@ -18,12 +18,16 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 from flight.link.commands import LAYOUTS as COMMANDS
 from flight.link.process.commanding import Stage
 from flight.link.process.directives import LAYOUTS as DIRECTIVES
-from flight.link.process.directives import NEW_KEY
+from flight.link.process.directives import NEW_KEY, PORTION
 from flight.link.telemetry.definitions import STAGES, Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
 
 SPACE = "KnightCube"
-TELECOMMANDS = {**COMMANDS, **{name: layout for name, layout in DIRECTIVES.items() if name != NEW_KEY.name}}
+_OF_THE_LINK = (NEW_KEY.name, PORTION.name)
+TELECOMMANDS = {
+    **COMMANDS,
+    **{name: layout for name, layout in DIRECTIVES.items() if name not in _OF_THE_LINK},
+}
 """Commands that a third-party ground station may send; only `flight` can send new keys."""
 _XTCE = "http://www.omg.org/spec/XTCE/20180204"
 EPOCH = "2000-01-01T00:00:00"

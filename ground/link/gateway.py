@@ -26,6 +26,7 @@ from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
 from flight.link.files.units import PACKET_VERSION, UP
 from flight.link.frames import LONGEST_FRAME
+from flight.link.process.directives import LONGEST_IN_PORTIONS
 from flight.link.process.station import host_port
 from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, SECONDARY_BYTES, crc16
@@ -295,8 +296,9 @@ class Gateway:
             return
         try:
             for packet in self._connections[line].stream.packets(data):
-                if len(packet) > (most := self._terminal.packet_bytes):
-                    raise StreamError(f"{len(packet)} bytes: link.command_frame_bytes allows {most}")
+                most = max(self._terminal.packet_bytes, LONGEST_IN_PORTIONS)
+                if len(packet) > most:
+                    raise StreamError(f"{len(packet)} bytes: the link carries {most}")
                 self._terminal.send_by(self._sealer, finished(packet, utc_ns()))
                 self.up += 1
         except StreamError as error:

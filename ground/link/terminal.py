@@ -15,6 +15,7 @@ from typing import Protocol
 
 import serial
 
+from flight.app.run import utc_ns
 from flight.link.coding import Framing, LinkCodes
 from flight.link.frames import (
     TELECOMMAND_HEADER,
@@ -27,6 +28,7 @@ from flight.link.frames import (
     open_telemetry,
 )
 from flight.link.process.commanding import Report, Request, Stage
+from flight.link.process.directives import portions
 from flight.link.process.downlink import LIVE
 from flight.link.process.station import host_port
 from flight.link.security import (
@@ -183,14 +185,14 @@ class Terminal:
         return Sealer(self._vault, spi, TELECOMMAND_MASK, block, shared=True)
 
     def send_by(self, sealer: Sealer, packet: bytes) -> int:
-        """Send a command packet in a frame authenticated by `sealer`, and return the counter of the frame.
+        """Send a packet in a frame authenticated by `sealer`, and return the counter of the frame.
 
-        Raises FlightError if the packet is too long, or if the frame cannot be sent.
+        A packet that is too long for a frame is sent in portions; the counter is that of the last portion.
+        Raises FlightError if the packet is longer than any command, or if a frame cannot be sent.
         """
-        length = FRAME_OVERHEAD_BYTES + len(packet)
         if len(packet) > self.packet_bytes:
-            most = f"link.command_frame_bytes is {self._settings.command_frame_bytes}"
-            raise FlightError(f"the command needs a frame of {length} bytes, but {most}")
+            return [self.send_by(sealer, portion) for portion in portions(packet, utc_ns())][-1]
+        length = FRAME_OVERHEAD_BYTES + len(packet)
         header = TelecommandHeader(self._settings.spacecraft, 0, self._sequence)
         with _turn_to_send(self._vault.folder):
             body, counter = sealer.seal(header.pack(length), packet)

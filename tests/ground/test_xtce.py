@@ -14,7 +14,7 @@ from flight.bodies.orbit.body import LEVELS
 from flight.link.commands import COMMANDS
 from flight.link.events import Severity
 from flight.link.process.commanding import Stage
-from flight.link.process.directives import DIRECTIVES, NEW_KEY
+from flight.link.process.directives import DIRECTIVES, NEW_KEY, PORTION
 from flight.link.telemetry import definitions
 from flight.link.telemetry.definitions import PACKETS, Field, Limits, Packet
 from flight.link.telemetry.packets import LAYOUTS, Packer, compile_layouts
@@ -116,7 +116,7 @@ def test_names_are_plain_and_commands_carry_ranges_and_hazards() -> None:
     assert not [name for name in names if set(name) & set("./:[] ")]
     commands = found(root, "x:CommandMetaData/x:MetaCommandSet")
     assert [command.get("name") for command in commands] == [
-        packet.name for packet in (*COMMANDS, *DIRECTIVES) if packet is not NEW_KEY
+        packet.name for packet in (*COMMANDS, *DIRECTIVES) if packet not in (NEW_KEY, PORTION)
     ]
     arguments = found(root, "x:CommandMetaData/x:ArgumentTypeSet")
     assert found(arguments, ".//x:ValidRange").attrib == {"minInclusive": "-0.68", "maxInclusive": "0.68"}

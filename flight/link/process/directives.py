@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,6 +27,10 @@ SUM_BYTES = 32
 LONGEST_COMMAND = 96
 """Maximum length (bytes) of a command in words, including the terminating zero byte."""
 _LONGEST_UTC = 32
+_PORTION_BYTES, _MOST_PORTIONS = 72, 8
+"""Bytes of a packet in one portion, which fits into a frame of 128 bytes, and maximum number of portions."""
+LONGEST_IN_PORTIONS = _PORTION_BYTES * _MOST_PORTIONS
+"""Length (bytes) of the longest packet that can be sent in portions."""
 
 _ENTITY = Field(
     "entity", "u2", "-", "receiving entity", states=((GROUND, "ground"), (FOREIGN, "another-ground-station"))
@@ -106,6 +111,14 @@ NEW_KEY = telecommand(
     Field("spi", "u2", "-", "SPI of the key, 1 to 4"),
     Field("generation", "u4", "-", "generation of the new key, one above the old generation"),
     Field("key", "u1", "-", "new key of AES-256", KEY_BYTES),
+)
+PORTION = telecommand(
+    "portion",
+    0x2A3,
+    "Carry a portion of a packet that is longer than the frames allow",
+    Field("total", "u1", "-", "number of portions of the packet, 2 to 8"),
+    Field("number", "u1", "-", "number of this portion, 1 to `total`, in this order"),
+    Field("data", "u1", "-", "bytes of the packet; zeros fill the last portion", _PORTION_BYTES),
 )
 SCHEDULE = telecommand(
     "schedule",
@@ -276,6 +289,41 @@ class NewKey:
 
 
 @dataclass(frozen=True, slots=True)
+class Portion:
+    """Directive that carries the portion `number` of the `total` portions of a packet."""
+
+    total: int
+    number: int
+    data: bytes
+
+    def __str__(self) -> str:
+        return f"portion {self.number} of {self.total}"
+
+
+class Joiner:
+    """Buffer that joins the portions of a packet."""
+
+    def __init__(self) -> None:
+        self._portions: list[Portion] = []
+
+    def add(self, portion: Portion) -> bytes:
+        """Return the packet after its last portion, and an empty value before.
+
+        Raises CommandError for a portion that does not follow the portion received before.
+        """
+        before, self._portions = self._portions, []
+        if portion.number == 1 and 2 <= portion.total <= _MOST_PORTIONS:
+            before = []
+        elif not before or (portion.total, portion.number) != (before[0].total, len(before) + 1):
+            raise CommandError(f"{portion}: a portion before it is missing, send the command again")
+        if portion.number < portion.total:
+            self._portions = [*before, portion]
+            return b""
+        whole = b"".join(one.data for one in (*before, portion))
+        return whole[: int.from_bytes(whole[4:HEADER_BYTES], "big") + HEADER_BYTES + 1]
+
+
+@dataclass(frozen=True, slots=True)
 class Scheduled:
     """Directive to execute a command, given in words, at a UTC in ISO 8601 format."""
 
@@ -307,12 +355,13 @@ class Listing:
 FileDirective = ListFiles | SendFile | CancelFile | SuspendFile | ResumeFile | UseFile | DeleteFile
 Privileged = Activate | Confirm | Withdraw | Restart
 """Directives that the privileged part of the renewal executes."""
-Directive = Play | Stop | NewKey | Scheduled | Deletion | Listing | Privileged | FileDirective
+Directive = Play | Stop | NewKey | Portion | Scheduled | Deletion | Listing | Privileged | FileDirective
 
 _PACKETS: dict[type[Any], Packet] = {
     Play: PLAY,
     Stop: STOP,
     NewKey: NEW_KEY,
+    Portion: PORTION,
     Scheduled: SCHEDULE,
     Deletion: UNSCHEDULE,
     Listing: LIST,
@@ -356,6 +405,20 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
         return Packer(LAYOUTS).pack(packet, utc_ns, values)
     except TelemetryError as error:
         raise CommandError("the values do not fit into the directive") from error
+
+
+def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
+    """Yield the portions of a packet, each as a packet with a time of its own from `utc_ns` on.
+
+    Raises CommandError for a packet that is longer than eight portions.
+    """
+    total = -(-len(packet) // _PORTION_BYTES)
+    if len(packet) > LONGEST_IN_PORTIONS:
+        raise CommandError(f"{len(packet)} bytes are longer than any command")
+    for number in range(total):
+        data = packet[_PORTION_BYTES * number : _PORTION_BYTES * (number + 1)]
+        portion = Portion(total, number + 1, data.ljust(_PORTION_BYTES, b"\0"))
+        yield pack(portion, utc_ns + number)
 
 
 def unpack(data: bytes) -> Directive | None:

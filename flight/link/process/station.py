@@ -51,6 +51,7 @@ from flight.link.process.directives import (
     Listing,
     NewKey,
     Play,
+    Portion,
     Privileged,
     Restart,
     Scheduled,
@@ -524,7 +525,7 @@ class Station:
         folder = vault.folder.absolute().parent / "renewal"
         self._renewal = Renewal(folder, settings.renewal, settings.command_loss)
         self._verification = Verification()
-        self._packer, self._commands = Packer(), CommandPacker()
+        self._packer, self._commands, self._joiner = Packer(), CommandPacker(), directives.Joiner()
         self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
         self._status_ns = self._label_ns = clock.now_ns()
         self._refusals_ns = deque([-2 * SECOND_NS] * _REFUSALS_A_SECOND, _REFUSALS_A_SECOND)
@@ -640,6 +641,8 @@ class Station:
         line.trust(sender, now_ns)
         request = request_of(admitted.data)
         try:
+            admitted = self._joined(admitted)
+            request = request_of(admitted.data)
             if is_unit(admitted.data, UP):
                 self._filing.take(admitted.data, now_ns)
                 return
@@ -654,6 +657,16 @@ class Station:
             return
         self._report(report(sent, Stage.ACCEPTED, sent.command.text))
         self._hand_over(sent, admitted.data, now_ns)
+
+    def _joined(self, admitted: Admitted) -> Admitted:
+        """Return a frame's content, after the last portion of a packet with the whole packet.
+
+        Raises CommandError for a portion that does not follow the portion before it.
+        """
+        if is_unit(admitted.data, UP) or not isinstance(portion := directives.unpack(admitted.data), Portion):
+            return admitted
+        whole = self._joiner.add(portion)
+        return replace(admitted, data=whole) if whole else admitted
 
     def _hand_over(self, sent: Sent, packet: bytes, now_ns: int) -> None:
         if problem := self._control.send(sent, packet, now_ns):
@@ -675,7 +688,8 @@ class Station:
         request = request_of(admitted.data)
         done = Report(admitted.spi, admitted.counter, Stage.COMPLETED, name, text, request)
         self._report(replace(done, stage=Stage.ACCEPTED))
-        reports = self._executed(directive, done)
+        # Nothing is executed after a portion of a packet whose last portion has not arrived.
+        reports = [done] if isinstance(directive, Portion) else self._executed(directive, done)
         own = [one.stage for one in reports if (one.spi, one.counter) == (done.spi, done.counter)]
         self._refused_commands += Stage.FAILED in own
         self._report(*reports)

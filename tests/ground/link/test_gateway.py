@@ -17,7 +17,8 @@ from typing import cast
 
 import pytest
 
-from flight.link.commands import ChangeMode, CommandPacker, Ping, Slew
+from flight.link.commands import ChangeMode, CommandPacker, Ping
+from flight.link.files.units import UP, UnitPacker
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import HEALTH
 from flight.link.telemetry.packets import Packer
@@ -110,12 +111,12 @@ def station() -> Iterator[Station]:
 def test_a_packet_for_a_longer_frame_closes_its_connection_alone(
     station: Station,
 ) -> None:
-    station.satellite.packet_bytes = 21
-    ping, slew = (CommandPacker().pack(command, 1) for command in (Ping(1), Slew(0.1)))
-    line = station.connect(station.line + slew)
+    station.satellite.packet_bytes = 700
+    ping, unit = CommandPacker().pack(Ping(1), 1), UnitPacker(UP).pack(bytes(783), 1)
+    line = station.connect(station.line + unit)
     station.turn()
     assert closed(line)
-    assert "25 bytes: link.command_frame_bytes allows 21" in station.complaints[-1]
+    assert "800 bytes: the link carries 700" in station.complaints[-1]
     station.connect(station.line + ping)
     station.turn()
     assert station.satellite.up[-1][:2] == ping[:2]

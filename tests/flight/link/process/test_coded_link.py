@@ -11,14 +11,23 @@ import numpy as np
 import pytest
 
 from flight.link.coding import LinkCodes, kiss_frame
-from flight.link.commands import CommandPacker, Ping, unpack
+from flight.link.commands import CommandPacker, LoadParameters, Ping, unpack
 from flight.link.files.units import UP, Metadata, Transaction, UnitPacker, pack
 from flight.link.frames import IDLE_CHANNEL, TELEMETRY_HEADER, TelecommandHeader, close_frame, is_idle
 from flight.link.process import directives
-from flight.link.process.directives import Stop
+from flight.link.process.commanding import Stage, request_of
+from flight.link.process.directives import (
+    Activate,
+    DeleteFile,
+    Directive,
+    Portion,
+    Scheduled,
+    Stop,
+    UseFile,
+)
 from flight.link.process.station import TcpLine, TncLine, UdpLine
 from flight.link.security import Refusal
-from flight.link.telemetry.definitions import LINK
+from flight.link.telemetry.definitions import LINK, PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS
 from flight.schema.sections import LinkCoding
 from ground.link.terminal import StreamGround, TerminalSettings, UdpGround
@@ -135,17 +144,69 @@ def test_idle_frames_keep_the_configured_rate_and_no_telemetry_waits_for_them(
     assert sum(link.terminal.gate.refused.values()) == 0
 
 
-def test_a_command_for_a_longer_frame_is_refused_on_the_ground(stack: ExitStack, tmp_path: Path) -> None:
+@pytest.fixture
+def short(stack: ExitStack, tmp_path: Path) -> BothEnds:
     settings = TerminalSettings(frame_bytes=128, command_frame_bytes=128)
-    link = stack.enter_context(closing(BothEnds(tmp_path, settings=settings)))
-    link.terminal.send(ping(1))
-    with pytest.raises(FlightError, match=r"needs a frame of 129 bytes, but link.command_frame_bytes is 128"):
-        link.terminal.send(bytes(92))
-    link.turn()
-    assert [unpack(data) for data in link.obeyed] == [Ping(1)]
+    return stack.enter_context(closing(BothEnds(tmp_path, settings=settings)))
 
 
-@pytest.mark.parametrize("command_bytes", [190, 300])
+TABLE = LoadParameters(7, tuple((parameter.valid or (0.0, 0.0))[1] for parameter in PARAMETER_FIELDS))
+LONG = (
+    Activate(f"received/release/{'n' * 78}", bytes(range(32)), 24.0, 1),
+    UseFile("received/elements/a.txt", bytes(32)),
+    Scheduled("2026-11-27T00:00:00", f"safe {'r' * 60}"),
+    DeleteFile(f"received/elements/{'n' * 77}"),
+)
+
+
+def test_a_table_of_parameters_passes_frames_of_128_bytes_in_portions(short: BothEnds) -> None:
+    packet = CommandPacker().pack(TABLE, 1)
+    counter = short.terminal.send(packet)
+    assert all(len(frame) <= 128 for frame in short.wire.up)
+    short.turn()
+    assert short.obeyed == [packet]
+    assert short.stages(counter) == ["accepted", "started", "completed"]
+    for portion in range(1, len(range(0, len(packet), 72))):
+        assert short.stages(counter - portion) == ["accepted", "completed"]
+
+
+@pytest.mark.parametrize("directive", LONG, ids=lambda directive: type(directive).__name__)
+def test_a_long_directive_passes_frames_of_128_bytes(short: BothEnds, directive: Directive) -> None:
+    counter = short.terminal.send(directives.pack(directive, 1))
+    short.turn()
+    assert "accepted" in short.stages(counter)
+    (accepted,) = (r for r in short.reports() if (r.counter, r.stage) == (counter, Stage.ACCEPTED))
+    assert accepted.text == str(directive)[: len(accepted.text)]
+    assert accepted.request == request_of(directives.pack(directive, 1))
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_a_packet_with_a_lost_portion_is_refused_and_the_next_is_obeyed(short: BothEnds, lost: int) -> None:
+    packet = CommandPacker().pack(TABLE, 1)
+    counter = short.terminal.send(packet)
+    del short.wire.up[lost]
+    short.turn()
+    assert short.obeyed == []
+    assert short.stages(counter) == ([] if lost == 2 else ["refused"])
+    short.terminal.send(ping(1))
+    short.terminal.send(packet)
+    short.turn()
+    assert short.obeyed == [ping(1), packet]
+
+
+@pytest.mark.parametrize(
+    "portion",
+    [Portion(0, 1, bytes(72)), Portion(1, 1, bytes(72)), Portion(9, 1, bytes(72)), Portion(3, 2, bytes(72))],
+)
+def test_a_portion_without_the_portion_before_it_is_refused(short: BothEnds, portion: Portion) -> None:
+    counter = short.terminal.send(directives.pack(portion, 1))
+    short.turn()
+    assert short.stages(counter) == ["refused"]
+    with pytest.raises(FlightError, match="600 bytes are longer than any command"):
+        short.terminal.send(bytes(600))
+
+
+@pytest.mark.parametrize("command_bytes", [128, 300])
 def test_files_pass_short_frames_in_both_directions(
     stack: ExitStack, tmp_path: Path, command_bytes: int
 ) -> None:
