@@ -8,7 +8,7 @@ TESTS  := $(RUN) -m pytest -n auto
 # The tests start hundreds of processes: without kept bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo cage orbit orbit-3u object console quick test test-container lint types arrows docs house unit fast explore slow-list pictures lock clean help
+.PHONY: demo cage orbit orbit-3u object console quick test test-container lint types arrows docs house unit fast explore slow-list pictures lock release clean help
 
 help:           ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -109,6 +109,16 @@ CHECKS  := images parquet test docs interop
 COMPILE = build/lock/bin/pip-compile --quiet --generate-hashes --all-build-deps --allow-unsafe --strip-extras \
   --no-annotate --no-header --no-emit-options --find-links build/lock/wheels --output-file $(1) $(2) && \
   sed -i -e '/^knightcube==/,/[^\\]$$/d' -e '/^\#/d' $(1)
+
+release: $(READY) ## sign the committed release and check its bundle as a board does (SIGNING=folder of renewal keys)
+	@test -f "$(SIGNING)/signing.pem" || { echo "name the folder of \`knightcube renewal keys\`: make release SIGNING=folder" >&2; exit 2; }
+	@test -z "$$(git status --porcelain)" || { echo "commit or remove the changes first: git status" >&2; exit 2; }
+	@rm -rf build/release && mkdir -p build/release/source build/release/opened
+	@git archive HEAD | tar -x -C build/release/source
+	$(RUN) -m flight renewal sign "$(SIGNING)" release build/release/source --out build/release
+	$(RUN) deploy/open_bundle.py build/release/trusted "$(SIGNING)/metadata/1.root.json" build/release/release-*.renewal release \
+	  build/release/opened - -
+	@cd build/release && sha256sum release-*.renewal
 
 clean:          ## forget the virtual environment and the runs
 	rm -rf $(VENV) runs build *.egg-info

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import re
 import sys
 import tarfile
 from collections.abc import Iterable
@@ -66,9 +67,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     signed.add_argument(
         "path", type=Path, metavar="FILE", help="the artefact; for a release its folder of sources"
     )
-    signed.add_argument(
-        "--version", type=int, required=True, metavar="N", help="its version, above the last one"
-    )
+    text = "its version, above the last one (for a release by default 200 for 0.2.0, 10203 for 1.2.3)"
+    signed.add_argument("--version", type=int, metavar="N", help=text)
     signed.add_argument("--back", action="store_true", help="permit a version that is not newer")
     signed.add_argument(
         "--expires", metavar="DATE", help="end of the signature, such as 2030-01-01 (default none)"
@@ -108,7 +108,10 @@ def run(options: argparse.Namespace) -> int:
             version = replace_signing_key(options.folder, options.root)
             sys.stdout.write(f"root metadata {version}; the next bundle carries them\n")
         case "sign":
-            bundle = sign(options, artefact(options.kind, options.path))
+            data = artefact(options.kind, options.path)
+            if options.version is None:
+                options.version = _release_version(options.kind, options.path)
+            bundle = sign(options, data)
             sys.stdout.write(f"{bundle}: {bundle.stat().st_size} bytes\n")
         case _:
             return _command(options)
@@ -230,6 +233,18 @@ def artefact(kind: str, path: Path) -> bytes:
     if kind == "elements" and [len(line.rstrip()) for line in data.splitlines() if line.strip()] != [69, 69]:
         raise UsageError(f"{path}: elements are two lines of 69 characters")
     return data
+
+
+def _release_version(kind: str, source: Path) -> int:
+    """Return the version of a release as one number, 10203 for 1.2.3. Raises UsageError for another kind."""
+    if kind != "release":
+        raise UsageError(f"{kind}: needs its version, --version N")
+    text = read_text(source / "pyproject.toml")
+    found = re.search(r'^version = "(\d+)\.(\d\d?)\.(\d\d?)"$', text, re.MULTILINE)
+    if found is None:
+        raise UsageError(f"{source}/pyproject.toml: has no version such as 1.2.3: give --version N")
+    major, minor, patch = map(int, found.groups())
+    return 10_000 * major + 100 * minor + patch
 
 
 def _packed(source: Path) -> bytes:

@@ -121,5 +121,6 @@ DIRECTIVES: tuple[tuple[str, int, str, bool], ...] = (
     ("play", 0x2A0, "run:u4 begin:f8 end:f8", False),
     ("stop-playback", 0x2A1, "", False),
     ("new-key", 0x2A2, "spi:u2 generation:u4 key:32u1", False),
+    ("portion", 0x2A3, "total:u1 number:u1 data:72u1", False),
 )
 """Name, APID, fields, and whether a hazard is stated, of each directive."""

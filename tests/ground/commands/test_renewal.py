@@ -33,6 +33,43 @@ def test_a_bundle_is_opened_by_the_root_metadata_of_the_board(signing: Path, tmp
     assert (folder / "set/flight.yaml").read_bytes() == config.read_bytes()
 
 
+def _sources(place: Path, version: str) -> Path:
+    """Return the folder of a release's sources that have a version and a file."""
+    (place / "deploy").mkdir(parents=True)
+    (place / "deploy/build_release.py").write_text("print('built')\n")
+    (place / "pyproject.toml").write_text(f'[project]\nname = "x"\nversion = "{version}"\n')
+    return place
+
+
+@pytest.mark.parametrize(("version", "number"), [("0.2.0", 200), ("1.2.3", 10203), ("12.0.99", 120099)])
+def test_a_release_is_signed_under_the_version_of_its_sources(
+    signing: Path, tmp_path: Path, version: str, number: int
+) -> None:
+    source = _sources(tmp_path / "source", version)
+    done = command("renewal", "sign", signing, "release", source, "--out", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    root, folder = signing / "metadata/1.root.json", tmp_path / "opened"
+    folder.mkdir()
+    words = [tmp_path / "trusted", root, tmp_path / f"release-{number}.renewal", "release", folder, "-", "-"]
+    assert script("open_bundle").main([str(word) for word in words]) == 0
+    with tarfile.open(folder / "artefact") as archive:
+        assert {"deploy/build_release.py", "pyproject.toml"} < set(archive.getnames())
+
+
+@pytest.mark.parametrize(
+    ("kind", "version"), [("release", "1.2"), ("release", "0.100.0"), ("catalogue", "1.2.3")]
+)
+def test_without_a_usable_version_the_option_is_asked_for(
+    signing: Path, tmp_path: Path, kind: str, version: str
+) -> None:
+    source = _sources(tmp_path / "source", version)
+    path = source if kind == "release" else source / "pyproject.toml"
+    done = command("renewal", "sign", signing, kind, path, "--out", tmp_path)
+    assert done.returncode == 2
+    assert "--version N" in done.stderr
+    assert not list(tmp_path.glob("*.renewal"))
+
+
 def test_keys_are_readable_by_their_owner_only_and_never_overwritten(signing: Path) -> None:
     keys = sorted(signing.glob("*.pem"))
     assert [key.name for key in keys] == ["root-1.pem", "root-2.pem", "signing.pem"]
