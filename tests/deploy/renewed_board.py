@@ -9,7 +9,7 @@ import subprocess
 import sys
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from flight.link.process.renewal import decoded, encoded
 from ground.commands.renewal import artefact, make_signing_keys, sign
@@ -38,7 +38,7 @@ class RenewedBoard:
         self.count = 0
 
     @classmethod
-    def make(cls, place: Path, text: str = "") -> RenewedBoard:
+    def make(cls, place: Path, text: str = "") -> Self:
         """Install a board with a configuration, by default the testbed's, and make the signing keys."""
         place.mkdir(exist_ok=True)
         changed_testbed(place, commands="{socket: /run/knightcube/commands}", link=LINK)

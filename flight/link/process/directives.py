@@ -355,7 +355,8 @@ class Listing:
 FileDirective = ListFiles | SendFile | CancelFile | SuspendFile | ResumeFile | UseFile | DeleteFile
 Privileged = Activate | Confirm | Withdraw | Restart
 """Directives that the privileged part of the renewal executes."""
-Directive = Play | Stop | NewKey | Portion | Scheduled | Deletion | Listing | Privileged | FileDirective
+Executable = Play | Stop | NewKey | Scheduled | Deletion | Listing | Privileged | FileDirective
+Directive = Portion | Executable
 
 _PACKETS: dict[type[Any], Packet] = {
     Play: PLAY,

@@ -48,6 +48,7 @@ from flight.link.process.directives import (
     Confirm,
     Deletion,
     Directive,
+    Executable,
     Listing,
     NewKey,
     Play,
@@ -694,7 +695,7 @@ class Station:
         self._refused_commands += Stage.FAILED in own
         self._report(*reports)
 
-    def _executed(self, directive: Directive, done: Report) -> list[Report]:
+    def _executed(self, directive: Executable, done: Report) -> list[Report]:
         """Execute a directive and return the reports due now. The report `done` states its completion."""
         match directive:
             case Play():

@@ -134,6 +134,7 @@ class Rehearsal:
         self.board = RealReleases.make(place / "board", linked_text())
         self.ends = RenewedEnds(self.board, 1)
         self.steps: list[dict[str, object]] = []
+        self.board.step()
         self._note(f"install.sh installs {__version__}")
 
     def _note(self, step: str, **facts: object) -> None:
