@@ -29,6 +29,7 @@ accelerations.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -223,7 +224,6 @@ class CoilResponse:
         # Row a is the direction of coil a, times its strength relative to that of the strongest coil.
         self._directions: FloatArray = dipoles.T / strongest
         self._count_of_coils = coils = len(self._directions)
-        self._each = np.arange(coils)
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)[:, None]
         count = len(self._free)
@@ -457,27 +457,33 @@ class CoilResponse:
             right[:coils] - rest @ coupling,
             float(outputs @ outputs - rest @ others @ rest),
         )
-        freely = gains.solve(prior)
-        spread = max(1.0, freely.cost / max(len(outputs) - count - coils, 1))
+        # The hypotheses: all gains are free, one is free, none is free, and one coil is reversed.
+        healthy, each = np.full(coils, self._healthy), np.eye(coils, dtype=bool)
+        weights = np.concatenate(
+            [prior[None], np.where(each, prior, healthy), np.tile(healthy, (coils + 1, 1))]
+        )
+        expected = np.ones((len(weights), coils))
+        expected[coils + 2 :][each] = -1.0
+        fits = gains.solve(weights, expected)
+        free_cost = float(fits.costs[0])
+        spread = max(1.0, free_cost / max(len(outputs) - count - coils, 1))
         # If a gain is impossible even within its uncertainty, the model is wrong.
-        sigmas = np.sqrt(spread * freely.variances)
-        possible = bool((np.abs(freely.gains) - 3.0 * sigmas < self.largest).all())
-        healthy = np.full(coils, self._healthy)
-        one_free = [gains.solve(np.where(axis == self._each, prior, healthy)) for axis in range(coils)]
-        costs = [fit.cost / spread for fit in one_free]
-        sound_cost = gains.solve(healthy).cost / spread
+        sigmas = np.sqrt(spread * fits.variances[0])
+        possible = bool((np.abs(fits.gains[0]) - 3.0 * sigmas < self.largest).all())
+        free_cost, *costs = (fits.costs / spread).tolist()
+        sound_cost, reversed_costs = costs[coils], costs[coils + 1 :]
         alone, is_reversed = [], []
         for axis in range(coils):
             # Limit of the sum of squares of a hypothesis that only this axis is broken.
             limit = min(costs[other] for other in range(coils) if other != axis) - _CLEARLY
-            limit = min(limit, freely.cost / spread + _WORSE)
-            reversed_cost = gains.solve(healthy, np.where(axis == self._each, -1.0, 1.0)).cost / spread
+            limit = min(limit, free_cost + _WORSE)
             alone.append(costs[axis] < limit)
-            is_reversed.append(reversed_cost < min(limit, sound_cost - _CERTAINLY))
+            is_reversed.append(reversed_costs[axis] < min(limit, sound_cost - _CERTAINLY))
+        one_free = slice(1, coils + 1)
         return MotionFit(
-            np.array([fit.gains[axis] for axis, fit in enumerate(one_free)]),
-            np.sqrt(spread * np.array([fit.variances[axis] for axis, fit in enumerate(one_free)])),
-            (others @ rest - coupling @ freely.gains)[2 * count :],
+            fits.gains[one_free].diagonal().copy(),
+            np.sqrt(spread * fits.variances[one_free].diagonal()),
+            (others @ rest - coupling @ fits.gains[0])[2 * count :],
             possible,
             tuple(alone),
             tuple(is_reversed),
@@ -517,15 +523,26 @@ class CoilResponse:
         The noise of the mean rate of a bin enters two differences of neighbouring bins with opposite signs.
         """
         settings, rows = self._settings, np.array(bins)
-        variance = (settings.rate_noise / span) ** 2 / settings.bin_samples
-        count = len(rows)
-        covariance = (settings.model_error**2 + 2.0 * variance) * np.eye(count)
-        covariance -= variance * (np.eye(count, k=1) + np.eye(count, k=-1))
-        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-        rows = np.tensordot(whitening, rows, 1)
-        constant = whitening.sum(axis=1)
-        constant /= math.sqrt(float(constant @ constant))
-        return np.asarray(rows - constant[:, None, None] * np.tensordot(constant, rows, 1))
+        # The span is rounded to ns, so that equal spans use the stored matrix.
+        variance = (settings.rate_noise / round(span, 9)) ** 2 / settings.bin_samples
+        return np.tensordot(_whitening(len(rows), settings.model_error**2, variance), rows, 1)
+
+
+@functools.lru_cache(maxsize=64)
+def _whitening(count: int, independent: float, variance: float) -> FloatArray:
+    """Return the matrix (m, m) that whitens the differences of bins and removes their constant part.
+
+    Args:
+        count: number of differences, m.
+        independent: variance of the independent errors of the differences.
+        variance: variance of the rate of a bin, divided by the squared time between bins.
+    """
+    covariance = (independent + 2.0 * variance) * np.eye(count)
+    covariance -= variance * (np.eye(count, k=1) + np.eye(count, k=-1))
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    constant = whitening.sum(axis=1)
+    constant /= math.sqrt(float(constant @ constant))
+    return np.asarray(whitening - np.outer(constant, constant @ whitening))
 
 
 class Finding(Enum):
@@ -558,15 +575,16 @@ class MotionFit(NamedTuple):
     is_reversed: tuple[bool, ...]
 
 
-class GainFit(NamedTuple):
-    """Gains (n,), their variances (n,), and the weighted sum of squares of all residuals.
+class GainFits(NamedTuple):
+    """Fits of the n gains under k hypotheses: gains (k, n), their variances (k, n), and the costs (k,).
 
-    The sum includes the deviations of the parameters from their expected values.
+    A cost is the weighted sum of squares of all residuals, including the deviations of the parameters from
+    their expected values.
     """
 
     gains: FloatArray
     variances: FloatArray
-    cost: float
+    costs: FloatArray
 
 
 class GainEquations(NamedTuple):
@@ -579,15 +597,16 @@ class GainEquations(NamedTuple):
     right: FloatArray
     constant: float
 
-    def solve(self, weights: FloatArray, expected: FloatArray | None = None) -> GainFit:
-        """Fit gains with the prior weights (n,) of the expected gains (n,), which are 1 by default."""
-        prior = weights if expected is None else weights * expected
-        covariance = np.linalg.inv(self.matrix + np.diag(weights))
-        right = self.right + prior
-        gains = covariance @ right
+    def solve(self, weights: FloatArray, expected: FloatArray) -> GainFits:
+        """Fit gains with the prior weights (k, n) of the expected gains (k, n), which are 1 or -1."""
+        normal = np.repeat(self.matrix[None], len(weights), axis=0)
+        normal.reshape(len(weights), -1)[:, :: weights.shape[1] + 1] += weights
+        covariance = np.linalg.inv(normal)
+        right = self.right + weights * expected
+        gains = (covariance @ right[:, :, None])[:, :, 0]
         # The squares of the expected gains are 1, so the prior adds the sum of the weights.
-        cost = self.constant + float(weights.sum() - right @ gains)
-        return GainFit(gains, np.asarray(covariance.diagonal(), dtype=np.float64), cost)
+        costs = self.constant + weights.sum(axis=1) - (right * gains).sum(axis=1)
+        return GainFits(gains, covariance.diagonal(axis1=1, axis2=2), costs)
 
 
 LONGEST_REST_NS = 600_000_000_000

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, select
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_product, select
 from knightcube.vision.camera.lens import Pinhole
 
 PIXEL_VARIANCE = 1.0 / 12.0
@@ -157,10 +157,13 @@ class CameraMotion:
     def higher(self, time: FloatArray, derivative: int = 0) -> FloatArray:
         """Return the rotation vector (3, m) from `higher_terms` at `time` (m,), or its time derivative."""
         out = np.zeros((3, len(time)))
-        for power, term in enumerate(self.higher_terms, start=3):
-            factor = (1, power, power * (power - 1))[derivative]
-            out += factor * term[:, None] * time ** (power - derivative)
-        return out
+        if not len(self.higher_terms):
+            return out
+        powers = np.arange(3.0, 3.0 + len(self.higher_terms))
+        factors = (np.ones(len(powers)), powers, powers * (powers - 1.0))[derivative]
+        for coefficient in (factors[:, None] * self.higher_terms)[::-1]:  # Horner's scheme, without pow()
+            out = coefficient[:, None] + time * out
+        return out * (time * time * time, time * time, time)[derivative]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -324,7 +327,7 @@ def _rotation_until(motion: CameraMotion, time: FloatArray) -> tuple[FloatArray,
         a = (motion.rate / max(angle, _TINY))[:, None]
         phi = angle * time
     else:
-        twist = np.cross(motion.rate, motion.acceleration) / 12.0
+        twist = cross_product(motion.rate, motion.acceleration) / 12.0
         parts = np.stack([motion.rate, 0.5 * motion.acceleration, twist], axis=1)
         square = time * time
         vector = parts @ np.stack([time, square, square * time]) + motion.higher(time)
