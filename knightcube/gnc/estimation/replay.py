@@ -11,8 +11,9 @@ import bisect
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -121,24 +122,50 @@ class Checkpoint:
         return self.measurement.time_ns
 
 
+class _Step(NamedTuple):
+    """A step of the propagation under one coil command, and the state and covariance after the step."""
+
+    state: FilterState
+    covariance: FloatArray
+    torquing: Torquing
+    span_ns: int
+    result: tuple[FilterState, FloatArray]
+
+
 @dataclass(frozen=True, slots=True)
 class PropagationModel:
-    """Body, process noise, coil commands, and the gate by the degrees of freedom of a measurement."""
+    """Body, process noise, coil commands, and the gate by the degrees of freedom of a measurement.
+
+    The last steps are stored, because the next measurement repeats a step of the estimate before it.
+    """
 
     body: RigidBody
     noise: ProcessNoise
     commands: CommandHistory
     longest_step: float
     gate: Mapping[int, float]
+    _steps: deque[_Step] = field(default_factory=lambda: deque(maxlen=2), compare=False)
 
     def propagate(
         self, state: FilterState, covariance: FloatArray, from_ns: int, to_ns: int
     ) -> tuple[FilterState, FloatArray]:
         """Return state and covariance propagated between two times under the recorded coil commands."""
         for torquing, span_ns in self.commands.spans(from_ns, to_ns):
-            state, covariance = propagate(
-                self.body, self.noise, state, covariance, torquing, span_ns * 1e-9, self.longest_step
-            )
+            for step in self._steps:
+                if (
+                    step.covariance is covariance
+                    and step.state is state
+                    and step.span_ns == span_ns
+                    and step.torquing is torquing
+                ):
+                    state, covariance = step.result
+                    break
+            else:
+                result = propagate(
+                    self.body, self.noise, state, covariance, torquing, span_ns * 1e-9, self.longest_step
+                )
+                self._steps.append(_Step(state, covariance, torquing, span_ns, result))
+                state, covariance = result
         return state, covariance
 
     def estimate(self, then: Checkpoint, time_ns: int, measured_ns: int) -> Estimate:
