@@ -224,6 +224,8 @@ LEAST_RATIO = 0.1
 _CIRCLES_APART = 0.7
 # Mean number of stars per circle that are searched first, relative to the number of stars needed.
 _ENOUGH = 4.0
+# Mean number of the brightest stars within the smallest useful reach of a star, relative to the rank.
+_BRIGHTER = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,30 +255,42 @@ class TriangleIndex:
         return np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
 
 
-def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
+def reach(direction: FloatArray, rank: int, farthest: float, least: float = 0.0) -> FloatArray:
     """Return the reach of each star (n,): the chord to its `rank`-th nearest brighter star.
 
     The reach is at most `farthest`, which is also the reach of a star with fewer than `rank` brighter stars.
-    The unit vectors `direction` (n, 3) are in order of brightness, the brightest first.
+    For many of the stars with a reach below `least`, the result is zero. The unit vectors `direction` (n, 3)
+    are in order of brightness, the brightest first.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     count = len(direction)
     result = np.full(count, farthest)
+    wanted = np.arange(count)
+    # Most stars have a small reach, which the brightest stars of the sky show in little time.
+    brightest = math.ceil(4.0 * _BRIGHTER * rank / least**2) if least > 0.0 else count
+    if brightest < count:
+        near = cKDTree(direction[:brightest]).query_ball_point(
+            direction[brightest:], least * (1.0 - TIE), return_length=True
+        )
+        result[brightest:][near >= rank] = 0.0
+        wanted = np.flatnonzero(result)
     begin = 0
     while begin < count:
         end = min(max(2 * begin, 4 * rank), count)
+        stars = wanted[np.searchsorted(wanted, begin) : np.searchsorted(wanted, end)]
         # About half of a star's neighbours are brighter, so that 4 x `rank` neighbours contain enough.
         neighbours = min(4 * rank, end)
-        distance, number = cKDTree(direction[:end]).query(direction[begin:end], neighbours)
-        brighter = number < np.arange(begin, end)[:, None]
-        order = np.cumsum(brighter, axis=1)
+        distance, number = cKDTree(direction[:end]).query(
+            direction[stars], neighbours, distance_upper_bound=farthest * (1.0 + TIE)
+        )
+        order = np.cumsum(number < stars[:, None], axis=1)
         enough = order[:, -1] >= rank
         column = np.where(enough, np.argmax(order >= rank, axis=1), neighbours - 1)
-        found = distance[np.arange(end - begin), column]
+        found = distance[np.arange(len(stars)), column]
         if neighbours == end:
             found[~enough] = farthest
-        result[begin:end] = np.minimum(found, farthest)
+        result[stars] = np.minimum(found, farthest)
         begin = end
     return result
 
@@ -295,7 +309,7 @@ def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, f
     found = [np.sort(_band(direction, *band), axis=1) for band in bands]
     if few >= 3:
         found += [_of_circles(direction, sizes[0], radius, few) for radius in sizes[:-1]]
-    return _indexed(direction, np.unique(np.concatenate(found), axis=0))
+    return _indexed(direction, _distinct(np.concatenate(found)))
 
 
 def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int) -> IntArray:
@@ -313,16 +327,24 @@ def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int)
     for count in sorted({brightest, len(direction)}):
         stars = direction[:count]
         poor = np.flatnonzero(chosen[:, -1] == len(direction))
-        for circle, inside in zip(poor, cKDTree(stars).query_ball_point(centres[poor], radius), strict=True):
-            first = np.sort(inside)[:few]
-            chosen[circle, : len(first)] = first
+        inside = cKDTree(stars).query_ball_point(centres[poor], radius, return_sorted=True)
+        for circle, numbers in zip(poor, inside, strict=True):
+            chosen[circle, : len(numbers)] = numbers[:few]
     one, two, three = np.array(list(combinations(range(few), 3))).T
     corners = np.stack([chosen[:, one], chosen[:, two], chosen[:, three]], axis=-1).reshape(-1, 3)
-    corners = np.unique(corners[corners[:, 2] < len(direction)], axis=0)
+    corners = _distinct(corners[corners[:, 2] < len(direction)])
     place = direction[corners]
     side = np.linalg.norm(place - np.roll(place, 1, axis=1), axis=-1)
     longest = side.max(axis=1)
     return np.asarray(corners[(longest >= smallest) & (side.min(axis=1) >= LEAST_RATIO * longest)])
+
+
+def _distinct(corners: IntArray) -> IntArray:
+    """Return the distinct rows of triangles (m, 3) in ascending order; an index holds at most 2^16 stars."""
+    one, two, three = corners.T
+    packed = np.sort((one << 32) + (two << 16) + three)
+    packed = packed[np.diff(packed, prepend=-1) > 0]
+    return np.stack([packed >> 32, (packed >> 16) & 0xFFFF, packed & 0xFFFF], axis=-1)
 
 
 def evenly_spread(count: int) -> FloatArray:
@@ -341,7 +363,7 @@ def _band(direction: FloatArray, smallest: float, largest: float, rank: int) -> 
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
-    limit = reach(direction, rank, largest)
+    limit = reach(direction, rank, largest, smallest)
     able = np.flatnonzero(limit >= smallest)
     # Stars are sorted by reach, so that each triangle is found once, from the star with the smallest reach.
     able = able[np.argsort(-limit[able], kind="stable")]

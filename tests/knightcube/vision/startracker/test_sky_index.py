@@ -44,6 +44,17 @@ def test_the_reach_of_a_star_is_the_distance_of_its_nth_brighter_neighbour() -> 
         assert np.isclose(found[star], min(expected, 0.9)), star
 
 
+def test_only_a_reach_below_the_useful_one_is_left_out() -> None:
+    """Half of the stars are strewn and half are beside each other, where the brightest are many or few."""
+    near = np.array([0.0, 0.0, 1.0]) + 0.05 * _strewn(2000, 2)
+    both = np.concatenate([near / np.linalg.norm(near, axis=-1, keepdims=True), _strewn(2000)])
+    direction = np.random.default_rng(3).permutation(both)
+    whole, useful = reach(direction, 5, 0.9), reach(direction, 5, 0.9, 0.5)
+    assert (useful[whole >= 0.5] == whole[whole >= 0.5]).all()
+    assert (useful[whole < 0.5] < 0.5).all()
+    assert np.mean(useful == 0.0) > 0.5, "the choice saves no time"
+
+
 def test_the_triangles_are_those_of_enumeration() -> None:
     direction = _strewn(60)
     sizes, ranks = np.array([0.3, 0.5, 0.9]), np.array([4, 6])
