@@ -6,13 +6,16 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flight.link.telemetry.log import DISK_TROUBLE, FlightLog, begin_run, find_runs, open_segment
-from flight.loop.flight_loop import FlightEnding
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.interfaces.wires import SECOND_NS, Rig
 from knightcube.errors import UsageError
+
+if TYPE_CHECKING:  # most commands that use this module do not need the flight loop, which is slow to load
+    from flight.loop.flight_loop import FlightEnding
 
 
 @dataclass(frozen=True, slots=True)

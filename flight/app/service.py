@@ -49,7 +49,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -60,7 +60,6 @@ from flight.link.events import EventKind
 from flight.link.regular_files import line_of, read_regular, to_record
 from flight.link.telemetry.log import Recorder
 from flight.loop.facts import EventLog
-from flight.loop.flight_loop import FlightLoop
 from flight.loop.state import LARGEST_FILE, LinuxFiles, replace_file, service_folder
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError, UnreadConfigError, checked_length, no_such_file, read_text
@@ -74,6 +73,9 @@ from hal.interfaces.errors import DeviceError
 from hal.interfaces.guardian import CoilGuardian, GuardianNews, Overseer
 from hal.interfaces.wires import SECOND_NS, Clock, Rig, Ticker
 from knightcube.errors import FlightError, UsageError
+
+if TYPE_CHECKING:  # see `flight.app.run`
+    from flight.loop.flight_loop import FlightLoop
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 30.0
 _MEAL_NS = 200_000_000

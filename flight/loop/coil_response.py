@@ -606,7 +606,7 @@ class GainEquations(NamedTuple):
         gains = (covariance @ right[:, :, None])[:, :, 0]
         # The squares of the expected gains are 1, so the prior adds the sum of the weights.
         costs = self.constant + weights.sum(axis=1) - (right * gains).sum(axis=1)
-        return GainFits(gains, covariance.diagonal(axis1=1, axis2=2), costs)
+        return GainFits(gains, np.asarray(covariance.diagonal(axis1=1, axis2=2), dtype=np.float64), costs)
 
 
 LONGEST_REST_NS = 600_000_000_000

@@ -18,12 +18,11 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flight.app.cli.run import counts_text, summary_facts
 from flight.app.devices import linux_camera, unit_settings
 from flight.app.run import RunRequest, RunResult
-from flight.loop.flight_loop import FlightEnding
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera, structure_mask
 from flight.schema.document import ConfigError, config_path, merged_text, names, read_document
@@ -37,6 +36,9 @@ from hal.drivers.pca9685 import MODE1
 from hal.drivers.vn100.driver import Vn100
 from hal.interfaces.errors import DeviceError, NotResponding
 from knightcube.errors import UsageError
+
+if TYPE_CHECKING:  # see `flight.app.run`
+    from flight.loop.flight_loop import FlightEnding
 
 _CHIP_CURE = "check power, wiring and address; `i2cdetect -y` lists the chips that answer"
 _LISTENED_NS = 2_500_000_000

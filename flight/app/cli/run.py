@@ -9,13 +9,15 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from flight.app.cli import PROGRAM
 from flight.app.run import RunRequest, RunResult
-from flight.loop.flight_loop import FlightEnding, FlightProgress
 from flight.schema.document import config_path, names
 from knightcube.errors import FlightError
+
+if TYPE_CHECKING:  # see `flight.app.run`
+    from flight.loop.flight_loop import FlightEnding, FlightProgress
 
 
 def summary_text(result: RunResult, elapsed: float) -> str:
