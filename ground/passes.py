@@ -25,6 +25,7 @@ from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, terrestrial_time
 from knightcube.astro.earth.sun import DAY, earth_from_sun, julian_date, sunlit_share
 from knightcube.errors import UsageError
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 _SEARCH_S = 3600.0
 """Time (s) by which the search extends beyond the span, so that a pass at its edge is complete."""
@@ -32,6 +33,8 @@ _STEP_S = 10.0
 """Interval (s) between computed positions; begin and end of an eclipse are interpolated."""
 _SPEED = 7.6e3
 """Typical speed (m/s) in a low orbit, which converts an along-track error to a timing error."""
+LEAD_S = 120.0
+"""Default time (s) between the command to point to the station and the rise, for the slew."""
 _RISE, _CULMINATION, _SET = range(3)
 """Codes of the events of `EarthSatellite.find_events`."""
 
@@ -52,6 +55,12 @@ class Station(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     longitude_deg: Annotated[float, Meta(ge=-180.0, le=360.0)]
     height: Annotated[float, Meta(ge=-500.0, le=9000.0)] = 0.0
     mask_deg: Annotated[float, Meta(ge=0.0, lt=90.0)] = 5.0
+
+    @property
+    def text(self) -> str:
+        """The station as the text that `station_of` reads."""
+        numbers = (self.latitude_deg, self.longitude_deg, self.height, self.mask_deg)
+        return ",".join([self.name.replace(",", " "), *(f"{number:g}" for number in numbers)])
 
     def on_earth(self) -> GeographicPosition:
         """Return the position of the station for Skyfield."""
@@ -87,6 +96,29 @@ class Pass:
     range: float
     sunlit: float
     sun_elevation_deg: float
+
+
+def facts_of(one: Pass) -> dict[str, object]:
+    """Return a pass as JSON data."""
+    return {
+        "station": one.station.name,
+        **{f"{name}_utc": getattr(one, name).isoformat() for name in ("rise", "top", "set")},
+        "azimuths_deg": list(one.azimuths_deg),
+        "elevation_deg": one.elevation_deg,
+        "range_m": one.range,
+        "sunlit": one.sunlit,
+        "sun_elevation_deg": one.sun_elevation_deg,
+    }
+
+
+def scheduled_targets(one: Pass, lead: float = LEAD_S) -> list[tuple[datetime, PointingTarget]]:
+    """Return UTC and pointing target of the commands for a pass: to the station, and back to nadir.
+
+    The first command is due `lead` s before the rise.
+    """
+    place = (math.radians(one.station.latitude_deg), math.radians(one.station.longitude_deg))
+    begin = one.rise - timedelta(seconds=lead)
+    return [(begin, PointingTarget(Goal.GROUND, place)), (one.set, PointingTarget(Goal.NADIR))]
 
 
 def read_stations(path: Path) -> tuple[Station, ...]:

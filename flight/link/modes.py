@@ -50,5 +50,8 @@ POINTING = frozenset({Mode.SUN, Mode.POINT})
 ORBITAL = POINTING | {Mode.ACQUIRE}
 """Modes that exist only on a satellite in orbit, which must first acquire its attitude."""
 
-STEERING = POINTING | {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO}
+TESTBED = frozenset({Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO})
+"""Modes that exist only on a testbed."""
+
+STEERING = POINTING | TESTBED
 """Modes in which the planner and the controller steer the attitude."""

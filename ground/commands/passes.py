@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from ground.commands.elements import read_file
 from ground.commands.options import finite, positive, utc
 from ground.report.text import number, table
 from knightcube.errors import FlightError, UsageError
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal
 
 if TYPE_CHECKING:
     from ground.passes import OrbitPrediction, Pass, Station
@@ -97,12 +98,17 @@ def _add_orbit(parser: argparse.ArgumentParser) -> None:
 def run_passes(options: argparse.Namespace) -> int:
     """Predict the passes and print them."""
     prediction, stations, _ = _prediction(options)
+    from ground.passes import facts_of, scheduled_targets  # noqa: PLC0415
+
     found = prediction.passes(stations)
     if options.json:
-        facts = {"timing_error_s": prediction.timing_error_s, "passes": [_facts(one) for one in found]}
+        facts = {"timing_error_s": prediction.timing_error_s, "passes": [facts_of(one) for one in found]}
         sys.stdout.write(json.dumps(facts) + "\n")
     elif options.schedule:
-        sys.stdout.writelines(f"{line}\n" for one in found for line in _commands(one, options.lead))
+        for one in found:
+            for at, target in scheduled_targets(one, options.lead):
+                words = "point nadir" if target.goal is Goal.NADIR else f"point ground {_place(one.station)}"
+                sys.stdout.write(f"schedule {at:%Y-%m-%dT%H:%M:%S} {words}\n")
     else:
         sys.stdout.write("\n".join(_lines(found)) + "\n" if found else "no pass\n")
     return 0 if found else 1
@@ -184,23 +190,5 @@ def _lines(found: list[Pass]) -> list[str]:
     return [*table(head, rows), note]
 
 
-def _commands(one: Pass, lead: float) -> list[str]:
-    """Return the scheduled commands that point to the station during a pass, and back to nadir."""
-    place = f"{one.station.latitude_deg:g} {one.station.longitude_deg:g}"
-    begin = one.rise - timedelta(seconds=lead)
-    return [
-        f"schedule {begin:%Y-%m-%dT%H:%M:%S} point ground {place}",
-        f"schedule {one.set:%Y-%m-%dT%H:%M:%S} point nadir",
-    ]
-
-
-def _facts(one: Pass) -> dict[str, object]:
-    return {
-        "station": one.station.name,
-        **{f"{name}_utc": getattr(one, name).isoformat() for name in ("rise", "top", "set")},
-        "azimuths_deg": list(one.azimuths_deg),
-        "elevation_deg": one.elevation_deg,
-        "range_m": one.range,
-        "sunlit": one.sunlit,
-        "sun_elevation_deg": one.sun_elevation_deg,
-    }
+def _place(station: Station) -> str:
+    return f"{station.latitude_deg:g} {station.longitude_deg:g}"

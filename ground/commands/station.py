@@ -17,6 +17,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from flight.app.service import EndingSignals
+from flight.link.files.store import files_folder
 from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_runs
 from ground.commands.options import positive
@@ -270,6 +271,14 @@ def configure_console(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="kept frames of the camera (default those of RUN; with --link as received by `files`)",
     )
+    parser.add_argument(
+        "--station",
+        action="append",
+        default=[],
+        metavar="NAME,LAT,LON[,HEIGHT[,MASK]]",
+        help="a ground station of the panel of passes, as for `passes`; may be repeated",
+    )
+    parser.add_argument("--stations", type=Path, metavar="FILE", help="YAML file with a list `stations`")
     text = "port of the page, 0 for any (default %(default)s)"
     parser.add_argument("--port", type=int, default=PORT, metavar="N", help=text)
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
@@ -309,18 +318,24 @@ def _print(text: str) -> None:
 def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
     """Return the console that the options describe. Its resources are closed by `stack`."""
     from ground.console.commanding import CommandForms, LinkFeed, by_socket, flying  # noqa: PLC0415
+    from ground.console.files import LinkFiles, RunFiles  # noqa: PLC0415
     from ground.console.history import History  # noqa: PLC0415
     from ground.console.server import Console  # noqa: PLC0415
     from ground.console.surroundings import UNKNOWN, FlightSurroundings, FrameFolder  # noqa: PLC0415
     from ground.xtce import TELECOMMANDS  # noqa: PLC0415
 
     history = stack.enter_context(History())
+    stations = _stations(options)
     if options.link is not None:
         feed = LinkFeed(terminal_of(options))
         stack.callback(feed.close)
         place = UNKNOWN if options.config is None else FlightSurroundings.of(options.config)
         by_link = CommandForms(feed.send, TELECOMMANDS)
-        return Console(options.link, feed, history, place, by_link, frames=FrameFolder(options.frames))
+        files = LinkFiles(feed, files_folder(options.keys))
+        kept = FrameFolder(options.frames)
+        return Console(
+            options.link, feed, history, place, by_link, frames=kept, files=files, stations=stations
+        )
     to = options.to
     if options.fly is not None:
         to = stack.enter_context(flying(options.fly, options.run))
@@ -330,7 +345,26 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
     forms = CommandForms(by_socket(to) if to else None)
     place = FlightSurroundings.of(folder / "config.yaml")
     frames = FrameFolder(options.frames or folder / images.KEPT_FRAMES_FOLDER)
-    return Console(folder.name, LogTail(folder), history, place, forms, frames=frames)
+    return Console(
+        folder.name,
+        LogTail(folder),
+        history,
+        place,
+        forms,
+        frames=frames,
+        files=RunFiles(folder),
+        stations=stations,
+    )
+
+
+def _stations(options: argparse.Namespace) -> tuple[str, ...]:
+    """Return the ground stations of the options as texts. Raises UsageError for an invalid station."""
+    if not options.station and options.stations is None:
+        return ()
+    from ground.passes import read_stations, station_of  # noqa: PLC0415 - Skyfield is large
+
+    given = tuple(map(station_of, options.station))
+    return tuple(one.text for one in given + (read_stations(options.stations) if options.stations else ()))
 
 
 def _listening(port: int) -> socket.socket:

@@ -19,10 +19,13 @@ import numpy as np
 
 from flight.app.run import utc_ns
 from flight.link import commands
-from flight.link.commands import LAYOUTS, LOAD_PARAMETERS, CommandError, CommandPacker, Ping
+from flight.link.commands import CLEAR, LAYOUTS, LOAD_PARAMETERS, MODE, CommandError, CommandPacker, Ping
+from flight.link.events import EVENTS
+from flight.link.files.store import Store
+from flight.link.modes import Mode
 from flight.link.process import directives
-from flight.link.process.commanding import Report, Stage
-from flight.link.process.directives import LIST
+from flight.link.process.commanding import Report, Stage, utc_of
+from flight.link.process.directives import LIST, SCHEDULE
 from flight.link.process.downlink import LIVE
 from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
 from flight.link.telemetry.definitions import VERIFICATION, Field, crc_of
@@ -31,8 +34,9 @@ from flight.link.telemetry.packets import Layout, Packer, PacketArray, Telemetry
 from flight.schema.document import merged_text, read_text
 from flight.schema.reader import parse
 from flight.schema.sections import Commands
+from ground.console.description import Body, commands_for, foreign_modes, layouts_for
 from ground.console.history import values
-from ground.link.commanding import exchange, explained, obeyed
+from ground.link.commanding import FileSession, exchange, explained, obeyed
 from ground.link.terminal import Terminal, report_of
 from ground.telemetry import decode, scan
 from knightcube.errors import FlightError, UsageError
@@ -75,15 +79,23 @@ class CommandForms:
     """Sender of commands, which packs the values of the page's forms into command packets."""
 
     def __init__(self, send: Send | None, layouts: Mapping[str, Layout] = LAYOUTS) -> None:
-        """Accept the commands of `layouts`; without `send` the console is read-only."""
+        """Accept the commands of `layouts`; without `send` the console is read-only.
+
+        The attribute `body` is the kind of body, whose commands alone are accepted, or None if unknown.
+        """
         self._send = send
-        self.layouts = layouts
+        self._layouts = layouts
+        self.body: Body | None = None
         self._packer = Packer(dict(layouts))
 
     @property
     def possible(self) -> bool:
         """Whether the console can send commands."""
         return self._send is not None
+
+    def table(self) -> list[Object]:
+        """Return the commands that the body can obey, each with the inputs of its form."""
+        return commands_for(self.body, self._layouts)
 
     def text(self, name: str, given: Object) -> str:
         """Return a command as text for its confirmation. Raises UsageError for invalid values."""
@@ -96,9 +108,10 @@ class CommandForms:
         return self._send(self._pack(name, given))
 
     def _pack(self, name: str, given: Object) -> bytes:
-        if name not in self.layouts:
-            raise UsageError(f"{name}: no such command: {', '.join(self.layouts)}")
-        packet = self.layouts[name].packet
+        layouts = layouts_for(self.body, self._layouts)
+        if name not in layouts:
+            raise UsageError(f"{name}: no such command: {', '.join(layouts)}")
+        packet = layouts[name].packet
         unknown = sorted(set(given) - {field.name for field in packet.fields})
         if unknown:
             raise UsageError(f"{name}: no such value: {', '.join(unknown)}")
@@ -110,9 +123,24 @@ class CommandForms:
         try:
             data = self._packer.pack(packet, utc_ns(), fields)
             _text_of(data)
+            self._check(name, fields)
         except (TelemetryError, CommandError) as error:
             raise UsageError(str(error)) from error
         return data
+
+    def _check(self, name: str, fields: Object) -> None:
+        """Raise UsageError or CommandError for values that this body or the satellite's schedule refuses."""
+        if name == MODE.name and (mode := Mode(fields["mode"])) in foreign_modes(self.body):
+            raise UsageError(f"mode {mode.label}: this body has no such mode")
+        if name == CLEAR.name and fields["event"] not in {kind.name for kind in EVENTS}:
+            raise UsageError(f"clear: {fields['event']!r} is not the name of an event")
+        if name == SCHEDULE.name:
+            if utc_of(fields["at"]) <= utc_ns():
+                raise UsageError(f"schedule: {fields['at']} has passed")
+            command = commands.command_of_words(fields["words"])
+            if command.packet.name not in layouts_for(self.body, self._layouts):
+                raise UsageError(f"schedule: this body does not obey {command.packet.name}")
+            self._check(command.packet.name, command.fields)
 
 
 def _text_of(data: bytes) -> str:
@@ -123,10 +151,23 @@ def _text_of(data: bytes) -> str:
 
 def _value(name: str, field: Field, given: Any) -> Any:
     """Return a field's value. An empty number is NaN in a field that can hold NaN. Raises UsageError."""
+    if field.count > 1 and isinstance(given, str):
+        return _bytes(name, field, given)
     if field.count > 1:
         items = list(given) if isinstance(given, list) else [given] if given is not None else []
         return [_number(name, field, item) for item in [*items, *[None] * field.count][: field.count]]
     return str(given or "") if field.kind.startswith("S") else _number(name, field, given)
+
+
+def _bytes(name: str, field: Field, given: str) -> list[int]:
+    """Return the bytes of a field from hexadecimal digits. Raises UsageError."""
+    try:
+        found = bytes.fromhex(given)
+    except ValueError:
+        found = b""
+    if len(found) != field.count:
+        raise UsageError(f"{name}: {field.name} needs {2 * field.count} hexadecimal digits: {field.meaning}")
+    return list(found)
 
 
 def _number(name: str, field: Field, given: Any) -> float | int:
@@ -145,12 +186,14 @@ def _number(name: str, field: Field, given: Any) -> float | int:
 class LinkFeed:
     """Live telemetry and commands over a link. One thread calls `new`, and other threads may call `send`.
 
-    Playback is not shown, because its packets are older than the live packets.
+    Playback is not shown, because its packets are older than the live packets. The attribute `lock` protects
+    the terminal and an open file session.
     """
 
     def __init__(self, terminal: Terminal) -> None:
         self._terminal = terminal
-        self._lock = threading.Lock()
+        self.lock = threading.Lock()
+        self._session: FileSession | None = None
         self._packer = CommandPacker()
         self._reports: dict[int, list[Report]] = {}
         self._received = time.monotonic()
@@ -163,12 +206,16 @@ class LinkFeed:
 
     def new(self) -> dict[str, PacketArray]:
         """Return the packets by name received since the last call. Raises FlightError."""
-        with self._lock:
+        with self.lock:
             now = time.monotonic()
             if now - max(self._received, self._asked) > _PING_AFTER_S or self._asked < 0.0:
                 self._asked = now
                 self._terminal.send(self._packer.pack(Ping(), utc_ns()), _SPI)
-            live = [packet for channel, packet in self._terminal.packets(_LISTEN_S) if channel == LIVE]
+            packets = list(self._terminal.packets(_LISTEN_S))
+            if self._session is not None:
+                self._session.take(packets, time.monotonic_ns())
+                self._session.transmit(time.monotonic_ns())
+            live = [packet for channel, packet in packets if channel == LIVE]
         if live:
             self._received = time.monotonic()
         found = scan(b"".join(live)).packets
@@ -184,7 +231,7 @@ class LinkFeed:
 
     def send(self, packet: bytes) -> Object:
         """Send a command and return its state after acceptance. Raises FlightError if no report arrives."""
-        with self._lock:
+        with self.lock:
             counter = self._terminal.send(packet, _SPI)
         until = time.monotonic() + _ANSWER_S
         while time.monotonic() < until:
@@ -196,6 +243,19 @@ class LinkFeed:
                 return {"obeyed": int(obeyed(reports)), "text": text, "counter": counter}
             time.sleep(0.02)
         raise FlightError(f"no answer over the link within {_ANSWER_S:g} s")
+
+    @contextlib.contextmanager
+    def transferring(self, store: Store, rate: float) -> Iterator[FileSession]:
+        """Yield a session of file transfers, to which `new` passes the packets. Raises FlightError."""
+        with self.lock:
+            session = FileSession(self._terminal, store, _SPI, rate, time.monotonic_ns())
+            self._session = session
+        try:
+            yield session
+        finally:
+            with self.lock:
+                self._session = None
+                session.close(time.monotonic_ns())
 
     def close(self) -> None:
         """Store the frame counters and close the line."""

@@ -19,17 +19,22 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from aiohttp import WSMsgType, web
 
-from flight.link.telemetry.definitions import LINK, TRANSFER, VERIFICATION
+from flight.link.commands import Point, words_of
+from flight.link.process.directives import KINDS
+from flight.link.telemetry.definitions import CONTROL, LINK, NAVIGATION, SPIN, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
 from ground.console.commanding import CommandForms
+from ground.console.description import Body, add_components, endings
+from ground.console.files import Files
 from ground.console.history import MAX_TIME, History, PageCursor, PageState
 from ground.console.surroundings import FlightSurroundings, FrameFolder
-from ground.documentation import command_table, database
+from ground.documentation import database
 from knightcube.errors import FlightError, UsageError
 
 PAGE = Path(__file__).parent / "page"
@@ -38,12 +43,19 @@ NO_ACCESS = "open the newest address that `knightcube console` printed: the page
 _READ_S = 0.1
 """Time (s) between two reads of new packets."""
 _MAX_POINTS = 4000
+_MOST_EXPORTED = 1_000_000
 _MAX_DIGITS = 18
 _MAX_PATH = 200
 _RANDOM_BYTES = 32
 _OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?")
 _OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name})
 """Packet types of the link process, which are received even if the flight process is silent."""
+_BODY_OF: dict[str, Body] = {CONTROL.name: "testbed", NAVIGATION.name: "orbit", SPIN.name: "orbit"}
+"""Packet types that only one kind of body sends."""
+_MOST_UPLOAD = 1 << 24
+"""Largest size (bytes) of a file that the page puts on the satellite."""
+_MOST_STATIONS = 20
+_MOST_DAYS = 7.0
 _T = TypeVar("_T")
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -82,6 +94,8 @@ class Console:
         flight_received: monotonic time of the last packet of the flight itself, s.
         frames: camera frames that the flight has kept.
         trouble: reason why the last read failed, or an empty text.
+        files: files of the satellite, or None if they are not known.
+        stations: ground stations of the panel of passes, before the operator enters others.
         settled_ns: newest time (ns) of which all packets have been received, which the live page shows.
         sockets: open WebSockets.
     """
@@ -94,9 +108,21 @@ class Console:
     utc_ns: int | None = None
     flight_received: float = field(default_factory=time.monotonic)
     frames: FrameFolder = field(default_factory=lambda: FrameFolder(None))
+    files: Files | None = None
+    stations: tuple[str, ...] = ()
     trouble: str = ""
     settled_ns: int = 0
     sockets: set[web.WebSocketResponse] = field(default_factory=set)
+
+    @property
+    def body(self) -> Body | None:
+        """Kind of body, from the configuration or else from the packets; None while unknown."""
+        if self.surroundings.body is not None:
+            return self.surroundings.body
+        for name, body in _BODY_OF.items():
+            if self.history.count(name, self.history.span_ns[1]):
+                return body
+        return None
 
     def read(self) -> None:
         """Read the new packets. A failure is stored in `trouble`, and the next read tries again."""
@@ -115,6 +141,7 @@ class Console:
             self.flight_received = time.monotonic()
         if len(packets["run"]):
             self.utc_ns = int(packets["run"]["utc_ns"][-1])
+        self.forms.body = self.body
 
 
 class Access:
@@ -184,7 +211,7 @@ def application(console: Console, access: Access) -> web.Application:
         response.set_cookie(name, session, httponly=True, samesite="Strict")
         return response
 
-    app = web.Application(middlewares=[only_own_page, _errors_as_json])
+    app = web.Application(middlewares=[only_own_page, _errors_as_json], client_max_size=_MOST_UPLOAD)
     app.on_response_prepare.append(_add_headers)
     pages = _Pages(console)
     app.add_routes(
@@ -196,6 +223,10 @@ def application(console: Console, access: Access) -> web.Application:
             web.get("/api/live", pages.live),
             web.get("/api/frame", pages.frame),
             web.get("/api/frame.png", pages.picture),
+            web.get("/api/passes", pages.passes),
+            web.get("/api/files", pages.files),
+            web.get("/api/file", pages.file),
+            web.post("/api/file", pages.put),
             web.post("/api/words", pages.words),
             web.post("/api/command", pages.command),
             web.static("/page", PAGE),
@@ -255,8 +286,15 @@ class _Pages:
         console = self._console
         return web.json_response(
             {
-                "packets": database()["packets"],
-                "commands": command_table(console.forms.layouts),
+                "packets": add_components(database()["packets"]),
+                "commands": console.forms.table(),
+                "endings": endings(),
+                "body": console.body,
+                "stations": list(console.stations),
+                "files": console.files is not None,
+                "puts": [] if console.files is None or not console.files.puts else list(KINDS),
+                "resistance": list(console.surroundings.resistance),
+                "currents": console.surroundings.currents,
                 "commanding": console.forms.possible,
                 "name": console.name,
                 "camera": console.surroundings.camera,
@@ -267,7 +305,10 @@ class _Pages:
         )
 
     async def series(self, request: web.Request) -> web.StreamResponse:
-        """Answer the query ?packet=&field=&component=&from=&to= (s) &points= with a field over time."""
+        """Answer the query ?packet=&field=&component=&from=&to= (s) &points= with a field over time.
+
+        With points=0 the answer has every value in the span, up to a million.
+        """
         name, column = request.query.get("packet", ""), request.query.get("field", "")
         if name not in LAYOUTS or column not in (LAYOUTS[name].dtype.names or ()):
             raise UsageError(f"{name}.{column}: no such field")
@@ -276,7 +317,8 @@ class _Pages:
         if columns.kind == "S" or not 0 <= component < max(columns.shape or (1,)):
             raise UsageError(f"{name}.{column}[{component}]: no such component")
         span = (int(_real(request, "from") * 1e9), int(_real(request, "to") * 1e9))
-        points = min(max(_whole(request, "points", 1000), 2), _MAX_POINTS)
+        points = _whole(request, "points", 1000)
+        points = min(max(points, 2), _MAX_POINTS) if points else _MOST_EXPORTED
         times, values = await asyncio.to_thread(
             self._console.history.series, name, column, component, span, points
         )
@@ -305,10 +347,54 @@ class _Pages:
     async def _drawn(self, make: Callable[[int], _T], sequence: int) -> _T:
         return await asyncio.get_running_loop().run_in_executor(self._drawing, make, sequence)
 
+    async def passes(self, request: web.Request) -> web.StreamResponse:
+        """Answer the query ?at= (s) &days= &station= with passes and their scheduled commands."""
+        stations = request.query.getall("station", [])
+        if len(stations) > _MOST_STATIONS:
+            raise UsageError(f"{len(stations)} stations: give at most {_MOST_STATIONS}")
+        at, days, lines = (
+            self._utc(_real(request, "at")),
+            _real(request, "days"),
+            self._console.surroundings.lines,
+        )
+        if lines is None or at is None:
+            raise UsageError(
+                "the orbit is not known: passes need two-line elements and the time of the flight"
+            )
+        if not 0.0 < days <= _MOST_DAYS:
+            raise UsageError(f"days = {days:g}: give up to {_MOST_DAYS:g} days")
+        begin = datetime.fromtimestamp(at * 1e-9, UTC)
+        return web.json_response(await asyncio.to_thread(_predicted, lines, begin, days, stations))
+
+    async def files(self, _: web.Request) -> web.StreamResponse:
+        """Answer with the list of the satellite's files."""
+        return web.json_response(await asyncio.to_thread(self._files.listing))
+
+    async def file(self, request: web.Request) -> web.StreamResponse:
+        """Answer the query ?name= with the content of a file, after it was received from the satellite."""
+        path = await asyncio.to_thread(self._files.get, request.query.get("name", ""))
+        name = re.sub(r"[^A-Za-z0-9_.+-]", "_", path.name)
+        return web.FileResponse(path, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+    async def put(self, request: web.Request) -> web.StreamResponse:
+        """Put the body of the request on the satellite, as the file ?kind=&name=."""
+        kind, name = request.query.get("kind", ""), request.query.get("name", "")
+        data = await request.read()
+        return web.json_response(await asyncio.to_thread(self._files.put, kind, name, data))
+
+    @property
+    def _files(self) -> Files:
+        if self._console.files is None:
+            raise UsageError("the files of this flight are not known")
+        return self._console.files
+
     async def words(self, request: web.Request) -> web.StreamResponse:
-        """Answer with the text of a command for confirmation before the command is sent."""
+        """Answer with the text of a command for its confirmation, or with the reason why it is refused."""
         name, given = await _command_of(request)
-        return web.json_response({"words": self._console.forms.text(name, given)})
+        try:
+            return web.json_response({"words": self._console.forms.text(name, given)})
+        except UsageError as error:  # a usual answer while a form is being filled
+            return web.json_response({"error": str(error)})
 
     async def command(self, request: web.Request) -> web.StreamResponse:
         """Send a command to the flight, and answer with the result of the command."""
@@ -351,6 +437,7 @@ class _Pages:
             "flight_silence": time.monotonic() - console.flight_received,
             "trouble": console.trouble,
             "utc_ns": utc,
+            "body": console.forms.body,
             "surroundings": None if utc is None else console.surroundings.at(utc),
             **state.at(at_ns, LAYOUTS),
         }
@@ -358,6 +445,25 @@ class _Pages:
     def _utc(self, seconds: float) -> int | None:
         start = self._console.utc_ns
         return None if start is None else start + int(seconds * 1e9)
+
+
+def _predicted(lines: tuple[str, str], begin: datetime, days: float, stations: list[str]) -> dict[str, Any]:
+    """Return the passes over stations, each with its scheduled commands: UTC, words to send, text to read."""
+    from ground.passes import OrbitPrediction, facts_of, scheduled_targets, station_of  # noqa: PLC0415 - large
+
+    prediction = OrbitPrediction(lines, begin, days)
+    found = []
+    for one in prediction.passes([station_of(text) for text in stations]):
+        schedule = [
+            {
+                "at": f"{at:%Y-%m-%dT%H:%M:%S}",
+                "words": words_of(Point(target)),
+                "text": f"point {target.text}",
+            }
+            for at, target in scheduled_targets(one)
+        ]
+        found.append({**facts_of(one), "mask_deg": one.station.mask_deg, "schedule": schedule})
+    return {"passes": found, "timing_error_s": prediction.timing_error_s}
 
 
 async def _command_of(request: web.Request) -> tuple[str, dict[str, Any]]:

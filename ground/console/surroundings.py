@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.schema.reader import load
+from ground.console.description import Body
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.geomagnetism import field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, TwoLineElements
@@ -36,13 +37,22 @@ class FlightSurroundings:
 
     Attributes:
         elements: two-line elements, or None on a testbed or without elements in the configuration.
+        lines: text of the elements, or None.
         camera: mounting (4,) of the star camera, body into camera, and its field of view, rad.
         coil_dipole: largest dipole moment along a body axis, A m^2.
+        body: kind of body, or None if the configuration cannot be read.
+        resistance: resistance of each coil, ohm.
+        currents: currents (n, 3), A, per dipole moment along each body axis, A m^2, of a satellite with three
+            coils.
     """
 
     elements: TwoLineElements | None
     camera: tuple[list[float], float] | None
     coil_dipole: float | None = None
+    body: Body | None = None
+    resistance: tuple[float, ...] = ()
+    currents: list[list[float]] | None = None
+    lines: tuple[str, str] | None = None
 
     @classmethod
     def of(cls, path: Path) -> FlightSurroundings:
@@ -53,11 +63,16 @@ class FlightSurroundings:
             return UNKNOWN
         lines, camera, dipole = getattr(config, "elements", None), getattr(config, "camera", None), None
         view = None if camera is None else (list(camera.mounting), math.radians(camera.field_of_view_deg))
+        body: Body = "testbed"
+        currents = None
         if getattr(config, "craft", None) is not None:
-            dipole = float(config.coils.map().limits.max())
+            coils = config.coils.map()
+            body, dipole = "orbit", float(coils.limits.max())
+            currents = np.linalg.inv(coils.dipoles).tolist() if coils.dipoles.shape[1] == 3 else None
         elif (plant := getattr(config, "plant", None)) is not None:
             dipole = float(plant.coil_turns * plant.coil_area * config.coils.current_limit)
-        return cls(TwoLineElements(*lines) if lines else None, view, dipole)
+        elements = TwoLineElements(*lines) if lines else None
+        return cls(elements, view, dipole, body, config.coils.resistance, currents, lines)
 
     def at(self, utc_ns: int) -> Object | None:
         """Return position, ICRS directions (3,), and the ground points (deg) below satellite and Sun."""

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from importlib.resources import files
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -57,16 +58,28 @@ class Page:
         time, values = self.page.evaluate(both)
         return float(time), values
 
+    def fill(self, name: str, **values: str) -> None:
+        """Choose a command and fill its form, by the names of the inputs."""
+        self.page.select_option("#which", name)
+        for label, value in values.items():
+            self.fill_one(label, value)
+
+    def fill_one(self, label: str, value: str) -> None:
+        """Fill one visible input of the chosen command."""
+        place = self.page.locator(f"#inputs label:visible:has-text('{label}')").first
+        if place.locator("select").count():
+            place.locator("select").select_option(label=value)
+        else:
+            place.locator("input").fill(value)
+
     def command(self, name: str, **values: str) -> str:
         """Fill a command's form, confirm, and return the answer that the page shows."""
-        form = self.page.locator(f"form.command:has(b:text-is('{name}'))")
-        for label, value in values.items():
-            form.locator(f"label:has-text('{label}') >> css=input, select").first.fill(value)
-        form.locator("button").click()
-        self.page.wait_for_selector("dialog[open]")
+        self.fill(name, **values)
+        self.page.click("#send-form")
+        self.page.wait_for_selector("#confirm[open]")
         self.page.click("#send")
-        self.wait("document.querySelector('form.command p.answer, form.command p.error') !== null")
-        return str(form.locator("p").inner_text())
+        self.wait("['answer', 'error'].includes(document.getElementById('answer').className)")
+        return self.text("#answer")
 
 
 def missing() -> str:
@@ -82,14 +95,30 @@ def missing() -> str:
 def opened(url: str, width: int = 1600, height: int = 1150) -> Iterator[Page]:
     """Open a page of the console and yield it once it shows a time."""
     with browsing() as browser:
-        page = browser.new_page(viewport={"width": width, "height": height})
-        found = Page(page)
-        page.on("console", found.heard)
-        page.on("pageerror", found.failed)
-        page.on("request", found.asked)
-        page.goto(url)
-        found.wait("document.body.dataset.time !== undefined")
-        yield found
+        yield open_page(browser, url, width, height)
+
+
+def open_page(context: Any, url: str, width: int = 1600, height: int = 1150, theme: str = "dark") -> Page:
+    """Open a page of the console in a browser or context, and return it once it shows a time."""
+    page = context.new_page()
+    page.set_viewport_size({"width": width, "height": height})
+    page.emulate_media(color_scheme=theme)
+    found = Page(page)
+    page.on("console", found.heard)
+    page.on("pageerror", found.failed)
+    page.on("request", found.asked)
+    page.goto(url)
+    found.wait("document.body.dataset.time !== undefined")
+    return found
+
+
+def audit(page: Page) -> list[str]:
+    """Return the violations of WCAG 2.1 A and AA that axe-core finds, each with its first element."""
+    source = files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8")
+    page.page.evaluate(source)
+    rules = '["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]'
+    result = page.page.evaluate(f"axe.run(document, {{ runOnly: {rules} }})")
+    return [f"{found['id']}: {found['nodes'][0]['html']}" for found in result["violations"]]
 
 
 @contextlib.contextmanager

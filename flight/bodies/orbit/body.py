@@ -29,7 +29,7 @@ from flight.bodies.orbit.guidance import (
 from flight.bodies.orbit.learned_states import BODY, COIL_FACTORS, learned_of, start_from
 from flight.bodies.streak_methods import corner_estimator
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.modes import TESTBED, Mode
 from flight.link.telemetry.definitions import DESCRIPTION, NAVIGATION, SPIN
 from flight.loop import facts
 from flight.loop.body import BodyControl, BodyEstimation, BodyKind, ControlOutput, FlightBody, Target
@@ -300,7 +300,7 @@ class SatelliteControl(BodyControl):
         self._pauses = _pauses(config)
         paths = PointingPaths(coils.limits, fastest_rate(config))
         timed = [(step.at, step.target()) for step in config.targets]
-        self.modes = frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO}
+        self.modes = frozenset(Mode) - TESTBED
         self.dipoles = coils.dipoles
         self.free_axis = None
         self.paths = paths

@@ -1,6 +1,8 @@
-// The body in its reference frame, drawn on a canvas: a box with its axes and coils, and the directions that matter.
-const COLOURS = { sun: "#ffd75e", nadir: "#4cc38a", velocity: "#c38bff", field: "#5aa9ff", dipole: "#ff6fb1", camera: "#9fb3c8", target: "#8794a6" };
-const AXES = ["#ff7b72", "#7ee787", "#79c0ff"];
+// The body in its reference frame, drawn on a canvas: a box with its axes and coils, and directions such as that of the Sun.
+import { colour } from "/page/theme.js";
+
+const AXES = ["curve2", "curve3", "curve1"];
+const KEY_STEPS = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
 const FACES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]];
 
 // Turns v by the unit quaternion q, scalar last: a vector of body axes into reference axes.
@@ -25,9 +27,16 @@ export class Attitude {
       last = [event.clientX, event.clientY];
     };
     canvas.onpointerup = () => { last = null; };
+    canvas.onkeydown = (event) => {
+      const step = KEY_STEPS[event.key];
+      if (!step) return;
+      event.preventDefault();
+      this.azimuth += step[0];
+      this.height = Math.max(-1.5, Math.min(1.5, this.height + step[1]));
+    };
   }
 
-  // Of the testbed the thread, the body's second axis, is up; in orbit the celestial pole.
+  // Up is the thread of a testbed, the second body axis, and the celestial pole in orbit.
   seen([x, y, z]) {
     const [a, b, up] = this.table.orbit ? [x, y, z] : [z, x, y];
     const [ca, sa, ch, sh] = [Math.cos(this.azimuth), Math.sin(this.azimuth), Math.cos(this.height), Math.sin(this.height)];
@@ -44,7 +53,7 @@ export class Attitude {
     return b;
   }
 
-  // An arrow that points away from the reader lies behind the box; its name is always in front.
+  // An arrow that points away from the reader is drawn behind the box, and its name in front.
   arrows(ctx, arrows, near) {
     for (const { direction, colour, length } of arrows) {
       const tip = direction.map((part) => length * part);
@@ -84,14 +93,14 @@ export class Attitude {
     if (this.table.camera) this.camera(ctx, q);
     this.arrows(ctx, arrows, true);
     this.names(ctx, arrows);
-    if (!known) { ctx.fillStyle = "#ffb454"; ctx.font = "14px sans-serif"; ctx.fillText("attitude not known", 14, 24); }
+    if (!known) { ctx.fillStyle = colour("warn"); ctx.font = "14px sans-serif"; ctx.fillText("attitude not known", 14, 24); }
     this.legend.textContent = [words(attitude, known), ...this.sight(q, known, state.surroundings)].join(" · ");
   }
 
-  // The field is the model's where the place is known: what the coils make reaches the magnetometer too.
+  // In orbit the field is that of the model, because the magnetometer also measures the coils.
   arrowsOf({ attitude, imu }, place, q) {
     const arrows = [];
-    const add = (name, direction, length) => { if (direction) arrows.push({ name, direction, length, colour: COLOURS[name] }); };
+    const add = (name, direction, length) => { if (direction) arrows.push({ name, direction, length, colour: colour(name) }); };
     if (place) for (const name of ["sun", "nadir", "velocity"]) add(name, place[name], 1.4);
     if (place?.field_t) add("field", unit(place.field_t), 1.2);
     else if (imu && whole(imu.field)) add("field", unit(imu.field) && turned(q, unit(imu.field)), 1.2);
@@ -99,7 +108,7 @@ export class Attitude {
     return arrows;
   }
 
-  // Each coil as a ring on its face, and its dipole as a bar: at the coil's limit as long as the body is wide.
+  // Each coil is a ring on its face, and its dipole moment a bar, which has the width of the body at the limit of the coil.
   coils(ctx, q, dipole) {
     const most = this.table.coil_dipole ?? Math.max(...dipole.map(Math.abs), 1e-9);
     for (let k = 0; k < 3; k++) {
@@ -107,10 +116,10 @@ export class Attitude {
         const point = [0, 0, 0]; point[k] = 0.5; point[(k + 1) % 3] = 0.4 * Math.cos(n * Math.PI / 12); point[(k + 2) % 3] = 0.4 * Math.sin(n * Math.PI / 12);
         return this.seen(turned(q, point));
       });
-      ctx.strokeStyle = COLOURS.dipole; ctx.lineWidth = 0.8; ctx.globalAlpha = 0.45; ctx.beginPath();
+      ctx.strokeStyle = colour("dipole"); ctx.lineWidth = 0.8; ctx.globalAlpha = 0.45; ctx.beginPath();
       ring.forEach(([x, y], n) => ctx[n ? "lineTo" : "moveTo"](x, y)); ctx.stroke(); ctx.globalAlpha = 1;
       const [from, to] = [[0, 0, 0], [0, 0, 0]]; from[k] = 0.5; to[k] = 0.5 + dipole[k] / most;
-      this.line(ctx, turned(q, from), turned(q, to), COLOURS.dipole, 4);
+      this.line(ctx, turned(q, from), turned(q, to), colour("dipole"), 4);
     }
   }
 
@@ -118,15 +127,15 @@ export class Attitude {
     const names = ["x", "y", "z"];
     for (let k = 0; k < 3; k++) {
       const end = [0, 0, 0]; end[k] = 1.75;
-      const tip = this.line(ctx, [0, 0, 0], end, "#303b4a", 1);
-      ctx.fillStyle = "#5b6878"; ctx.font = "11px sans-serif"; ctx.fillText(names[k], tip[0] + 3, tip[1]);
+      const tip = this.line(ctx, [0, 0, 0], end, colour("line"), 1);
+      ctx.fillStyle = colour("dim"); ctx.font = "11px sans-serif"; ctx.fillText(names[k], tip[0] + 3, tip[1]);
     }
   }
 
   axes(ctx, q, length, ghost) {
     for (let k = 0; k < 3; k++) {
       const axis = [0, 0, 0]; axis[k] = length;
-      this.line(ctx, [0, 0, 0], turned(q, axis), ghost ? COLOURS.target : AXES[k], ghost ? 1 : 3, ghost ? [4, 4] : []);
+      this.line(ctx, [0, 0, 0], turned(q, axis), ghost ? colour("target") : colour(AXES[k]), ghost ? 1 : 3, ghost ? [4, 4] : []);
     }
   }
 
@@ -137,12 +146,12 @@ export class Attitude {
     for (const [face, k, depth] of faces) {
       const shade = 38 + 22 * (depth / 4 + 0.5);
       ctx.fillStyle = known ? `hsla(${[215, 205, 225][k >> 1]}, 35%, ${shade}%, 0.82)` : "rgba(90, 100, 112, 0.4)";
-      ctx.strokeStyle = "#0b0f14"; ctx.lineWidth = 1;
+      ctx.strokeStyle = colour("drawing"); ctx.lineWidth = 1;
       ctx.beginPath(); face.forEach((corner, n) => ctx[n ? "lineTo" : "moveTo"](seen[corner][0], seen[corner][1])); ctx.closePath(); ctx.fill(); ctx.stroke();
     }
   }
 
-  // Where the star camera looks among the stars, and how near the Sun; a testbed's frame is not the stars'.
+  // Direction of the star camera in ICRS and its angle from the Sun; the reference frame of a testbed is not ICRS.
   sight(q, known, place) {
     if (!known || !place || !this.table.camera) return [];
     const axis = turned(q, turned(this.table.camera[0], [0, 0, 1]));
@@ -156,7 +165,7 @@ export class Attitude {
     const [mounting, field] = this.table.camera;
     const [reach, half] = [1.3, Math.tan(field / 2)];
     const rim = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([a, b]) => turned(q, turned(mounting, [reach * half * a, reach * half * b, reach])));
-    rim.forEach((corner, k) => { this.line(ctx, [0, 0, 0], corner, COLOURS.camera, 1); this.line(ctx, corner, rim[(k + 1) % 4], COLOURS.camera, 1); });
+    rim.forEach((corner, k) => { this.line(ctx, [0, 0, 0], corner, colour("camera"), 1); this.line(ctx, corner, rim[(k + 1) % 4], colour("camera"), 1); });
   }
 }
 

@@ -1,14 +1,16 @@
-// The newest frame of the star camera that was kept, with the stars and objects found in it; a click on a line of the list picks one.
+// The newest kept frame of the star camera with its stars and objects; a click or Enter on a line of the list chooses a frame.
 export class KeptFrame {
   constructor(figure, list) {
     this.figure = figure;
     [this.image, this.marks, this.words] = ["img", "canvas", "figcaption"].map((name) => figure.querySelector(name));
     this.asked = null; this.picked = null;
     this.image.onload = () => this.mark();
-    list.addEventListener("click", (event) => {
+    const pick = (event) => {
       const sequence = event.target.closest("tr")?.dataset.sequence;
       if (sequence !== undefined) { this.picked = Number(sequence); this.ask(this.picked); }
-    });
+    };
+    list.addEventListener("click", pick);
+    list.addEventListener("keydown", (event) => { if (event.key === "Enter") pick(event); });
   }
   show(newest, _, __, again) {
     if (again) this.picked = null;
@@ -25,7 +27,7 @@ export class KeptFrame {
     this.figure.hidden = false;
     this.image.src = `/api/frame.png?sequence=${sequence}`;
     const rate = facts.rate_rad_s === null ? "" : `, ${(180 / Math.PI * Math.hypot(...facts.rate_rad_s)).toFixed(3)} deg/s`;
-    const objects = facts.object_points.length ? `, ${facts.object_points.length} no star` : "";
+    const objects = facts.object_points.length ? `, ${facts.object_points.length} other` : "";
     this.words.textContent = `frame ${sequence}, ${facts.exposure_s} s: ${facts.star_points.length} stars identified${objects}${rate}`;
   }
   mark() {

@@ -1,7 +1,9 @@
-// Lists that grow: events with filters, frames with what was found in them, commands and their answers.
+// Lists that grow: events with filters, frames with the results of vision, commands and their answers.
 import { beyond, label } from "/page/values.js";
 
 const MOST_ROWS = 500;
+const MOST_ITEMS = 200; // events kept of one line
+const GAP_S = 60; // longest time between events of one line
 
 function row(cells, kind = "") {
   const line = document.createElement("tr");
@@ -18,23 +20,92 @@ class Rows {
   add(line) { this.body.prepend(line); while (this.body.rows.length > MOST_ROWS) this.body.lastChild.remove(); }
 }
 
+// Events of one cause as one line with begin and end. An event that ends a condition closes the line of its begin, and
+// an event that recurs within GAP_S extends its line.
 export class Events extends Rows {
-  constructor(table, severity, filter, field) {
+  constructor(table, severity, filter, field, endings) {
     super(table);
-    this.severity = severity; this.filter = filter; this.field = field;
-    severity.onchange = filter.oninput = () => { this.body.replaceChildren(); this.kept.forEach((event) => this.list(event)); };
+    Object.assign(this, { severity, filter, field, endings, begins: new Set(Object.values(endings).flat()), open: new Map() });
+    severity.onchange = filter.oninput = () => { for (const episode of this.kept) this.hide(episode); };
   }
+
   show(_, __, listed, again) {
-    if (again) this.clear();
-    for (const event of listed.event ?? []) { this.kept.push(event); this.list(event); }
-    this.kept = this.kept.slice(-5 * MOST_ROWS);
+    if (again) { this.clear(); this.open.clear(); }
+    const touched = new Set((listed.event ?? []).map((event) => this.take(event)));
+    for (const episode of touched) this.draw(episode);
   }
-  list(event) {
-    const words = `${event.name} ${event.text}`;
-    if (event.severity < Number(this.severity.value) || !words.toLowerCase().includes(this.filter.value.toLowerCase())) return;
-    this.add(row([seconds(event), label(event.severity, this.field), `${event.name}: ${event.text}`], beyond(event.severity, this.field)));
+
+  take(event) {
+    const closed = this.closedBy(event);
+    if (closed) {
+      Object.assign(closed, { end: event.time_ns, ended: true });
+      closed.events.push(event);
+      this.open.delete(closed.key);
+      return closed;
+    }
+    const key = this.keyOf(event);
+    let episode = this.open.get(key);
+    if (!episode || (!this.begins.has(event.name) && event.time_ns - episode.end > GAP_S * 1e9)) {
+      episode = { key, name: event.name, severity: event.severity, begin: event.time_ns, count: 0, events: [], ended: false };
+      this.open.set(key, episode);
+      this.kept.push(episode);
+      if (this.kept.length > MOST_ROWS) this.kept.shift();
+    }
+    episode.end = event.time_ns;
+    episode.severity = Math.max(episode.severity, event.severity);
+    episode.count += 1 + event.suppressed;
+    episode.events.push(event);
+    if (episode.events.length > MOST_ITEMS) episode.events.splice(1, 1);
+    return episode;
+  }
+
+  // Conditions with the same events, such as those of several streams, differ in the first word of the text.
+  keyOf(event) { return this.begins.has(event.name) ? `${event.name} ${subject(event)}` : event.name; }
+
+  closedBy(event) {
+    const candidates = [...this.open.values()].filter(({ name }) => this.endings[event.name]?.includes(name));
+    return candidates.find(({ events }) => subject(events[0]) === subject(event)) ?? candidates.at(-1);
+  }
+
+  draw(episode) {
+    const { name, count, events, begin, end, ended, severity } = episode;
+    const open = !ended && this.begins.has(name);
+    const last = events.at(-1);
+    const title = `${name}${count > 1 ? ` × ${count}` : ""}: ${ended ? `${events[0].text}; ${last.name}: ${last.text}` : last.text}`;
+    const cells = [seconds({ time_ns: begin }), open ? "open" : end > begin || ended ? seconds({ time_ns: end }) : "", label(severity, this.field), title];
+    if (!episode.line) {
+      episode.line = row(cells, beyond(severity, this.field));
+      this.add(episode.line);
+    }
+    episode.line.className = open || !ended ? beyond(severity, this.field) : "";
+    cells.slice(0, 3).forEach((text, k) => { episode.line.cells[k].textContent = text; });
+    if (events.length > 1) this.unfold(episode, title); else episode.line.cells[3].textContent = title;
+    this.hide(episode);
+  }
+
+  unfold(episode, title) {
+    const cell = episode.line.cells[3];
+    let fold = cell.querySelector("details");
+    if (!fold) {
+      fold = document.createElement("details");
+      fold.append(document.createElement("summary"), document.createElement("div"));
+      fold.ontoggle = () => this.list(episode, fold);
+      cell.replaceChildren(fold);
+    }
+    fold.firstChild.textContent = title;
+    this.list(episode, fold);
+  }
+
+  list({ events }, fold) {
+    if (fold.open) fold.lastChild.replaceChildren(...events.map((event) => Object.assign(document.createElement("div"), { textContent: `${seconds(event)} ${event.name}: ${event.text}` })));
+  }
+
+  hide({ line, severity, events }) {
+    const wanted = this.filter.value.toLowerCase();
+    line.hidden = severity < Number(this.severity.value) || !events.some((event) => `${event.name} ${event.text}`.toLowerCase().includes(wanted));
   }
 }
+const subject = (event) => event.text.split(/[ :]/)[0];
 
 export class Frames extends Rows {
   show(_, __, listed, again) {
@@ -53,11 +124,12 @@ export class Frames extends Rows {
     }
     for (const frame of listed.sightings ?? []) this.line(frame).cells[6].textContent = String(frame.found);
   }
-  // Vision's results come as a packet of each kind; those of a frame share its number and a line.
+  // The packets of one frame have its number and share one line.
   line(frame) {
     const known = this.lines.get(frame.sequence);
     if (known?.isConnected) return known;
     const line = row([seconds(frame), "", "", "", "", "", ""]);
+    line.tabIndex = 0;
     line.dataset.sequence = frame.sequence;
     this.lines.set(frame.sequence, line);
     this.add(line);

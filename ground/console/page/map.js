@@ -1,7 +1,7 @@
 // The ground track on a map with day and night. Land: Natural Earth, as TopoJSON.
-const NIGHT = "rgba(2, 6, 18, 0.62)";
+import { colour } from "/page/theme.js";
 
-// The rings of a topology's land: arcs are whole numbers, each a step from the one before.
+// Return the rings of the land. An arc consists of integer steps from one point to the next.
 function rings(topology) {
   const { scale, translate } = topology.transform;
   const arcs = topology.arcs.map((arc) => {
@@ -22,32 +22,32 @@ export class GroundTrack {
 
   show(_, state) {
     const place = state.surroundings;
-    if (!place) { this.words.textContent = "place not known"; return; }
+    if (!place) { this.words.textContent = "the position is not known"; return; }
     if (Math.abs(state.time - this.asked) > 60) {
       this.asked = state.time;
       fetch(`/api/track?at=${state.time}`).then((answer) => answer.json()).then((answer) => { this.track = answer.track ?? []; });
     }
     const ctx = this.canvas.getContext("2d");
-    ctx.fillStyle = "#13233a"; ctx.fillRect(0, 0, this.canvas.width, this.canvas.height);
-    ctx.fillStyle = "#2c4a3b";
+    ctx.fillStyle = colour("sea"); ctx.fillRect(0, 0, this.canvas.width, this.canvas.height);
+    ctx.fillStyle = colour("land");
     for (const ring of this.land) { ctx.beginPath(); ring.forEach(([x, y], k) => ctx[k ? "lineTo" : "moveTo"](...this.at(y, x))); ctx.fill(); }
     this.night(ctx, place);
-    ctx.strokeStyle = "#6cb6ff"; ctx.lineWidth = 1.2; ctx.beginPath();
+    ctx.strokeStyle = colour("accent"); ctx.lineWidth = 1.2; ctx.beginPath();
     this.track.forEach(([latitude, longitude], k) => {
       const jump = k === 0 || Math.abs(longitude - this.track[k - 1][1]) > 180;
       ctx[jump ? "moveTo" : "lineTo"](...this.at(latitude, longitude));
     });
     ctx.stroke();
-    this.dot(ctx, place.sun_latitude, place.sun_longitude, "#ffd75e", 7);
-    this.dot(ctx, place.latitude, place.longitude, "#ff6fb1", 5);
+    this.dot(ctx, place.sun_latitude, place.sun_longitude, colour("sun"), 7);
+    this.dot(ctx, place.latitude, place.longitude, colour("dipole"), 5);
     const light = place.sunlit > 0.99 ? "in sunlight" : place.sunlit < 0.01 ? "in the Earth's shadow" : "in half-shadow";
     this.words.textContent = `${place.latitude.toFixed(2)}°, ${place.longitude.toFixed(2)}°, ${place.altitude_km.toFixed(0)} km, ${light}`;
   }
 
-  // The night's side: beyond the great circle at right angles to the Sun.
+  // The night side lies beyond the great circle perpendicular to the direction of the Sun.
   night(ctx, { sun_latitude: latitude, sun_longitude: longitude }) {
     const slope = Math.tan(Math.max(Math.abs(latitude), 0.05) * Math.PI / 180) * (latitude < 0 ? -1 : 1);
-    ctx.fillStyle = NIGHT; ctx.beginPath();
+    ctx.fillStyle = colour("night"); ctx.beginPath();
     for (let k = -180; k <= 180; k += 2) {
       const edge = Math.atan(-Math.cos((k - longitude) * Math.PI / 180) / slope) * 180 / Math.PI;
       ctx[k === -180 ? "moveTo" : "lineTo"](...this.at(edge, k));

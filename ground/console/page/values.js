@@ -1,5 +1,12 @@
-// Values as they stand: cards of the health, and every field of every packet. States, alarms and limits are the table's.
+// Newest values: cards of the health, and every field of every packet. States, alarms and limits come from the table.
 const KINDS = { warning: "warn", fault: "bad" };
+const DEGREES = 180 / Math.PI;
+const SHOWN = { "-": [1, ""], rad: [DEGREES, "deg"], "rad/s": [DEGREES, "deg/s"], "rad/s^2": [DEGREES, "deg/s²"], T: [1e6, "µT"], W: [1e3, "mW"], B: [1e-6, "MB"], "B/h": [1e-6, "MB/h"], "B/s": [1e-6, "MB/s"], "degree C": [1, "°C"], "deg C": [1, "°C"] };
+
+// The factor from the table's unit to the unit on the page, and the latter.
+export function shownUnit(unit) { return SHOWN[unit] ?? [1, unit.replace("^2", "²")]; }
+
+export function rounded(value, digits = 4) { return value === null || value === undefined ? "-" : String(Number(value.toPrecision(digits))); }
 
 export function fieldOf(table, packet, name) {
   return table.packets.find((each) => each.name === packet)?.fields.find((field) => field.name === name);
@@ -31,7 +38,7 @@ export function beyond(value, field) {
 
 function worst(kinds) { return kinds.includes("bad") ? "bad" : kinds.includes("warn") ? "warn" : ""; }
 
-// What is known of a field by the table, for whoever points at it.
+// Description of a field by the table, shown to a pointer.
 function meaning(field) {
   const range = (word, bounds) => (bounds?.length ? [`${word} outside ${bounds.join(" to ")}`] : []);
   const states = (field.states ?? []).map(([number, name]) => {
@@ -41,11 +48,26 @@ function meaning(field) {
   return [field.meaning, ...(states.length ? [states.join(", ")] : []), ...range("warning", field.warning_outside), ...range("fault", field.fault_outside)].join("; ");
 }
 
-// Cards of what is measured, each coloured by the table; what the monitors find; and every value of any periodic
+const HEAT = { meaning: "heat in the coils, resistance times the square of each commanded current, summed over the coils" };
+
+// Heat of the coils in W, or null while currents or resistances are not known. A satellite with three coils reports its
+// dipole moment, from which the currents follow.
+export function heatOf({ control, coil_currents: many, attitude, run }, { resistance, currents }) {
+  const ohms = resistance.length ? resistance : (run?.coil_resistance ?? []);
+  const whole = (values) => values?.every((value) => value !== null);
+  const amperes = many?.written ?? control?.current_written
+    ?? (currents && whole(attitude?.dipole) ? currents.map((row) => row.reduce((sum, part, k) => sum + part * attitude.dipole[k], 0)) : null);
+  if (!amperes) return null;
+  const parts = amperes.map((current, k) => (current ? (ohms[k] ?? NaN) * current ** 2 : 0));
+  const sum = parts.reduce((total, part) => total + part, 0);
+  return Number.isFinite(sum) ? sum : null;
+}
+
+// Cards of the measured health, coloured by the table; the findings of the monitors; and every value of a periodic
 // packet that lies beyond its limits.
 export class Health {
   constructor(place, table) {
-    this.place = place;
+    this.place = place; this.table = table;
     this.fields = new Map(table.packets.filter((packet) => packet.rate.includes("Hz")).flatMap((packet) => packet.fields.map((field) => [`${packet.name}.${field.name}`, field])));
     this.judged = [...this.fields].filter(([, field]) => field.alarms || field.warning_outside || field.fault_outside);
     this.streams = this.judged.filter(([key, field]) => key.startsWith("health.") && field.states?.some(([, name]) => name === "not-fitted"));
@@ -53,6 +75,7 @@ export class Health {
 
   show(newest) {
     const { health, housekeeping: supply, link } = newest;
+    const heat = heatOf(newest, this.table);
     const value = (key) => { const [packet, name] = key.split("."); return newest[packet]?.[name]; };
     const cards = [];
     const add = (name, words, kind, field) => cards.push([name, words, kind, field ? meaning(field) : ""]);
@@ -73,6 +96,7 @@ export class Health {
       add("coils in use", text(health.coils_in_use, this.fields.get("health.coils_in_use")), "", this.fields.get("health.coils_in_use"));
       add("slots lost", String(health.slips), health.slips > 0 ? "warn" : "good", this.fields.get("health.slips"));
     }
+    if (heat !== null) add("coil heat (R I²)", `${(1e3 * heat).toFixed(1)} mW`, "", HEAT);
     if (supply) {
       number("coil bus voltage", "housekeeping.coil_voltage", 1, 2, "V");
       number("coil bus power", "housekeeping.coil_power", 1e3, 1, "mW");
@@ -91,7 +115,7 @@ export class Health {
     this.draw(cards);
   }
 
-  // Cards are made once: one that is made again ten times a second never shows its meaning to a pointer.
+  // A card is made once, because a new one ten times a second would never show its meaning to a pointer.
   draw(cards) {
     const names = cards.map(([name]) => name).join();
     if (names !== this.drawn) {
@@ -129,7 +153,7 @@ export class Packets {
     }
   }
   show(newest) {
-    if (!this.fold.open) return; // nobody looks
+    if (!this.fold.open) return; // the panel is closed
     for (const [name, packet] of Object.entries(newest)) {
       this.cells.get(name)[0].textContent = `${(packet.time_ns / 1e9).toFixed(3)} s`;
       for (const [key, value] of Object.entries(packet)) {

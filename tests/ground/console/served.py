@@ -11,6 +11,7 @@ from aiohttp import CookieJar
 from aiohttp.test_utils import TestClient, TestServer
 
 from ground.console.commanding import CommandForms
+from ground.console.files import RunFiles
 from ground.console.history import History
 from ground.console.server import Access, Console, application
 from ground.console.surroundings import FlightSurroundings
@@ -27,7 +28,9 @@ def asked(
 
     async def talk(history: History) -> Any:
         place = FlightSurroundings.of(folder / "config.yaml")
-        console = Console(folder.name, LogTail(folder), history, place, CommandForms(send))
+        console = Console(
+            folder.name, LogTail(folder), history, place, CommandForms(send), files=RunFiles(folder)
+        )
         console.read()
         door = access or Access(lambda token: None)
         server = TestServer(application(console, door), host="127.0.0.1")

@@ -139,6 +139,8 @@ def queries() -> Iterator[str]:
         yield f"/api/series?packet=imu&field=rate&from=0&to=1&points={number}&component={number}"
         yield f"/api/series?packet={number}&field={number}"
         yield f"/api/track?at={number}"
+        yield f"/api/passes?at={number}&days={number}&station={number}"
+        yield f"/api/file?name={number}"
         yield f"/api/frame?sequence={number}"
         yield f"/api/frame.png?sequence={number}"
         yield f"/page/{number}"
@@ -146,6 +148,9 @@ def queries() -> Iterator[str]:
         "/api/series",
         "/api/track",
         "/api/live",
+        "/api/passes?at=1&days=1",
+        "/api/file?name=../config.yaml",
+        "/api/file?name=/etc/passwd",
         "/page/../server.py",
         "/page/%2e%2e/server.py",
         "//",

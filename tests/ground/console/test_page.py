@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import csv
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
 
 from flight.link import events
-from flight.link.telemetry.definitions import EVENT, FACTS, HEALTH
+from flight.link.telemetry.definitions import EVENT, FACTS, HEALTH, PARAMETER_FIELDS, PARAMETERS, crc_of
 from flight.link.telemetry.packets import Packer
 from tests.flight.link.telemetry.samples import plain_contents
-from tests.ground.report.synthetic import Recipe, make_run
-from tests.support.browser import Page, another_origin, browsing, missing, opened
+from tests.ground.report.synthetic import CURRENT, Recipe, make_run
+from tests.support.answering_flight import Listener
+from tests.support.browser import Page, another_origin, audit, browsing, missing, open_page, opened
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing() or "-")]
+ROOT = Path(__file__).parents[3]
+SIZES = ((1600, 900), (1024, 768), (390, 844))
 
 _FRAME = """(url) => new Promise((done) => {
   const frame = Object.assign(document.createElement("iframe"), { src: url, onload: done });
@@ -38,16 +44,55 @@ _ASK = """async (url) => {
 FACTS_BIT = {name: 1 << bit for bit, name in FACTS}
 
 
+_RED = """(() => {
+  const canvas = document.querySelector('.panel:last-child canvas');
+  const probe = document.createElement('canvas').getContext('2d', { willReadFrequently: true });
+  probe.canvas.width = canvas.width; probe.canvas.height = canvas.height; probe.drawImage(canvas, 0, 0);
+  const wanted = getComputedStyle(document.documentElement).getPropertyValue('--bad').match(/[0-9a-f]{2}/gi);
+  const [r, g, b] = wanted.map((part) => parseInt(part, 16));
+  const { data } = probe.getImageData(0, 0, canvas.width, canvas.height);
+  let found = 0;
+  for (let k = 0; k < data.length; k += 4) {
+    found += Math.hypot(data[k] - r, data[k + 1] - g, data[k + 2] - b) < 30 && data[k + 3] > 120;
+  }
+  return found > 0.3 * canvas.width;
+})()"""
+"""Whether a dashed line in the colour of a fault is drawn across the last plot."""
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
 
 
+def _event(kind: events.EventKind, time_s: float, text: str) -> bytes:
+    values = {"code": kind.code, "severity": int(kind.severity), "suppressed": 0, "name": kind.name}
+    return Packer().pack(EVENT, round(time_s * 1e9), {**values, "text": text})
+
+
+@pytest.fixture(scope="module")
+def orbit_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run of a satellite with 105 saturated frames, an outage of the gyro, and a parameter table."""
+    run = make_run(tmp_path_factory.mktemp("orbit"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
+    shutil.copy(ROOT / "config/orbit.yaml", run / "config.yaml")
+    values = [sum(field.valid) / 2.0 for field in PARAMETER_FIELDS if field.valid]
+    table = {field.name: value for field, value in zip(PARAMETER_FIELDS, values, strict=True)}
+    packets = [
+        Packer().pack(PARAMETERS, 10**9, {**plain_contents(PARAMETERS), **table, "crc": crc_of(values)}),
+        _event(events.IMU_SILENT, 2.0, "no byte for 0.12 s"),
+        *(_event(events.CAMERA_SATURATED, 2.1 + 0.01 * k, f"frame {k} is saturated") for k in range(105)),
+        _event(events.IMU_RECOVERED, 5.0, "bytes come again"),
+    ]
+    with (run / "flight-0001.ccsds").open("ab") as file:
+        file.write(b"".join(packets))
+    return run
+
+
 @contextmanager
-def serving(folder: Path, port: int = 0) -> Iterator[str]:
+def serving(folder: Path, *words: object, port: int = 0) -> Iterator[str]:
     """Run `knightcube console` on a run, and yield the address that it prints."""
-    words = [sys.executable, "-m", "flight", "console", str(folder), "--port", str(port)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as server:
+    command = [sys.executable, "-m", "flight", "console", folder, "--port", port, *words]
+    with subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None
             found = re.search(r"http://\S+", server.stdout.readline())
@@ -58,9 +103,32 @@ def serving(folder: Path, port: int = 0) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def page(folder: Path) -> Iterator[Page]:
-    with serving(folder) as url, opened(url) as shown:
-        yield shown
+def browser() -> Iterator[Any]:
+    with browsing() as running:
+        yield running.new_context(accept_downloads=True)
+
+
+@pytest.fixture(scope="module")
+def page(browser: Any, folder: Path) -> Iterator[Page]:
+    with serving(folder) as url:
+        yield open_page(browser, url)
+
+
+@pytest.fixture(scope="module")
+def orbit_url(browser: Any, orbit_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a console that sends its commands to a socket; the browser is already admitted."""
+    socket = tmp_path_factory.mktemp("to") / "commands"
+    listener = Listener(socket)
+    station = ("--station", "Berlin,52.5,13.4,30,10")
+    with serving(orbit_folder, "--to", socket, *station) as url:
+        open_page(browser, url).page.close()
+        yield url.partition("?")[0]
+    del listener
+
+
+@pytest.fixture(scope="module")
+def satellite(browser: Any, orbit_url: str) -> Page:
+    return open_page(browser, orbit_url)
 
 
 def test_a_page_of_a_console_that_was_started_again_says_that_it_is_stale(folder: Path) -> None:
@@ -73,7 +141,7 @@ def test_a_page_of_a_console_that_was_started_again_says_that_it_is_stale(folder
         page.page.reload()
         page.wait("document.body.dataset.time !== undefined")
         first.close()
-        with serving(folder, port):
+        with serving(folder, port=port):
             page.wait("document.getElementById('light').textContent === 'address stale'", 60.0)
             assert "open the newest address that it printed" in page.text("#trouble")
             page.page.reload()
@@ -106,7 +174,7 @@ def test_it_shows_a_log_to_its_end_a_moment_of_it_and_a_link_that_is_dead_or_ove
     page.wait("document.querySelectorAll('#events tr').length >= 1")
     live, values = page.shown
     assert live == pytest.approx(6.0, abs=0.2)
-    assert page.page.locator("form.command").count() == 0, "this console only looks"
+    assert not page.page.is_visible("#command"), "the console is read-only"
     page.page.evaluate("location.hash = '#at=2'")
     page.wait("document.body.dataset.time === '2'")
     page.wait("document.getElementById('light').textContent === 'replay, paused'")
@@ -130,3 +198,179 @@ def test_it_shows_a_log_to_its_end_a_moment_of_it_and_a_link_that_is_dead_or_ove
     page.wait("Number(document.body.dataset.time) < 6")
     assert page.complaints == []
     assert page.strangers == []
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_each_size_and_theme_fits_shows_the_commands_and_has_no_violation(
+    browser: Any, orbit_url: str, theme: str
+) -> None:
+    shown = open_page(browser, orbit_url, theme=theme)
+    shown.wait("document.querySelectorAll('#events tbody tr').length > 0")
+    for width, height in SIZES:
+        shown.page.set_viewport_size({"width": width, "height": height})
+        shown.page.evaluate("scrollTo(0, 0)")
+        for name in ("#which", "#send-form", "#safe"):
+            box = shown.page.locator(name).bounding_box()
+            assert 0 <= box["x"] <= box["x"] + box["width"] <= width
+            assert 0 <= box["y"] <= box["y"] + box["height"] <= height
+        shown.page.wait_for_timeout(200)
+        shown.page.evaluate("for (const fold of document.querySelectorAll('details')) fold.open = true")
+        assert shown.page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+    assert shown.page.evaluate("document.documentElement.dataset.theme") == theme
+    shown.page.evaluate("document.getElementById('all').open = false")
+    assert audit(shown) == []
+    assert shown.complaints == []
+    shown.page.close()
+
+
+def test_the_form_offers_what_a_satellite_obeys_and_refuses_before_sending(
+    satellite: Page,
+) -> None:
+    offered = satellite.page.locator("#which option").all_inner_texts()
+    assert "point" in offered
+    assert "slew" not in offered, "a satellite slews by `point`"
+    satellite.fill("mode", mode="sun")
+    assert "hold" not in satellite.text("#inputs")
+    satellite.fill("point", goal="ground", latitude="95", longitude="13.4")
+    satellite.wait("document.getElementById('answer').className === 'error'")
+    assert satellite.text("#answer") == "latitude = 95: give -90 to 90 deg"
+    satellite.page.click("#send-form")
+    satellite.page.wait_for_timeout(300)
+    assert not satellite.page.is_visible("#confirm")
+    satellite.fill("point", goal="inertial")
+    shown = satellite.page.locator("#inputs label:visible").all_inner_texts()
+    assert [text.strip() for text in shown[1:]] == [f"quaternion {axis}" for axis in "xyzw"]
+    for axis in "xyzw":
+        satellite.fill_one(f"quaternion {axis}", "0.4")
+    satellite.wait("document.getElementById('answer').textContent.includes('length 0.8')")
+    assert satellite.command("point", goal="ground", latitude="90", longitude="13.4", roll="") == (
+        "obeyed: as commanded"
+    )
+
+
+def test_a_plot_has_titles_units_components_limits_zoom_and_exports(satellite: Page, tmp_path: Path) -> None:
+    page = satellite.page
+    page.fill("#add", "imu.field")
+    page.dispatch_event("#add", "change")
+    first = page.locator(".panel").last
+    assert first.locator("h3").inner_text() == "Magnetic field, body axes (µT)"
+    satellite.wait(
+        "document.querySelector('.panel:last-child .u-legend')?.textContent.match(/x.*y.*z/) != null"
+    )
+    page.fill("#add", "control.path_q2")
+    page.dispatch_event("#add", "change")
+    plot = page.locator(".panel").last
+    plot.locator("input").fill("control.path_rate")
+    plot.locator("input").dispatch_event("change")
+    satellite.wait("document.querySelectorAll('.panel:last-child .u-axis').length === 3")
+    assert "Current rate of the path (deg/s)" in plot.locator("h3").inner_text()
+    assert plot.locator(".limits").inner_text() == "fault below -0.68, fault above 0.68"
+    satellite.wait(_RED)
+    over = plot.locator(".u-over")
+    over.scroll_into_view_if_needed()
+    box = over.bounding_box()
+    page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 40)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + 50, steps=4)
+    page.mouse.up()
+    satellite.wait("!document.getElementById('unzoom').disabled")
+    page.wait_for_timeout(400)
+    with page.expect_download() as table:
+        plot.get_by_text("CSV").click()
+    with page.expect_download() as picture:
+        plot.get_by_text("PNG").click()
+    table.value.save_as(tmp_path / "table.csv")
+    rows = list(csv.reader((tmp_path / "table.csv").read_text(encoding="utf-8").splitlines()))
+    assert rows[0] == ["time [s]", "control.path_q2", "control.path_rate [deg/s]"]
+    times = [float(row[0]) for row in rows[1:]]
+    assert [times[0], times[-1]] == pytest.approx([1.5, 4.5], abs=0.2)
+    assert len(times) == pytest.approx(30, abs=3), "each control cycle"
+    picture.value.save_as(tmp_path / "plot.png")
+    assert (tmp_path / "plot.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    page.keyboard.press("z")
+    satellite.wait("document.getElementById('unzoom').disabled")
+
+
+def test_events_of_one_cause_are_one_line_with_begin_and_end(satellite: Page) -> None:
+    rows = satellite.page.locator("#events tbody tr")
+    texts = [[cell.strip() for cell in row.split("\t")] for row in rows.all_inner_texts()]
+    (saturated,) = [row for row in texts if "camera-saturated" in row[3]]
+    assert saturated[:3] == ["2.1", "3.1", "warning"]
+    assert "× 105: frame 104 is saturated" in saturated[3]
+    (silent,) = [row for row in texts if "imu-silent" in row[3]]
+    assert silent[:2] == ["2.0", "5.0"]
+    assert "imu-recovered: bytes come again" in silent[3]
+    satellite.page.fill("#filter", "frame 17 is")
+    assert rows.filter(visible=True).count() == 1
+    satellite.page.fill("#filter", "")
+
+
+def test_parameters_have_units_and_ranges_and_are_loaded_as_a_whole(satellite: Page) -> None:
+    satellite.page.click("#parameters-panel summary")
+    line = satellite.page.locator("#parameters-panel tr", has_text="modes.arrived_angle")
+    value = line.locator("input")
+    assert float(value.input_value()) == pytest.approx(14.327, abs=1e-3)
+    assert [line.locator("td").nth(k).inner_text() for k in (1, 2)] == ["deg", "0.00573 to 28.65"]
+    value.fill("40")
+    satellite.page.click("#parameters-panel button[type=submit]")
+    assert "modes.arrived_angle = 40: give 0.00573 to 28.65 deg" in satellite.text(
+        "#parameters-panel form > p"
+    )
+    assert not satellite.page.is_visible("#confirm")
+    value.fill("2")
+    satellite.page.click("#parameters-panel button[type=submit]")
+    satellite.page.wait_for_selector("#confirm[open]")
+    satellite.page.click("#send")
+    satellite.wait("document.querySelector('#parameters-panel form > p').className === 'answer'")
+
+
+def test_the_heat_of_the_coils_and_the_passes_with_their_schedule_are_shown(satellite: Page) -> None:
+    heat = satellite.page.locator(".card:has-text('coil heat') b").inner_text()
+    assert float(heat.split()[0]) == pytest.approx(1e3 * 23.0 * CURRENT**2, rel=0.02)
+    satellite.page.click("#passes summary")
+    satellite.wait("document.querySelectorAll('#passes tbody tr').length > 0")
+    cells = satellite.page.locator("#passes tbody tr").first.locator("td").all_inner_texts()
+    assert (cells[0], cells[4]) == ("Berlin", "10°")
+    assert "satellite" in cells[6]
+    assert re.search(r"T\d\d:\d\d:\d\dZ point ground 52.5000 13.4000 deg", cells[7])
+    assert "point nadir" in cells[7]
+
+
+def test_a_file_of_the_run_is_got(satellite: Page, orbit_folder: Path, tmp_path: Path) -> None:
+    satellite.page.click("#files summary")
+    satellite.wait("document.querySelectorAll('#files tbody tr').length > 1")
+    with satellite.page.expect_download() as got:
+        satellite.page.get_by_label("get config.yaml").click()
+    got.value.save_as(tmp_path / "config.yaml")
+    assert (tmp_path / "config.yaml").read_bytes() == (orbit_folder / "config.yaml").read_bytes()
+
+
+def test_keys_step_pause_and_focus_and_a_speed_does_not_start_a_paused_replay(satellite: Page) -> None:
+    page = satellite.page
+    page.evaluate("location.hash = '#at=2'")
+    satellite.wait("document.getElementById('light').textContent === 'replay, paused'")
+    assert page.is_disabled("#send-form"), "the past cannot be commanded"
+    page.select_option("#speed", "5")
+    page.wait_for_timeout(500)
+    assert page.evaluate("document.body.dataset.time") == "2"
+    assert satellite.text("#light") == "replay, paused"
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("ArrowRight")
+    satellite.wait("document.body.dataset.time === '3'")
+    page.keyboard.press(" ")
+    satellite.wait("document.getElementById('light').textContent === 'replay 5 x'")
+    page.keyboard.press("l")
+    satellite.wait("document.getElementById('live').className === 'chosen'")
+    satellite.wait("!document.getElementById('which').disabled")
+    page.keyboard.press("c")
+    assert page.evaluate("document.activeElement.id") == "which"
+    page.evaluate("document.activeElement.blur()")
+    before = page.evaluate("document.documentElement.dataset.theme")
+    page.keyboard.press("t")
+    assert page.evaluate("document.documentElement.dataset.theme") != before
+    page.keyboard.press("t")
+    page.keyboard.press("?")
+    assert "pause or play" in satellite.text("#keys")
+    page.keyboard.press("Escape")
+    assert satellite.complaints == []
+    assert satellite.strangers == []
