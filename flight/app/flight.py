@@ -52,7 +52,7 @@ from flight.loop.body import PLANNER, BodyKind, FlightBody
 from flight.loop.commanding import CommandTask, OnboardParameters
 from flight.loop.control_cycle import LoopTasks
 from flight.loop.executive import JobResult, JobRunner, LockStepRunner, Worker
-from flight.loop.facts import EventLog, Facts, Services, Streams, streams_of
+from flight.loop.facts import EventLog, Facts, FlightClock, Services, Streams, streams_of
 from flight.loop.flight_loop import FlightLoop, FlightProgress, RunLabel, Supervisors, nothing
 from flight.loop.health import (
     Board,
@@ -124,9 +124,10 @@ def open_flight(
         supervision = supervise(guardian, rig.clock, recorder, stack)
         feed, beat = supervision.feed, supervision.beat
     channels = _open_channels(config, stack)
-    keeper = open_state(config, os.environ, rig.clock, after_coils, [*earlier, folder])
+    clock = FlightClock(rig.clock)
+    keeper = open_state(config, os.environ, clock, after_coils, [*earlier, folder])
     frames = folder / images.KEPT_FRAMES_FOLDER
-    opened = Opened(rig.clock, devices, jobs, recorder, flight_log.error, channels, feed, frames)
+    opened = Opened(clock, devices, jobs, recorder, flight_log.error, channels, feed, frames)
     board = Board(folder) if rig.realtime else None
     loop = build_loop(config, opened, Supervisors(beat, keeper, board))
     return loop, flight_log
@@ -419,7 +420,7 @@ class Opened:
         frames: folder in which frames are stored.
     """
 
-    clock: Clock
+    clock: FlightClock
     devices: Devices
     jobs: JobRunner
     recorder: Recorder

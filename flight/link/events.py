@@ -204,7 +204,9 @@ STRINGS_RECOVERED = _info(105, "strings-recovered", "the solar strings deliver r
 SUN_UNCLEAR = _warning(106, "sun-unclear", "the solar strings detect no Sun although the satellite is sunlit")
 SUN_CLEAR = _info(107, "sun-clear", "the solar strings detect the Sun again")
 CLOCK_OFF = _warning(
-    130, "clock-off", "the wall clock differs from the time of the GPS receiver, which is used"
+    130,
+    "clock-off",
+    "the wall clock differs from the time of the GPS receiver, which is used, or precedes the elements",
 )
 FIELD_REFUSED = _warning(
     131, "field-refused", "the magnetometer is ignored because its value is stuck or contradicts the estimate"

@@ -16,7 +16,7 @@ plausible.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -27,7 +27,7 @@ from flight.link.telemetry.log import Recorder
 from flight.loop.executive import JobRunner
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.devices import COIL_NAMES
-from hal.interfaces.wires import Clock
+from hal.interfaces.wires import Clock, Ticker
 from knightcube.errors import FlightError
 
 THROTTLE_NS = 5_000_000_000
@@ -404,11 +404,57 @@ class Streams:
         return [(watch.stream, *watch.poor(now_ns)) for watch in self._watches.values()]
 
 
+CLOCK_OFF_NS = 1_000_000_000
+"""Largest accepted difference (ns) between the wall clock and the GPS receiver's time."""
+
+
+class FlightClock:
+    """Clock of the host whose UTC is that of the GPS receiver while the host's UTC differs from it.
+
+    Attributes:
+        host: clock of the host, whose UTC may be wrong.
+    """
+
+    def __init__(self, host: Clock) -> None:
+        self.host = host
+        self._offset_ns: int | None = None
+
+    def now_ns(self) -> int:
+        """Return the monotonic time, ns."""
+        return self.host.now_ns()
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Sleep until the monotonic time `deadline_ns`. Return at once if the deadline has passed."""
+        self.host.sleep_until_ns(deadline_ns)
+
+    def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
+        """Run `job` every `period_ns`, by the clock of the host."""
+        return self.host.ticker(name, period_ns, job)
+
+    @property
+    def tickers(self) -> Sequence[Ticker]:
+        """Running tickers in the order of their creation."""
+        return self.host.tickers
+
+    def correct(self, utc_ns: int, time_ns: int) -> int:
+        """Accept the UTC (ns) of a monotonic time from the receiver, and return the host's error, ns."""
+        self._offset_ns = utc_ns - time_ns
+        return self.host.utc_ns() - self.host.now_ns() - self._offset_ns
+
+    def utc_ns(self) -> int:
+        """Return the best known UTC in ns since 1970."""
+        host_ns = self.host.utc_ns()
+        if self._offset_ns is None:
+            return host_ns
+        best_ns = self.host.now_ns() + self._offset_ns
+        return host_ns if abs(host_ns - best_ns) <= CLOCK_OFF_NS else best_ns
+
+
 @dataclass(frozen=True, slots=True)
 class Services:
     """The clock, the workers, the recorder, and the tables of events, facts and streams."""
 
-    clock: Clock
+    clock: FlightClock
     jobs: JobRunner
     recorder: Recorder
     events: EventLog

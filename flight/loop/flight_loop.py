@@ -18,7 +18,7 @@ from flight.link.telemetry.definitions import RUN
 from flight.loop.body import ControlOutput, FlightBody, SteeringState
 from flight.loop.control_cycle import ControlCycle, LoopTasks
 from flight.loop.executive import Cycle, CyclicExecutive, RateGroup
-from flight.loop.facts import COILS_BROKEN, Services
+from flight.loop.facts import CLOCK_OFF_NS, COILS_BROKEN, Services
 from flight.loop.health import CONTROL, ResourceReader
 from flight.loop.state import StateKeeper
 from flight.schema.sections import CONTROL_RATE_HZ, Config
@@ -81,6 +81,8 @@ class FlightEnding:
 
 HEALTH_PERIOD_NS = SECOND_NS // 4
 COMMAND_PERIOD_NS = SECOND_NS // 10
+LABEL_PERIOD_NS = 60 * SECOND_NS
+"""Period (ns) of the repetitions of the run packet after the UTC of the run was corrected."""
 
 
 def nothing() -> None:
@@ -116,6 +118,9 @@ class FlightLoop:
         self._supervisors = supervisors
         self._stop_reason = ""
         self._ended_ns = 0
+        self._label: RunLabel | None = None
+        self._labelled_ns = self._zero_utc_ns = 0
+        self._is_corrected = False  # whether the UTC of the run was corrected
         self._show: Callable[[FlightProgress], None] | None = None
         self._notes: list[tuple[EventKind, str]] = [
             (events.LEARNED_REFUSED, problem) for problem in body.estimation.learned_problems
@@ -197,8 +202,7 @@ class FlightLoop:
     def _begin(self, epoch_ns: int, label: RunLabel) -> None:
         """Start all tasks at mission time zero, and record the properties of the run."""
         config, services, tasks, supervisors = self._config, self._services, self._tasks, self._supervisors
-        recorder, clock, coils = services.recorder, services.clock, config.coils
-        recorder.epoch_ns = epoch_ns
+        services.recorder.epoch_ns = epoch_ns
         tasks.navigation.begin(epoch_ns)
         if tasks.imaging is not None:
             tasks.imaging.begin(epoch_ns)
@@ -208,14 +212,29 @@ class FlightLoop:
         if tasks.commanding is not None:
             tasks.commanding.begin(epoch_ns)
         services.streams.begin(epoch_ns)
-        recorder.record(
+        self._label = label
+        self._record_label(epoch_ns)
+        tasks.modes.begin(epoch_ns, supervisors.keeper.record.unclean_recent if supervisors.keeper else 0)
+        services.events.report(events.STARTED, epoch_ns, f"{config.name}, {config.duration:g} s")
+        for kind, text in self._notes:
+            services.events.report(kind, epoch_ns, text)
+        tasks.health.begin(epoch_ns)
+        if supervisors.board is not None:
+            tasks.health.read_resources(supervisors.board, round(config.health.look_period * SECOND_NS))
+
+    def _record_label(self, now_ns: int) -> None:
+        """Record the properties of the run, with the best known UTC at mission time zero."""
+        config, label, coils = self._config, self._label, self._config.coils
+        assert label is not None
+        self._labelled_ns, self._zero_utc_ns = now_ns, self._utc_at_zero()
+        self._services.recorder.record(
             RUN,
-            epoch_ns,
+            now_ns,
             config_name=config.name,
             config_crc=zlib.crc32(label.config_text.encode()),
             software=__version__,
             seed=label.seed,
-            utc_ns=clock.utc_ns() - (clock.now_ns() - epoch_ns),
+            utc_ns=self._zero_utc_ns,
             simulated=int(label.simulated),
             realtime=int(label.realtime),
             control_period_ns=self._groups[0].period_ns,
@@ -226,13 +245,21 @@ class FlightLoop:
             supply_voltage=coils.supply_voltage,
             current_limit=max(coils.limits),
         )
-        tasks.modes.begin(epoch_ns, supervisors.keeper.record.unclean_recent if supervisors.keeper else 0)
-        services.events.report(events.STARTED, epoch_ns, f"{config.name}, {config.duration:g} s")
-        for kind, text in self._notes:
-            services.events.report(kind, epoch_ns, text)
-        tasks.health.begin(epoch_ns)
-        if supervisors.board is not None:
-            tasks.health.read_resources(supervisors.board, round(config.health.look_period * SECOND_NS))
+
+    def _utc_at_zero(self) -> int:
+        """Return the best known UTC at mission time zero, ns since 1970."""
+        clock = self._services.clock
+        return clock.utc_ns() - (clock.now_ns() - self._services.recorder.epoch_ns)
+
+    def _correct_label(self, now_ns: int) -> None:
+        """Record the properties of the run again after a change of the UTC, and then once a minute.
+
+        The repetitions let a link process that starts later know the corrected UTC.
+        """
+        changed = abs(self._utc_at_zero() - self._zero_utc_ns) > CLOCK_OFF_NS
+        self._is_corrected = self._is_corrected or changed
+        if changed or (self._is_corrected and now_ns - self._labelled_ns >= LABEL_PERIOD_NS):
+            self._record_label(now_ns)
 
     def _rate_groups(self) -> list[RateGroup]:
         """Return the rate groups in order of importance, with the control group first."""
@@ -262,6 +289,7 @@ class FlightLoop:
             if sensing is not None:
                 sensing.run(now_ns)
         self._tasks.housekeeping.run(cycle, state)
+        self._correct_label(now_ns)
         self._keep_state(now_ns)
         self._record_performance(now_ns)
         if self._show is None:

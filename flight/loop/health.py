@@ -451,7 +451,7 @@ class HealthWatch:
         self._power = power
         self._workers = workers
         self._monitor = ResourceMonitor(limits)
-        self._clock_watch = ClockWatch(services.clock)
+        self._clock_watch = ClockWatch(services.clock.host)
         self._clock = services.clock
         self._recorder = services.recorder
         self._events = services.events

@@ -288,8 +288,8 @@ class Navigation:
             self._events.report(events.IMU_IMPLAUSIBLE, now_ns, text)
 
 
-CLOCK_OFF_NS = SECOND_NS
-"""Largest accepted difference (ns) between the wall clock and the GPS receiver's time."""
+GPS_DELAY_NS = 100_000_000
+"""Delay (ns) from the time of a GPS fix to the first byte of the receiver's report; at most 0.2 s."""
 FIX_PERIOD_NS = 10 * SECOND_NS
 """Shortest time (ns) between two recorded fixes, and between two records of the line's counters."""
 _COUNTERS = tuple(field.name for field in GPS_LINK.fields)
@@ -318,6 +318,7 @@ class Positioning:
         self._clock = services.clock
         self._recorder = services.recorder
         self._fixed_ns = 0
+        self._off_ns: int | None = None
         self._recorded_ns: int | None = None
         self._link = receiver.link()
         self._link_recorded_ns: int | None = None
@@ -328,7 +329,7 @@ class Positioning:
 
     def run(self, now_ns: int) -> None:
         """Accept the fixes that have arrived since the last call."""
-        error, clock = "", self._clock
+        error = ""
         try:
             readings = self._receiver.poll()
         except DeviceError as lost:
@@ -338,15 +339,15 @@ class Positioning:
                 continue
             self._streams.note("gps", reading.time_ns)
             used = self._accept(reading)
-            self._record(reading, used, now_ns)
             if used:
                 self._fixed_ns = reading.time_ns
                 # Before the first fix, the position was computed with the wall clock.
-                off_ns = clock.utc_ns() - (clock.now_ns() - reading.time_ns) - reading.utc_ns
-                text = f"the wall clock is {off_ns * 1e-9:+.1f} s off the receiver's time"
-                self._facts.update(facts.CLOCK_OFF, abs(off_ns) > CLOCK_OFF_NS, now_ns, text)
+                self._off_ns = self._clock.correct(reading.utc_ns + GPS_DELAY_NS, reading.time_ns)
+                text = f"the wall clock is {self._off_ns * 1e-9:+.1f} s off the receiver's time"
+                self._facts.update(facts.CLOCK_OFF, abs(self._off_ns) > facts.CLOCK_OFF_NS, now_ns, text)
             else:
                 self._events.report(events.GPS_REFUSED, now_ns, f"{reading.satellites} satellites")
+            self._record(reading, used, now_ns)
         link = self._watch_line(now_ns)
         age_ns = now_ns - self._fixed_ns
         cause = f": {link.condition}" if link.condition else ""
@@ -390,6 +391,7 @@ class Positioning:
             velocity_sigma=reading.velocity_sigma,
             satellites=reading.satellites,
             used=used,
+            clock_off=math.nan if self._off_ns is None else self._off_ns * 1e-9,
         )
 
 

@@ -188,7 +188,7 @@ def _archived(folder: Path) -> Object:
     log = run.flight
     if len(run["run"]):
         first = run["run"][0]
-        row |= {"config_name": text_of(first["config_name"]), "utc": _label(int(first["utc_ns"]))}
+        row |= {"config_name": text_of(first["config_name"]), "utc": _label(int(run["run"]["utc_ns"][-1]))}
     if len(run["control"]):
         row["duration_s"] = float(run["control"]["time_ns"][-1]) * 1e-9
     return {

@@ -132,7 +132,7 @@ def _identity(run: Run, attitude: ThreadMotion, notes: list[str]) -> Object:
         "config_crc": int(first["config_crc"]),
         "software": text_of(first["software"]),
         "seed": int(first["seed"]),
-        "utc_ns": int(first["utc_ns"]),
+        "utc_ns": int(run["run"]["utc_ns"][-1]),
         "simulated": bool(first["simulated"]),
         "realtime": bool(first["realtime"]),
         "control_period_s": period,

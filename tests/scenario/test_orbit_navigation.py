@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from flight.schema import reader as configuration
 from ground.report import format_report, summarise
 from ground.report.orbit import FINE, AttitudeErrors, attitude_errors, camera_errors
 from ground.telemetry import Run
-from tests.scenario.orbit_flights import ACQUIRED, navigating, skyward
+from sim_hal.settings import FaultEntry
+from tests.scenario.orbit_flights import ACQUIRED, NEAR_REST, navigating, orbit_config, skyward, world
 from tests.support.flights import event_names, fly
 
 
@@ -81,3 +84,18 @@ def test_the_report_shows_how_well_the_attitude_was_known(flown: Run, tmp_path: 
     assert summary["share"]["fine"] > 0.6
     assert summary["fine_error_worst_rad"] < np.radians(0.3)
     assert "Attitude knowledge" in format_report(summarise(flown))
+
+
+@pytest.mark.parametrize("days", [3.0, -5.0])
+def test_a_wall_clock_that_is_days_off_is_corrected_by_the_first_fix(days: float, tmp_path: Path) -> None:
+    """The run packet is recorded again with the receiver's UTC."""
+    quiet = world(NEAR_REST, FaultEntry(fault=f"clock: stepped (by={86_400.0 * days})"))
+    receiver = configuration.replace(quiet.orbit_devices, gps_start=3.0)
+    config = configuration.replace(orbit_config(6.0), camera=None)
+    run = fly(config, tmp_path, section=configuration.replace(quiet, orbit_devices=receiver))
+    true_ns = round(datetime.fromisoformat(quiet.utc).timestamp()) * 10**9 + 10**9
+    assert abs(int(run["run"]["utc_ns"][-1]) - true_ns) < 2e8
+    assert summarise(run)["run"]["utc_ns"] == run["run"]["utc_ns"][-1]
+    assert run["fix"]["clock_off"] == pytest.approx(86_400.0 * days, abs=0.3)
+    assert "clock-off" in event_names(run)
+    assert run["navigation"]["placed"].tolist() == ([0, 1, 1, 1, 1, 1] if days > 0.0 else [0, 0, 0, 1, 1, 1])

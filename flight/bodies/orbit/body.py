@@ -90,6 +90,7 @@ class OrbitView:
         self._events = services.events
         self._facts = services.facts
         self._knowledge = Knowledge.LOST
+        self._is_clock_doubted = False
         self._detumbler = detumbling.detumbler
         self._recorder = services.recorder
 
@@ -128,6 +129,10 @@ class OrbitView:
             f"the magnetic field is extrapolated and has an additional error of {1e9 * (sigma or 0.0):.0f} nT"
         )
         self._facts.update(facts.FIELD_EXTRAPOLATED, None if sigma is None else sigma > 0.0, now_ns, text)
+        late = self._environment.clock_doubt
+        if late or (self._is_clock_doubted and not self._environment.is_timed):
+            self._facts.update(facts.CLOCK_OFF, bool(late), now_ns, late or "the date follows the elements")
+        self._is_clock_doubted = bool(late)
         doubt = found.field_doubt
         self._facts.update(
             facts.FIELD_REFUSED, bool(doubt), now_ns, doubt or "the magnetometer agrees with the estimate"

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flight.loop.navigation import GPS_DELAY_NS
 from hal.interfaces.devices import GpsReading
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.astro.arrays import FloatArray
@@ -38,8 +39,6 @@ from knightcube.gnc.estimation.free_filter import FilterEnvironment
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
 """Time spans (s) after and before the requested time that the short prediction covers."""
-GPS_DELAY_NS = 100_000_000
-"""Delay (ns) from the time of a GPS fix to the first byte of the receiver's report; at most 0.2 s."""
 GATE = 5.0
 """Largest accepted deviation of a GPS fix from the known orbit in standard deviations."""
 LEAST_GATE, FIX_GATE = 5e3, 500.0
@@ -192,6 +191,11 @@ class EstimatedEnvironment:
     def known(self) -> bool:
         """Whether the orbit was known at the last request."""
         return self._near is not None
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether the time is that of a GPS receiver."""
+        return self._utc_offset_ns is not None
 
     @property
     def clock_doubt(self) -> str:

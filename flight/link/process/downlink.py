@@ -33,6 +33,8 @@ _LOOKS = 25
 _UNORDERED_NS = 5_000_000_000
 """Maximum time (ns) by which packets of different rate groups can be out of order in the log."""
 _TIME = struct.Struct(">q")
+_LABEL = LAYOUTS[RUN.name].identifier.to_bytes(2, "big")
+"""First bytes of each packet `run`."""
 
 
 def time_of(packet: bytes) -> int:
@@ -71,7 +73,10 @@ class LogFollower:
         self._stream = _PacketStream()
         self._idle = 0
         self.label = b""
-        """The packet `run`, which describes the present run, as bytes; empty until a run is found."""
+        """The newest packet `run` of the present run as bytes; empty until a run is found."""
+        self._is_read = False
+        self.is_live = False
+        """Whether the newest packets were written after the end of the log was reached once."""
         self._attach(at_end=True)
 
     def folder(self, number: int) -> Path | None:
@@ -85,10 +90,14 @@ class LogFollower:
         data = b"" if self._path is None else _read(self._path, self._offset)
         self._offset += len(data)
         self._idle = 0 if data else self._idle + 1
+        self.is_live = self._is_read
+        self._is_read = self._path is not None and len(data) < _CHUNK
         if self._idle >= _LOOKS or (self._path is None and self._idle):
             self._idle = 0
             self._go_on()
-        return self._stream.add(data) if data else []
+        packets = self._stream.add(data) if data else []
+        self.label = next((packet for packet in reversed(packets) if packet[:2] == _LABEL), self.label)
+        return packets
 
     def _go_on(self) -> None:
         """Continue with the next segment, or with a newer run if the current run has no further segment."""
@@ -109,8 +118,8 @@ class LogFollower:
         self._run, self._path, self._offset = newest, segments[0], 0
         self._stream = _PacketStream()
         head = _PacketStream().add(_read(segments[0], 0)[:LONGEST_PACKET])
-        identifier = LAYOUTS[RUN.name].identifier.to_bytes(2, "big")
-        self.label = next((packet for packet in head if packet[:2] == identifier), b"")
+        self.label = next((packet for packet in head if packet[:2] == _LABEL), b"")
+        self._is_read = self.is_live = False
         if at_end:
             with suppress(OSError):
                 self._offset = max(0, segments[-1].stat().st_size - _LOOK_BACK)

@@ -73,8 +73,8 @@ from flight.link.security import (
     Sealer,
     Vault,
 )
-from flight.link.telemetry.definitions import LINK, TRANSFER, VERIFICATION, Packet
-from flight.link.telemetry.packets import Packer, TelemetryError
+from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION, Packet
+from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS, Clock, SerialPort
 from knightcube.errors import FlightError, UsageError
@@ -458,6 +458,8 @@ _BUSY_NS = SECOND_NS // 250
 A Linux socket buffers about 50 ms of traffic at 10,000 frames/s.
 """
 _LABEL_NS = 10 * SECOND_NS
+_UTC_WAIT_NS = 120 * SECOND_NS
+"""Longest time (ns) for which scheduled commands wait for the UTC of the flight."""
 _RESERVED_BLOCK = 4096
 _REFUSALS_A_SECOND = 4
 _HIGHEST_REPORTED = 2**63 - 1
@@ -528,6 +530,9 @@ class Station:
         self._verification = Verification()
         self._packer, self._commands, self._joiner = Packer(), CommandPacker(), directives.Joiner()
         self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
+        self._label, self._zero_utc_ns = b"", 0
+        self._utc_offset_ns: int | None = None  # best known UTC minus the time of the host's clock
+        self._begun_ns = clock.now_ns()
         self._status_ns = self._label_ns = clock.now_ns()
         self._refusals_ns = deque([-2 * SECOND_NS] * _REFUSALS_A_SECOND, _REFUSALS_A_SECOND)
         self._received = self._refused_commands = 0
@@ -676,7 +681,10 @@ class Station:
 
     def _execute_due(self, now_ns: int) -> None:
         """Send due scheduled commands to the control process, and report commands that are not executed."""
-        utc_ns = self._clock.utc_ns()
+        waits = self._log.label and now_ns - self._begun_ns < _UTC_WAIT_NS
+        if self._utc_offset_ns is None and waits:
+            return
+        utc_ns = self._utc_ns()
         for due in self._scheduling.due(utc_ns):
             if isinstance(due, Sent):
                 self._hand_over(due, self._commands.pack(due.command, utc_ns), now_ns)
@@ -708,9 +716,9 @@ class Station:
             case Activate() | Confirm() | Withdraw() | Restart():
                 return self._renew(directive, done)
             case Scheduled() | Deletion() | Listing():
-                return self._scheduling.obey(directive, done, self._clock.utc_ns())
+                return self._scheduling.obey(directive, done, self._utc_ns())
             case _:
-                return self._filing.obey(directive, done, self._clock.utc_ns(), self._clock.now_ns())
+                return self._filing.obey(directive, done, self._utc_ns(), self._clock.now_ns())
 
     def _renew(self, directive: Privileged, done: Report) -> list[Report]:
         """Hand a directive over to the privileged part, which reports its completion."""
@@ -728,9 +736,30 @@ class Station:
             self._scheduling.followed(packet)
             self._renewal.followed(packet)
             self._report(*self._verification.followed(packet))
+            if self._log.is_live and self._log.label:
+                self._follow_utc(self._log.label, time_of(packet) - now_ns)
         if self._log.label and now_ns >= self._label_ns:
             self._label_ns = now_ns + _LABEL_NS
             self._downlink.live(self._log.label)
+
+    def _follow_utc(self, label: bytes, mission_offset_ns: int) -> None:
+        """Accept the newest run packet, and the mission time minus the time of the host's clock, ns.
+
+        Packets are written to the log with a delay, so the largest difference is the most accurate one.
+        """
+        if label != self._label:
+            self._label, self._utc_offset_ns = label, None
+            self._zero_utc_ns = int(LAYOUTS[RUN.name].array(label)[0]["utc_ns"])
+        offset_ns = self._zero_utc_ns + mission_offset_ns
+        self._utc_offset_ns = max(
+            offset_ns, offset_ns if self._utc_offset_ns is None else self._utc_offset_ns
+        )
+
+    def _utc_ns(self) -> int:
+        """Return the UTC of the flight, ns since 1970, or the host's UTC without a flight."""
+        if self._utc_offset_ns is None:
+            return self._clock.utc_ns()
+        return self._clock.now_ns() + self._utc_offset_ns
 
     def _seal(self, header: bytes, data: bytes) -> bytes:
         """Protect a frame with the primary telemetry SPI, or with the reserve SPI if the primary fails.

@@ -195,14 +195,14 @@ FACT_ALARMS: Alarms = tuple((bit, level) for bit, (_, level) in enumerate(_FACTS
 RUN = Packet(
     "run",
     0x101,
-    "once, at start",
+    "at start, and after a change of the best known UTC",
     "Configuration, software and devices of the run",
     (
         Field("config_name", "S64", "-", "name of the configuration"),
         Field("config_crc", "u4", "-", "CRC-32 of the configuration in the folder of the run"),
         Field("software", "S32", "-", "version of the flight application"),
         Field("seed", "u8", "-", "seed of the simulation, 0 on hardware"),
-        Field("utc_ns", "i8", "ns", "UTC at mission time zero since 1970, used only as a label"),
+        Field("utc_ns", "i8", "ns", "best known UTC at mission time zero since 1970, a label only"),
         flag("simulated", "whether the devices are emulated"),
         flag("realtime", "whether the run uses the machine's clock; no means lock-step simulation"),
         Field("control_period_ns", "u8", "ns", "period of the control rate group"),
@@ -550,7 +550,9 @@ FIX = Packet(
         Field("velocity_sigma", "f4", "m/s", "standard deviation of the velocity per axis; NaN if unknown"),
         Field("satellites", "u1", "-", "number of GPS satellites"),
         flag("used", "whether the orbit was updated; no means that the fix contradicts the known orbit"),
+        Field("clock_off", "f8", "s", "host's UTC minus the UTC of the newest used fix; NaN before a fix"),
     ),
+    version=2,
 )
 
 GPS_LINK = Packet(

@@ -6,15 +6,17 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from flight.link.telemetry.definitions import GPS_LINK, Packet
 from flight.link.telemetry.log import Recorder
-from flight.loop.facts import EventLog, Facts, Services, Streams
-from flight.loop.navigation import Positioning
+from flight.loop.facts import EventLog, Facts, FlightClock, Services, Streams
+from flight.loop.navigation import GPS_DELAY_NS, Positioning
 from hal.interfaces.devices import GpsLink, GpsReading
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
 
+UTC_NS = 1_800_000_000 * SECOND_NS
 LINK = GpsLink(1000, 10, 2, 0, 50, 0, 0, 0, 0, 0, 0, "", 18.0, "", 0)
 
 
@@ -59,9 +61,10 @@ class Bench:
         self.receiver = Receiver()
         self.recorder = KeepingRecorder()
         events = EventLog(lambda kind, _1, _2, text: self.texts.setdefault(kind.name, []).append(text), 0)
-        clock = SimClock()
-        services = Services(clock, None, self.recorder, events, Facts(events), Streams(()))  # type: ignore[arg-type]  # no jobs
-        self.positioning = Positioning(self.receiver, lambda _: False, 60 * SECOND_NS, services)
+        self.clock = FlightClock(SimClock(UTC_NS))
+        services = Services(self.clock, None, self.recorder, events, Facts(events), Streams(()))  # type: ignore[arg-type]  # no jobs
+        self.used = False
+        self.positioning = Positioning(self.receiver, lambda _: self.used, 60 * SECOND_NS, services)
         self.positioning.begin(0)
         self._now_ns = 0
 
@@ -111,3 +114,22 @@ def test_a_fix_that_is_not_valid_is_not_offered_to_the_body() -> None:
     bench.receiver.readings = [GpsReading(0, 0, 0, zero, zero, 1.0, 1.0, 9, False)]
     bench.run(3)
     assert "gps-refused" not in bench.texts
+
+
+@pytest.mark.parametrize("off", [-86_400.0, -1.5, -0.4, 0.9, 3600.0])
+def test_the_receiver_corrects_a_clock_that_is_more_than_a_second_off(off: float) -> None:
+    bench, zero = Bench(), np.zeros(3)
+    assert bench.clock.utc_ns() == UTC_NS
+    true_ns = UTC_NS - round(off * SECOND_NS)
+    bench.receiver.readings = [
+        GpsReading(GPS_DELAY_NS, GPS_DELAY_NS, true_ns, zero, np.array([7e3, 0.0, 0.0]), 1.0, 1.0, 9, True)
+    ]
+    bench.run(2)
+    assert bench.clock.utc_ns() == UTC_NS, "the body refuses the fix"
+    bench.used = True
+    bench.run(2)
+    assert bench.clock.utc_ns() == (true_ns if abs(off) > 1.0 else UTC_NS)
+    assert ("clock-off" in bench.texts) is (abs(off) > 1.0)
+    bench.receiver.readings = []
+    bench.clock.sleep_until_ns(100 * SECOND_NS)
+    assert bench.clock.utc_ns() - 100 * SECOND_NS == (true_ns if abs(off) > 1.0 else UTC_NS)

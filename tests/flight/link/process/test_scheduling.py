@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,6 +24,7 @@ from flight.link.process.commanding import (
 )
 from flight.link.process.directives import Deletion, Directive, Listing, Scheduled
 from flight.link.regular_files import overwrite
+from flight.link.telemetry.definitions import RUN
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.flight.link.process.both_ends import BothEnds
 
@@ -258,3 +260,41 @@ def test_words_are_read_by_the_table() -> None:
     for wrong in ("", "mode up", "ping", "ping x", "slew 0.1 0.2"):
         with pytest.raises(CommandError):
             command_of_words(wrong)
+
+
+def label(link: BothEnds, utc_ns: int) -> bytes:
+    """Return the packet of a run that began now, at a UTC."""
+    fields: dict[str, Any] = {field.name: [0.0] * 3 if field.count == 3 else 0 for field in RUN.fields}
+    fields |= {"config_name": "orbit", "software": "1", "utc_ns": utc_ns - link.clock.now_ns()}
+    return link.packer.pack(RUN, link.clock.now_ns(), fields)
+
+
+def fly(link: BothEnds, seconds: int) -> None:
+    """Let a flight write a packet each second."""
+    for _ in range(seconds):
+        link.record(link.mode_packet(Mode.HOLD, "again"))
+        link.turn(1.0)
+
+
+@pytest.mark.parametrize("days", [2500, 40])
+def test_the_schedule_follows_the_utc_of_the_flight(link: BothEnds, days: int) -> None:
+    """The flight is a simulation, or has corrected the wall clock; a restart keeps the UTC."""
+    begun_ns = link.clock.utc_ns()
+    link.record(label(link, begun_ns))
+    link.turn(2.0)
+    simulated = timedelta(days=days)
+    link.record(label(link, link.clock.utc_ns() + round(simulated.total_seconds()) * 10**9))
+    fly(link, 3)
+    now = datetime.fromtimestamp(link.clock.utc_ns() * 1e-9, UTC) + simulated
+    early = send(link, Scheduled(f"{now - timedelta(seconds=20):%Y-%m-%dT%H:%M:%S}", "ping 1"))
+    assert f"it is {now:%Y-%m-%dT%H:%M}" in texts(link, early)[-1]
+    send(link, Scheduled(f"{now + timedelta(seconds=10):%Y-%m-%dT%H:%M:%S}", "ping 5"))
+    later = send(link, Scheduled(f"{now + timedelta(seconds=30):%Y-%m-%dT%H:%M:%S}", "ping 6"))
+    fly(link, 14)
+    assert [unpack(data) for data in link.obeyed] == [Ping(5)]
+    link.restart()
+    link.turn(5.0)
+    assert "not executed" not in " ".join(texts(link, later)), "the UTC of the flight is not known yet"
+    link.record(label(link, link.clock.utc_ns() + round(simulated.total_seconds()) * 10**9))
+    fly(link, 16)
+    assert [unpack(data) for data in link.obeyed] == [Ping(5), Ping(6)], texts(link, later)
