@@ -532,8 +532,7 @@ class Station:
         self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
         self._label, self._zero_utc_ns = b"", 0
         self._utc_offset_ns: int | None = None  # best known UTC minus the time of the host's clock
-        self._begun_ns = clock.now_ns()
-        self._status_ns = self._label_ns = clock.now_ns()
+        self._begun_ns = self._status_ns = self._label_ns = clock.now_ns()
         self._refusals_ns = deque([-2 * SECOND_NS] * _REFUSALS_A_SECOND, _REFUSALS_A_SECOND)
         self._received = self._refused_commands = 0
         self._problem = ""

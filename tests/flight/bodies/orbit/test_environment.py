@@ -12,10 +12,10 @@ import pytest
 from flight.bodies.orbit.environment import (
     CONFIRMED,
     FIRST_FIXES,
-    GPS_DELAY_NS,
     EstimatedEnvironment,
     Witness,
 )
+from flight.loop.navigation import GPS_DELAY_NS
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from hal.interfaces.devices import GpsReading
