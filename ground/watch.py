@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -30,6 +30,17 @@ _MAX_TIME = 1e15
 """Mission time (s) above which a packet is assumed to come from a damaged log."""
 _TIMEOUT_S = 2.0
 """Longest time (s) to wait for the answer to a ping."""
+
+
+class PacketSource(Protocol):
+    """A source of the packets of a flight, such as its log or its link."""
+
+    @property
+    def silence(self) -> float:
+        """Time (s) since the last packet."""
+
+    def new(self) -> dict[str, PacketArray]:
+        """Return the packets by name that arrived since the last call. Raises FlightError or UsageError."""
 
 
 class LogTail:

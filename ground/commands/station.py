@@ -9,6 +9,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -28,6 +29,7 @@ from ground.watch import (
     STREAMS,
     FlightState,
     LogTail,
+    PacketSource,
     PlainLines,
     answers,
     attitude_text,
@@ -102,13 +104,22 @@ def configure_watch(parser: argparse.ArgumentParser) -> None:
         "Show a flight in the terminal from its log: mode, attitude, coil currents, devices and events, "
         "while the log grows or up to its end. A terminal with rich (extra `watch`) shows a panel, "
         "otherwise plain lines are printed. With a flight's command socket, a ping every two seconds "
-        "requests its state, which is printed as plain lines. Ctrl-C ends. Exit status 0 if the flight has "
-        "ended or after Ctrl-C, 1 if the log stopped growing."
+        "requests its state, which is printed as plain lines. With --link the telemetry that the link "
+        "receives is shown. Ctrl-C ends. Exit status 0 if the flight has ended or after Ctrl-C, 1 if no "
+        "new packets arrive."
     )
-    parser.epilog = "example: knightcube watch runs/demo"
-    parser.add_argument(
-        "flight", metavar="RUN|SOCKET", help="folder of a run or of an archive, a socket, or HOST:PORT"
+    parser.epilog = (
+        "examples: knightcube watch runs/demo; "
+        "knightcube watch --link 192.0.2.7:5010 --keys keys/ground --once"
     )
+    way = parser.add_mutually_exclusive_group(required=True)
+    way.add_argument(
+        "flight",
+        metavar="RUN|SOCKET",
+        nargs="?",
+        help="folder of a run or of an archive, a socket, or HOST:PORT",
+    )
+    add_link_options(parser, way)
     text = "mission time between plain lines (default %(default)g s)"
     parser.add_argument("--every", type=positive, default=10.0, metavar="S", help=text)
     text = "time without new packets before the command ends (default %(default)g s)"
@@ -120,14 +131,34 @@ def configure_watch(parser: argparse.ArgumentParser) -> None:
 
 
 def run_watch(options: argparse.Namespace) -> int:
-    """Show a flight until the flight ends, the log stops growing, or a signal arrives."""
+    """Show a flight until the flight ends, no new packets arrive, or a signal arrives."""
+    if options.link is not None:
+        from ground.console.commanding import LinkFeed  # noqa: PLC0415 - not needed by the other commands
+
+        with contextlib.closing(LinkFeed(terminal_of(options))) as feed:
+            return _watch(options, feed, options.patience, "over the link")
     folder = Path(options.flight)
     if folder.is_socket() or (":" in options.flight and not folder.exists()):
         return _watch_socket(options)
     runs = find_runs(folder)
-    tail, state = LogTail(runs[-1] if runs else folder), FlightState()
+    return _watch(options, LogTail(runs[-1] if runs else folder), 0.0, "and no stop event in the log")
+
+
+def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: str) -> int:
+    """Show the flight whose packets come from `tail`.
+
+    `wait` is the longest time (s) to wait for a first complete state, and `where` ends the message that no
+    more packets arrive.
+    """
+    state = FlightState()
     if options.json or options.once:
         state.update(tail.new())
+        until = time.monotonic() + wait
+        while not {"attitude", "health"} <= state.newest.keys() and time.monotonic() < until:
+            state.update(tail.new())
+        if not state.newest:
+            sys.stderr.write(f"knightcube: no packet in {wait:g} s {where}\n")
+            return 1
         line = state_line(state) + (f"  ended: {state.ended}" if state.ended else "")
         sys.stdout.write((json.dumps(_facts(state)) if options.json else line) + "\n")
         return 0
@@ -138,7 +169,7 @@ def run_watch(options: argparse.Namespace) -> int:
             while not (state.ended or tail.silence > options.patience or ended.wait(_READ_S)):
                 refresh()
     if not state.ended and not ended.is_set():
-        sys.stderr.write(f"knightcube: no new packet for {tail.silence:.0f} s and no stop event in the log\n")
+        sys.stderr.write(f"knightcube: no new packet for {tail.silence:.0f} s {where}\n")
         return 1
     return 0
 
@@ -161,7 +192,7 @@ def _ending() -> Iterator[threading.Event]:
 
 
 @contextlib.contextmanager
-def _lines(state: FlightState, tail: LogTail, every: float) -> Iterator[Callable[[], None]]:
+def _lines(state: FlightState, tail: PacketSource, every: float) -> Iterator[Callable[[], None]]:
     """Yield a function that prints the new packets as plain lines."""
     lines = PlainLines(state, every, sys.stdout.write)
 
@@ -172,7 +203,9 @@ def _lines(state: FlightState, tail: LogTail, every: float) -> Iterator[Callable
     yield refresh
 
 
-def _panel(state: FlightState, tail: LogTail) -> contextlib.AbstractContextManager[Callable[[], None]] | None:
+def _panel(
+    state: FlightState, tail: PacketSource
+) -> contextlib.AbstractContextManager[Callable[[], None]] | None:
     """Return a context with a function that updates the panel, or None without rich."""
     try:
         from rich.live import Live  # noqa: PLC0415 - an extra

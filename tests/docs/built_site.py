@@ -1,7 +1,8 @@
 """Checks the built site: `python -m tests.docs.built_site build/site`; exit 1 on a find.
 
 The pages must be readable without a network, so no page may load anything from another host. Links to
-follow are allowed.
+follow are allowed. Where Chromium is installed, the search of the site is tried on a page that is opened as a
+file: guides must stand before pages of modules.
 """
 
 from __future__ import annotations
@@ -9,9 +10,21 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+from collections.abc import Mapping
 from html.parser import HTMLParser
 from pathlib import Path
 
+from tests.support import browser
+
+FIRST_FOUND = {
+    "star tracker": "library/star-tracker.html",
+    "add a device": "extending/device.html",
+    "own satellite": "fly/my-satellite.html",
+    "campaigns": "fly/simulation.html",
+    "renewal": "fly/renewal.html",
+    "day of operations": "fly/day-of-operations.html",
+}
+"""Searched words, and the page that must stand first among the results."""
 _LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href", "object": "data"}
 _OTHER_HOST = re.compile(r"^(https?:)?//")
 _STYLE_URL = re.compile(r"(?:url\(|@import)\s*[\"']?((?:https?:)?//[^\"')\s]+)")
@@ -51,6 +64,23 @@ def problems_of(site: Path) -> list[str]:
     return found
 
 
+def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> list[str]:
+    """Return a line for each search whose first result is not the right page. Needs Chromium."""
+    found: list[str] = []
+    item = "li.md-search-result__item > a.md-search-result__link"
+    with browser.browsing() as chromium:
+        page = chromium.new_page()
+        for words, right in first_found.items():
+            page.goto((site.resolve() / "index.html").as_uri())
+            page.click(".md-search__input")
+            page.keyboard.type(words)
+            page.wait_for_selector(item, timeout=60_000)
+            first = str(page.get_attribute(item, "href")).partition("?")[0]
+            if not first.endswith(f"/{right}"):
+                found.append(f"search {words!r}: the first result is {first}, not {right}")
+    return found
+
+
 def main() -> int:
     """Check a site; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.docs.built_site", description=__doc__)
@@ -58,6 +88,10 @@ def main() -> int:
     site = parser.parse_args().site
     pages = len(list(site.rglob("*.html")))
     found = problems_of(site) if pages else [f"{site}: no pages"]
+    if pages and (missing := browser.missing()):
+        sys.stderr.write(f"documentation: the search was not tried, because {missing}\n")
+    elif pages:
+        found += wrong_searches(site)
     for line in found:
         sys.stderr.write(f"{line}\n")
     sys.stdout.write(f"documentation: {pages} pages in {site}, {len(found)} problems\n")

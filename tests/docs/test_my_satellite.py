@@ -55,9 +55,12 @@ def test_the_commands_of_two_line_elements_print_the_same_section() -> None:
 
 
 def newcomer() -> tuple[list[str], list[str]]:
-    """Return the commands of the page that install the software, and those that fly one's own satellite."""
-    first, second = [one for one in blocks() if one.page == "docs/fly/my-satellite.md" and one.commands][:2]
-    return first.commands, second.commands
+    """Return the tutorial's commands that install the software, and those that fly one's own satellite."""
+    install, fly = (
+        next(one.commands for one in blocks() if one.page == "docs/tutorial.md" and word in one.text)
+        for word in ("git clone", "new-satellite")
+    )
+    return install, fly
 
 
 def test_a_newcomer_needs_at_most_ten_commands() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import os
@@ -20,7 +21,7 @@ import pytest
 from flight.link import events
 from flight.link.telemetry.definitions import ATTITUDE, EVENT, HEALTH, MODE, PACKETS, Packet
 from flight.link.telemetry.log import find_segments
-from flight.link.telemetry.packets import Packer
+from flight.link.telemetry.packets import Packer, PacketArray
 from ground.commands import station
 from ground.telemetry import read_run, scan
 from ground.watch import FlightState, LogTail, PlainLines, state_line
@@ -304,3 +305,27 @@ def test_a_folder_without_a_log_is_refused(tmp_path: Path) -> None:
         LogTail(tmp_path)
     with pytest.raises(UsageError, match="no such folder"):
         LogTail(tmp_path / "none")
+
+
+class Portions:
+    """Packets that arrive in portions, as over a link."""
+
+    silence = 0.0
+
+    def __init__(self, *portions: bytes) -> None:
+        self.left = list(portions)
+
+    def new(self) -> dict[str, PacketArray]:
+        return scan(self.left.pop(0) if self.left else b"").packets
+
+
+def test_one_look_over_a_link_waits_for_a_complete_state(capsys: pytest.CaptureFixture[str]) -> None:
+    packer = Packer()
+    health, attitude = pack(packer, HEALTH, 5.0, mode=3, slips=4), pack(packer, ATTITUDE, 5.1, mode=3)
+    options = argparse.Namespace(once=True, json=False)
+    assert station._watch(options, Portions(b"", health, attitude), 20.0, "over the link") == 0
+    shown = capsys.readouterr().out
+    assert "5.100 s" in shown
+    assert "slips 4" in shown
+    assert station._watch(options, Portions(), 0.01, "over the link") == 1
+    assert "no packet in 0.01 s over the link" in capsys.readouterr().err

@@ -14,13 +14,13 @@ from flight.app.cli import main
 from tests.support.places import ROOT
 
 
-def command(*arguments: str | Path) -> CompletedProcess[str]:
-    """Type a command in the repository's folder; return its status, its output and its complaints."""
+def command(*arguments: str | Path, folder: Path = ROOT) -> CompletedProcess[str]:
+    """Run a command in a folder, by default the repository; return its status and outputs."""
     words = [str(word) for word in arguments]
     raw, complaint = io.BytesIO(), io.StringIO()
     output = io.TextIOWrapper(raw, encoding="utf-8", write_through=True)
     with (
-        contextlib.chdir(ROOT),
+        contextlib.chdir(folder),
         contextlib.redirect_stdout(output),
         contextlib.redirect_stderr(complaint),
     ):

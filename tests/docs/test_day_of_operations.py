@@ -1,0 +1,95 @@
+"""The page "A day of operations": its commands are run in order against a simulated satellite."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.docs.blocks import blocks
+from tests.flight.app.cli.linked_board import free_ports
+from tests.ground.commands.in_process import command
+from tests.support.places import ROOT
+
+PAGE = "docs/fly/day-of-operations.md"
+ENVIRONMENT = {
+    **os.environ,
+    "PYTHONPATH": str(ROOT),
+    "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+}
+READY_S = 100.0
+
+
+@contextlib.contextmanager
+def in_background(line: str, folder: Path, is_ready: Callable[[Path], bool]) -> Iterator[None]:
+    """Run a command until the end of the context, which begins when `is_ready`, given its output, is true."""
+    log = folder / f"{line.split()[1]}.log"
+    with (
+        log.open("wb") as file,
+        subprocess.Popen(
+            line.split(), cwd=folder, env=ENVIRONMENT, stdout=file, stderr=subprocess.STDOUT
+        ) as process,
+    ):
+        try:
+            until = time.monotonic() + READY_S
+            while not is_ready(log):
+                assert process.poll() is None, log.read_text(encoding="utf-8")
+                assert time.monotonic() < until, log.read_text(encoding="utf-8")
+                time.sleep(0.1)
+            yield
+        finally:
+            process.terminate()
+
+
+def run(line: str, folder: Path, satellite: str) -> str:
+    """Run a command of the ground and return what it printed. Most run in this process, to save time."""
+    words = shlex.split(line.replace("$SATELLITE", satellite))
+    if words[0] == "knightcube" and not {"|", ">"} & set(words):
+        done = command(*words[1:], folder=folder)
+    else:
+        done = subprocess.run(
+            ["bash", "-c", line],
+            cwd=folder,
+            env={**ENVIRONMENT, "SATELLITE": satellite},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+    assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_the_commands_of_the_page_operate_a_simulated_satellite(tmp_path: Path) -> None:
+    first, link, export, *ground = [
+        block.commands
+        for block in blocks()
+        if block.page == PAGE and block.commands and block.mark == "run by"
+    ]
+    keys, copy, fly = first
+    (port,) = free_ports([socket.SOCK_DGRAM])
+    satellite = export[0].partition("=")[2].strip('"').replace("5010", str(port))
+    run(keys, tmp_path, satellite)
+    run(copy.replace("~/knightcube", str(ROOT)), tmp_path, satellite)
+    practice = tmp_path / "practice.yaml"
+    practice.write_text(practice.read_text(encoding="utf-8").replace("5010", str(port)), encoding="utf-8")
+    with (
+        in_background(fly, tmp_path, lambda _: (tmp_path / "practice.socket").exists()),
+        in_background(link[0], tmp_path, lambda log: "link open on" in log.read_text(encoding="utf-8")),
+    ):
+        printed = {line: run(line, tmp_path, satellite) for lines in ground for line in lines}
+    shown = [text for line, text in printed.items() if "ping" in line or "mode point" in line]
+    assert all("started" in text for text in shown)
+    watched = [text for line, text in printed.items() if "watch" in line]
+    assert watched
+    assert "Berlin" in next(text for line, text in printed.items() if "passes" in line)
