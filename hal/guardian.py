@@ -29,13 +29,12 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
 from hal.buses import linux_process
 from hal.buses.clock import SystemClock
-from hal.drivers.pca9685 import switch_off
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.guardian import ACTED, BEAT, BYE, FAILED, READY, CoilReach, GuardianNews
 
@@ -122,23 +121,25 @@ class ByteWriter(Protocol):
 class CoilSwitch:
     """Switch that sets the coils to zero over an I2C bus, which is reopened after each failure."""
 
-    def __init__(self, opener: Callable[[str], ByteWriter], where: str, address: int) -> None:
+    def __init__(self, opener: Callable[[str], ByteWriter], where: str, numbers: Sequence[int]) -> None:
+        """Use writes given by three `numbers` each: address, register and value."""
         self._opener = opener
         self._where = where
-        self._address = address
+        self._writes = tuple(zip(numbers[::3], numbers[1::3], numbers[2::3], strict=True))
         self._bus: ByteWriter | None = None
 
     def off(self) -> bool:
-        """Write zero once and return whether the PWM chip acknowledged the write."""
-        try:
-            if self._bus is None:
-                self._bus = self._opener(self._where)
-            # The function switch_off is typed for a complete bus, but needs only write_byte_data.
-            switch_off(self._bus, self._address, tries=1)  # type: ignore[arg-type]
-        except (OSError, NotResponding):
-            self.close()
-            return False
-        return True
+        """Execute each write once and return whether the chips acknowledged all of them."""
+        acknowledged = True
+        for write in self._writes:
+            try:
+                if self._bus is None:
+                    self._bus = self._opener(self._where)
+                self._bus.write_byte_data(*write)
+            except OSError:
+                self.close()
+                acknowledged = False
+        return acknowledged
 
     def close(self) -> None:
         """Close the bus."""
@@ -206,17 +207,16 @@ class Guardian:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the guardian with the arguments DESCRIPTOR OPENER WHERE ADDRESS, as `GuardianLine` starts it."""
-    descriptor, opener, where, address = arguments
+    """Run the guardian with the arguments DESCRIPTOR OPENER WHERE NUMBER..., as `GuardianLine` starts it."""
+    descriptor, opener, where, *numbers = arguments
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     module, _, function = opener.partition(":")
     flight = socket.socket(fileno=int(descriptor))
-    switch = CoilSwitch(getattr(importlib.import_module(module), function), where, int(address))
+    opened = getattr(importlib.import_module(module), function)
+    switch = CoilSwitch(opened, where, [int(number, 0) for number in numbers])
     if not switch.off():
-        sys.stderr.write(
-            f"guardian: the coils' PWM chip at 0x{int(address):02x} on {where} does not answer\n"
-        )
+        sys.stderr.write(f"guardian: the coils' chip at {numbers[0]} on {where} does not answer\n")
     _survive()
     Guardian(flight, switch, SystemClock().now_ns).serve()
     switch.close()
@@ -334,7 +334,7 @@ class GuardianLine:
             raise NotResponding(DEVICE, f"no line to it: {error.strerror}") from error
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _QUEUE_BYTES)
         reach = self._reach
-        words = [str(theirs.fileno()), reach.opener, reach.where, str(reach.address)]
+        words = [str(theirs.fileno()), reach.opener, reach.where, *reach.words]
         try:
             process = subprocess.Popen(
                 # The options -S and -E skip site-packages and environment variables, for a fast start.

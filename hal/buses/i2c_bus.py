@@ -20,7 +20,7 @@ from fcntl import ioctl
 from pathlib import Path
 from typing import TypeVar
 
-from smbus2 import I2cFunc, SMBus
+from smbus2 import I2cFunc, SMBus, i2c_msg
 
 from hal.buses.smbus_byte import I2C_TIMEOUT
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused
@@ -125,6 +125,14 @@ class LinuxI2cBus:
         """Write at most 32 bytes to consecutive registers of a device."""
         _check_length(len(values))
         self._transact(address, lambda bus: bus.write_i2c_block_data(address, register, list(values)))
+
+    def exchange(self, address: int, data: bytes, count: int) -> bytes:
+        """Write `data` if there are any, then read `count` bytes after a repeated START, if any."""
+        messages = [i2c_msg.write(address, data)] if data or not count else []
+        if count:
+            messages.append(i2c_msg.read(address, count))
+        self._transact(address, lambda bus: bus.i2c_rdwr(*messages))
+        return bytes(messages[-1]) if count else b""
 
     def close(self) -> None:
         """Close the bus. Calling `close` again has no effect."""

@@ -29,31 +29,36 @@ FAILED = b"x"
 
 
 NOTE = "coils"
-"""Name of the file that contains the I2C bus and address of the coils' PWM chip."""
+"""Name of the file that contains the I2C bus of the coils' chips and the writes that switch them off."""
 
 
 @dataclass(frozen=True, slots=True)
 class CoilReach:
-    """Access to the coils' PWM chip for a process without numpy.
+    """Access to the coils' chips for a process without numpy.
 
     Attributes:
         opener: function that opens the bus, written as `module:function`.
         where: argument of this function, such as a device file.
-        address: I2C address of the PWM chip.
+        writes: I2C writes (address, register, value) that switch all coils off in any state of the chips.
     """
 
     opener: str
     where: str
-    address: int
+    writes: tuple[tuple[int, int, int], ...]
+
+    @property
+    def words(self) -> list[str]:
+        """The numbers of the writes as hexadecimal words."""
+        return [f"0x{number:02x}" for write in self.writes for number in write]
 
     def note(self, folder: Path) -> None:
-        """Write the bus and address durably to a file in `folder`, for the script `deploy/coils-off`.
+        """Write the bus and the writes durably to a file in `folder`, for the script `deploy/coils-off`.
 
-        The file also contains the SHA-256 of bus and address, as a checksum. Never raises.
+        The file also contains the SHA-256 of its text, as a checksum. Never raises.
         """
         import hashlib  # noqa: PLC0415 - the guardian, which imports this module, needs no checksum
 
-        text = f"{self.where} 0x{self.address:02x}".encode()
+        text = " ".join((self.where, *self.words)).encode()
         beside = folder / f"{NOTE}.part"
         with contextlib.suppress(OSError):
             with beside.open("wb") as note:

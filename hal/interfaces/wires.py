@@ -117,23 +117,34 @@ class I2cBus(Protocol):
         """Close the bus. Calling `close` again has no effect."""
 
 
-@dataclass(frozen=True, slots=True)
-class Wires:
-    """Connections to the hardware, on which the drivers operate.
+class RawI2cBus(I2cBus, Protocol):
+    """I2C bus that also executes transactions without a register address."""
 
-    Attributes:
-        serial: serial port of the inertial unit.
-        i2c: I2C bus of the coils and monitors.
-        frames: star camera, None if not fitted.
-        gps: serial port of the GPS receiver, None if not fitted.
-        wide: wide-angle cameras of a satellite.
+    def exchange(self, address: int, data: bytes, count: int) -> bytes:
+        """Write `data` if there are any, then read `count` bytes after a repeated START, if any."""
+
+
+class SpiDevice(Protocol):
+    """One device on an SPI bus, which its chip select line selects during each transfer."""
+
+    def transfer(self, data: bytes) -> bytes:
+        """Send `data`, and return the bytes received meanwhile. Raises OSError."""
+
+
+class Wires(Protocol):
+    """Connections to the devices, opened by name: those of the board, or emulated ones of the same names.
+
+    A connection that is already open is returned again, and all are closed at the end of the flight.
     """
 
-    serial: SerialPort
-    i2c: I2cBus
-    frames: FrameSource | None
-    gps: SerialPort | None = None
-    wide: tuple[FrameSource, ...] = ()
+    def serial(self, device: str, baud_rate: int) -> SerialPort:
+        """Return the serial port of a device file. Raises NotResponding."""
+
+    def i2c(self, bus: int | str | None = None) -> RawI2cBus:
+        """Return an I2C bus, by number or device file; None means the bus of the coils. Raises DeviceError."""
+
+    def spi(self, device: str, speed_hz: int, mode: int) -> SpiDevice:
+        """Return a device on an SPI bus, for example `/dev/spidev0.0`. Raises DeviceError."""
 
 
 class HostFaults(Protocol):
@@ -165,6 +176,8 @@ class Rig:
         latency: simulated latencies of planner and vision (ns), used in a lock-step simulation only.
         reach: access of the guardian to the coils, used in real time only.
         host: simulated faults inside the flight process, None for no faults.
+        cameras: emulated cameras, first the star camera, if fitted; None if the drivers open real cameras.
+        earliest_utc_ns: UTC (ns since 1970) before the flight, by which a GPS receiver's week is resolved.
     """
 
     clock: Clock
@@ -175,3 +188,5 @@ class Rig:
     latency: tuple[int, int] = (0, 0)
     reach: CoilReach | None = None
     host: HostFaults | None = None
+    cameras: tuple[FrameSource | None, ...] | None = None
+    earliest_utc_ns: int = 0

@@ -123,6 +123,11 @@ class EmulatedI2cBus:
         _check_length(len(values))
         self.send(address, bytes((register, *values)))
 
+    def exchange(self, address: int, data: bytes, count: int) -> bytes:
+        """Write `data` if there are any, then read `count` bytes after a repeated START, if any."""
+        messages = [Message(address, data)] if data or not count else []
+        return b"".join(self.transfer([*messages, Message(address, count=count)] if count else messages))
+
     def close(self) -> None:
         """Close the bus. Safe to call twice."""
         self._closed = True

@@ -91,9 +91,12 @@ class DeviceLink:
 class RemoteI2cBus:
     """An I2cBus whose chips are in the server process. The bus is safe for several threads."""
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], name: str = "") -> None:
+        """Connect to the bus `name` of the server, or to the bus of the coils if `name` is empty."""
         self._link = DeviceLink(path)
         self._lock = threading.Lock()
+        if name:
+            self.call("select", name)
 
     def call(self, name: str, *arguments: Any) -> Any:
         """Send a request and wait for its answer. Raises OSError as a bus does."""
@@ -129,6 +132,14 @@ class RemoteI2cBus:
     def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
         """Write a block."""
         self.call("write_i2c_block_data", address, register, list(values))
+
+    def exchange(self, address: int, data: bytes, count: int) -> bytes:
+        """Write and read bytes without a register address."""
+        return bytes(self.call("exchange", address, list(data), count))
+
+    def transfer(self, data: bytes) -> bytes:
+        """Transfer bytes, if the selected name is that of an SPI device."""
+        return bytes(self.call("spi", list(data)))
 
     def close(self) -> None:
         """Close the connection."""

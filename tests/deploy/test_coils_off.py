@@ -98,7 +98,7 @@ def test_it_tries_again_and_says_so_when_all_is_in_vain(tools: Tools) -> None:
 
 def test_the_units_address_and_the_one_last_flown_are_both_written(tools: Tools) -> None:
     tools.put("i2cset", 0)
-    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", 0x42).note(tools.folder)
+    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", ((0x42, 0xFD, 0x10),)).note(tools.folder)
     status, calls, said = tools.run(KNIGHTCUBE_I2C="/dev/i2c-3", KNIGHTCUBE_PWM="0x41")
     assert (status, said) == (0, "")
     assert sorted(calls) == ["i2cset -y 3 0x41 0xfd 0x10 b", "i2cset -y 7 0x42 0xfd 0x10 b"]
@@ -106,10 +106,32 @@ def test_the_units_address_and_the_one_last_flown_are_both_written(tools: Tools)
 
 def test_an_address_that_the_unit_and_the_note_share_is_written_once(tools: Tools) -> None:
     tools.put("i2cset", 0)
-    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-3", 0x41).note(tools.folder)
+    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-3", ((0x41, 0xFD, 0x10),)).note(tools.folder)
     assert tools.run(KNIGHTCUBE_I2C="/dev/i2c-3", KNIGHTCUBE_PWM="0x41")[1] == [
         "i2cset -y 3 0x41 0xfd 0x10 b"
     ]
+
+
+def test_every_write_of_a_unit_and_of_a_note_is_executed_whatever_another_chip_does(tools: Tools) -> None:
+    """Bridges with an I2C interface are one chip a coil; each has a register of its own to be cleared."""
+    (tools.folder / "bin/i2cset").write_text(
+        f'#!/bin/sh\necho "$*" >>"{tools.folder}/calls"\n[ "$3" != 0x61 ]\n', encoding="utf-8"
+    )
+    (tools.folder / "bin/i2cset").chmod(0o755)
+    tools.put("python3", 1)
+    writes = tuple((address, 0x00, 0x00) for address in (0x60, 0x61, 0x62))
+    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", writes).note(tools.folder)
+    status, calls, said = tools.run(
+        KNIGHTCUBE_I2C="/dev/i2c-3", KNIGHTCUBE_PWM="0x44 0x02 0x00 0x45 0x02 0x00"
+    )
+    assert status == 0, "the unit's chips acknowledged"
+    written = {call for call in calls if call.startswith("-y")}
+    assert written == {
+        *(f"-y 7 0x6{n} 0x00 0x00 b" for n in range(3)),
+        *(f"-y 3 0x4{n} 0x02 0x00 b" for n in (4, 5)),
+    }
+    assert "0x61 on /dev/i2c-7 does not answer" in said
+    assert "0x62" not in said
 
 
 def test_an_address_that_hangs_keeps_the_other_from_nothing(tools: Tools) -> None:
@@ -121,7 +143,9 @@ def test_an_address_that_hangs_keeps_the_other_from_nothing(tools: Tools) -> Non
     (tools.folder / "bin/i2cset").chmod(0o755)
     for hanging, other in (("note", "unit"), ("unit", "note")):
         addresses = {hanging: 0x42, other: 0x41}
-        CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", addresses["note"]).note(tools.folder)
+        CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", ((addresses["note"], 0xFD, 0x10),)).note(
+            tools.folder
+        )
         with tools.start(KNIGHTCUBE_PWM=f"0x{addresses['unit']:02x}") as process:
             calls = tools.folder / "calls"
             while not calls.exists() or sorted(calls.read_text(encoding="ascii").split()) != ["0x41", "0x42"]:
@@ -175,7 +199,7 @@ def test_of_the_known_addresses_each_that_acknowledges_is_off_whatever_another_d
     if refusals:
         chips.bus.nack(0x41, refusals)
     tools.emulate(tools.folder / "bus.sock")
-    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", note).note(tools.folder)
+    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", ((note, 0xFD, 0x10),)).note(tools.folder)
     process = tools.start(KNIGHTCUBE_I2C="/dev/i2c-7", KNIGHTCUBE_PWM=f"0x{unit:02x}")
     while process.poll() is None:
         chips.server.serve(0.02)
@@ -208,7 +232,7 @@ def test_half_a_note_counts_for_nothing(tools: Tools, half: str) -> None:
 
 def test_a_note_with_a_flipped_bit_writes_to_no_other_chip(tools: Tools) -> None:
     tools.put("i2cset", 0)
-    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", 0x42).note(tools.folder)
+    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", ((0x42, 0xFD, 0x10),)).note(tools.folder)
     whole = (tools.folder / "coils").read_bytes()
     for place in (3, 9, 14, 16, 40, 79):
         (tools.folder / "coils").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
@@ -235,9 +259,9 @@ def test_the_note_is_on_the_disk_before_it_has_its_name(
 
     monkeypatch.setattr("hal.interfaces.guardian.os.fsync", sync)
     monkeypatch.setattr(Path, "replace", replace)
-    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/knightcube-i2c", 0x42).note(tmp_path)
+    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/knightcube-i2c", ((0x42, 0xFD, 0x10),)).note(tmp_path)
     assert done == ["note", "name", "folder"]
-    text = "/dev/knightcube-i2c 0x42"
+    text = "/dev/knightcube-i2c 0x42 0xfd 0x10"
     digest = hashlib.sha256(text.encode()).hexdigest()
     assert (tmp_path / "coils").read_text(encoding="ascii") == f"{text} {digest}\n"
 

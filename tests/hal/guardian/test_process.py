@@ -30,7 +30,7 @@ def log(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def guardian(log: Path) -> Iterator[GuardianLine]:
-    line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", str(log), ADDRESS))
+    line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", str(log), ((ADDRESS, 0xFD, 0x10),)))
     line.wait_ready(10.0)
     yield line
     line.close()
@@ -103,7 +103,7 @@ _FLIGHT = """
 import sys, time
 from hal.interfaces.guardian import CoilReach
 from hal.guardian import GuardianLine
-line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", sys.argv[1], int(sys.argv[2])))
+line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", sys.argv[1], ((int(sys.argv[2]), 0xFD, 0x10),)))
 line.wait_ready(20.0)
 print(line.process_id, flush=True)
 time.sleep(60.0)
@@ -168,7 +168,7 @@ def test_a_silent_chip_is_reported_once_and_tried_again(guardian: GuardianLine, 
 
 def test_a_chip_that_is_silent_at_the_start_is_refused(log: Path) -> None:
     Path(f"{log}.broken").touch()
-    line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", str(log), ADDRESS))
+    line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", str(log), ((ADDRESS, 0xFD, 0x10),)))
     try:
         with pytest.raises(NotResponding, match="PWM chip"):
             line.wait_ready(0.5)

@@ -45,7 +45,7 @@ class DamagedBoard:
         (self._state / "releases.json").write_bytes(starts_record({SECOND: 1}, FIRST))
         note_boot([self._state], 7)
         StateStore(self._state, lambda *_: None).store(StoredState(boot_count=7))
-        CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", 0x42).note(self._state)
+        CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", ((0x42, 0xFD, 0x10),)).note(self._state)
         keys = self._link / "keys"
         keys.mkdir(parents=True)
         vault = Vault(keys, self._link / "witness")
