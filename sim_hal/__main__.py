@@ -20,6 +20,7 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.document import config_path, names
 from hal.buses.clock import SystemClock
+from hal.buses.i2c_bus import device_file
 from knightcube.errors import UsageError
 from sim_hal.emulators.serial_line import PtyLine
 from sim_hal.emulators.vn100 import BAUD_RATES, Vn100Emulator, Vn100EmulatorSettings
@@ -162,13 +163,11 @@ def _serve(options: argparse.Namespace) -> int:
         signal.signal(signal_number, server.stop)
     try:
         facts = {
-            "serial": server.serial_device,
-            "baud_rate": config.inertial_unit.baud_rate,
             "socket": str(server.socket_path),
             "camera": config.camera is not None,
-            "gps": server.gps_device,
+            "lines": server.lines,
+            "coil_bus": device_file(config.coils.bus),
             "utc_offset_ns": server.hardware.utc_offset_ns,
-            "gps_baud_rate": None if config.gps is None else config.gps.baud_rate,
             "wide": len(config.wide_cameras),
         }
         if options.facts is not None:

@@ -12,11 +12,20 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from flight.schema.devices import Camera, UnitCalibration, WideCamera
+from flight.schema.devices import (
+    Camera,
+    Coils,
+    Gps,
+    InertialUnitSection,
+    PowerMonitorSection,
+    SolarStringsSection,
+    UnitCalibration,
+    WideCamera,
+)
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
@@ -26,8 +35,9 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.vision.camera.lens import Lens, Pinhole
-from sim_hal.clock import EmulatedDevice, FaultTimeline, SerialEnd, TimedSimulation
+from sim_hal.clock import FaultTimeline, TimedSimulation
 from sim_hal.description_errors import NO_ERRORS, description_errors
+from sim_hal.emulation import EmulatedWires, Emulation, emulated
 from sim_hal.emulators.camera import EmulatedCamera, Expose, no_objects
 from sim_hal.emulators.coil_circuit import CoilCircuit, CoilCondition, EmulatedIna219
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
@@ -48,17 +58,15 @@ from sim_hal.worlds.world import (
 
 if TYPE_CHECKING:
     from sim_hal.earth_camera import EarthCameraModel, EarthScene
-    from sim_hal.emulators.gps import EmulatedGps
+    from sim_hal.emulators.gps import EmulatedGps, GpsErrors
     from sim_hal.emulators.solar_cells import EmulatedSolarCells
     from sim_hal.star_camera import SourceTrack, StarCameraModel
     from sim_hal.star_camera.objects import SkyObjects
 
 BUS_VOLTAGE = 5.0
 """Supply voltage (V) of the coils before the losses of the H-bridge (Sease, chapter 5: a 5 V power bus)."""
-GPS_LINE = 1
-"""Key of the random stream for faults of the GPS receiver's serial line."""
 READOUT_NS = 50_000_000
-_LINE_STREAM, _FAULT_STREAM, _ORBIT_STREAM = 0x11E, 0xFA017, 0x0B17
+_FAULT_STREAM, _ORBIT_STREAM = 0xFA017, 0x0B17
 _EARTH_RATE = 2.0 * math.pi * 1.002_737_909_35 / 86_400.0
 
 ExposeWide = Callable[["EarthCameraModel", "EarthScene", tuple[int, ...]], "Future[Image]"]
@@ -66,44 +74,44 @@ ExposeWide = Callable[["EarthCameraModel", "EarthScene", tuple[int, ...]], "Futu
 
 
 @dataclass(frozen=True, slots=True)
-class CoilHardware:
-    """The chips on the coils' I2C bus and the coil circuit. The current `monitor` may be None."""
-
-    bus: EmulatedI2cBus
-    pwm: EmulatedPca9685
-    monitor: EmulatedIna219 | None
-    circuit: CoilCircuit
-
-
-@dataclass(frozen=True, slots=True)
 class OrbitDevices:
     """The configured devices that need an orbit. The attribute `wide` holds the horizon cameras."""
 
-    gps: EmulatedGps | None = None
-    cells: EmulatedSolarCells | None = None
+    gps: Any = None
+    cells: Any = None
     wide: tuple[EmulatedCamera, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """All simulated devices. Drivers use only I2C bus and camera; faults and tests use all devices.
+    """All simulated devices. Drivers use only wires and cameras; faults and tests use all devices.
 
+    Devices of other packages' drivers are of any type; faults act on the devices of our drivers only.
     `utc_offset_ns` is the simulated UTC minus the simulation time, or None in a world without an orbit.
     """
 
     simulation: TimedSimulation
     world: World
-    unit: Vn100Emulator
-    bus: EmulatedI2cBus
-    pwm: EmulatedPca9685
-    monitor: EmulatedIna219 | None
-    circuit: CoilCircuit
+    wires: EmulatedWires
+    unit: Any
+    circuit: Any
+    monitor: Any
     camera: EmulatedCamera | None
     truth: TruthRecorder | None
     faults: FaultTimeline
     orbit: OrbitDevices
     objects: SkyObjects | None
     utc_offset_ns: int | None
+
+    @property
+    def bus(self) -> EmulatedI2cBus:
+        """The I2C bus of the coils."""
+        return self.wires.i2c()
+
+    @property
+    def pwm(self) -> Any:
+        """The PWM chip of the coils, if the coils are driven by one."""
+        return self.circuit.chip
 
     def release(self, epoch_ns: int) -> None:
         """Release the body at mission time zero, which is `epoch_ns`."""
@@ -118,57 +126,57 @@ def assemble(
     config: Config,
     section: Simulation,
     now_ns: Callable[[], int],
-    line: SerialEnd,
+    wires: EmulatedWires,
     truth: TruthRecorder | None = None,
     expose: Expose | None = None,
-    gps_line: SerialEnd | None = None,
     expose_wide: ExposeWide | None = None,
 ) -> Hardware:
-    """Build the hardware of `config` in the world of its simulation `section`.
+    """Build the hardware of `config` in the world of its simulation `section`, and connect it to `wires`.
 
-    The function `now_ns` returns the simulation time. `line` and `gps_line` are the device ends of the serial
-    lines. `expose` and `expose_wide` replace the renderers of the cameras, which in real time run in another
-    process. Raises ConfigError for an invalid world.
+    The function `now_ns` returns the simulation time. `expose` and `expose_wide` replace the renderers of the
+    cameras, which in real time run in another process. Raises ConfigError for an invalid world.
     """
     # All devices begin at one instant; in real time the clock runs on while they are built.
     start_ns = now_ns()
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
-    coils = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns)
-    world = make_world(WorldInputs(config, section, coils.circuit.currents, start_ns))
+    circuit, monitor = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wires)
+    world = make_world(WorldInputs(config, section, circuit.currents, start_ns))
     utc_offset_ns = world.utc_ns() - start_ns if isinstance(world, OrbitingWorld) else None
-    unit = _unit(config, section, world, coils.circuit, line, np.random.default_rng(unit_seed), start_ns)
+    receiver, currents = (np.random.default_rng([section.seed, _ORBIT_STREAM, n]) for n in range(2))
+    unit_generator = np.random.default_rng(unit_seed)
+    given = Emulation(
+        "inertial_unit",
+        wires,
+        config,
+        section,
+        unit_generator,
+        now_ns,
+        start_ns,
+        world,
+        _sense(config, section, world, circuit),
+        circuit.mean_supply,
+    )
+    unit = emulated(given)
     objects = sky_objects(section, start_ns, world)
-    camera = None
-    if config.camera is not None:
-        make = expose or inline_exposure(StarRenderer(config.camera, section.sky, section.seed))
-        if isinstance(world, OrbitingWorld):
-            from sim_hal.star_camera.objects import from_orbit  # noqa: PLC0415 - see above
-
-            make = from_orbit(make, world, config.camera, section.sky)
-        misaligned = from_rotation_vector(description_errors(config, section).camera)
-        mounting = multiply(np.array(config.camera.mounting), misaligned)
-        camera = emulated_camera(
-            config.camera, section.sky, world.motion, make, now_ns, objects, mounting=mounting
-        )
-    orbit = OrbitDevices()
-    if config.gps or config.solar_strings or config.wide_cameras:
-        orbit = assemble_orbit(config, section, world, start_ns, now_ns, gps_line, expose_wide)
-    for part in orbit.cells.parts if orbit.cells is not None else ():
-        coils.bus.attach(part)
+    camera = _star_camera(config, section, world, now_ns, objects, expose) if config.camera else None
+    orbit = OrbitDevices(
+        emulated(replace(given, kind="gps", generator=receiver)),
+        emulated(replace(given, kind="solar_strings", generator=currents)),
+        _horizon_cameras(config, section, world, now_ns, expose_wide or inline_wide),
+    )
     faults = FaultTimeline()
     if truth is not None:
         truth.watch(world, _true_description(config, section, world))
     # Devices with events at the same time run in the order of this list.
-    devices: list[EmulatedDevice | None] = [unit, camera, orbit.gps, *orbit.wide, faults, truth]
-    simulation = TimedSimulation(world.advance_to, [device for device in devices if device is not None])
+    devices = [unit, camera, orbit.gps, *orbit.wide, faults, truth, circuit, monitor, orbit.cells]
+    timed = [device for device in devices if hasattr(device, "next_event_ns")]
     return Hardware(
-        simulation,
+        TimedSimulation(world.advance_to, timed),
         world,
+        wires,
         unit,
-        coils.bus,
-        coils.pwm,
-        coils.monitor,
-        coils.circuit,
+        circuit,
+        monitor,
         camera,
         truth,
         faults,
@@ -176,6 +184,25 @@ def assemble(
         objects,
         utc_offset_ns,
     )
+
+
+def _star_camera(
+    config: Config,
+    section: Simulation,
+    world: World,
+    now_ns: Callable[[], int],
+    objects: SkyObjects | None,
+    expose: Expose | None,
+) -> EmulatedCamera:
+    assert config.camera is not None
+    make = expose or inline_exposure(StarRenderer(config.camera, section.sky, section.seed))
+    if isinstance(world, OrbitingWorld):
+        from sim_hal.star_camera.objects import from_orbit  # noqa: PLC0415 - see above
+
+        make = from_orbit(make, world, config.camera, section.sky)
+    misaligned = from_rotation_vector(description_errors(config, section).camera)
+    mounting = multiply(np.array(config.camera.mounting), misaligned)
+    return emulated_camera(config.camera, section.sky, world.motion, make, now_ns, objects, mounting=mounting)
 
 
 def _true_description(config: Config, section: Simulation, world: World) -> dict[str, FloatArray] | None:
@@ -200,26 +227,54 @@ def assemble_coils(
     section: Simulation,
     generator: np.random.Generator,
     now_ns: Callable[[], int],
-) -> CoilHardware:
-    """Build the coil hardware; the function `now_ns` returns the simulation time."""
-    coils, truth = config.coils, section.truth
-    if truth.resistance is not None and len(truth.resistance) != len(coils.slots):
-        problem = (
-            f"has {len(truth.resistance)} values: give one value for each of the {len(coils.slots)} coils"
-        )
+    wires: EmulatedWires,
+) -> tuple[Any, Any]:
+    """Build the coil circuit and the current monitor, which may be None.
+
+    The circuit of another package's coil driver has the methods `currents` and `mean_supply` of CoilCircuit.
+    """
+    truth = section.truth
+    if truth.resistance is not None and len(truth.resistance) != len(config.coils.slots):
+        given, coils = len(truth.resistance), len(config.coils.slots)
+        problem = f"has {given} values: give one value for each of the {coils} coils"
         raise ConfigError("simulation.truth.resistance", problem)
-    pwm = EmulatedPca9685(coils.address, now_ns)
+
+    def unknown(*_: int) -> Any:
+        raise AssertionError("coils are built before the world")
+
+    given_coils = Emulation(
+        "coils", wires, config, section, generator, now_ns, now_ns(), cast(World, None), unknown, unknown
+    )
+    circuit: Any = emulated(given_coils)
+    return circuit, emulated(replace(given_coils, kind="power_monitor", supply=circuit.mean_supply))
+
+
+def true_coils(emulation: Emulation, coils: Coils) -> CoilSettings:
+    """Return the true properties of the coils."""
+    truth = emulation.section.truth
     wired = wirings(coils.channels, truth.resistance or coils.resistance, coils.signs, coils.limits)
     supply = truth.supply_voltage or coils.supply_voltage
-    settings = CoilSettings(wired, supply, max(coils.limits), coils.stale_after)
-    circuit = CoilCircuit(pwm, settings, generator, now_ns, section.current_noise, BUS_VOLTAGE)
+    return CoilSettings(wired, supply, max(coils.limits), coils.stale_after)
+
+
+def emulate_pca9685(emulation: Emulation, coils: Coils) -> CoilCircuit:
+    """Connect an emulated PCA9685 to the bus, and return the circuit of the coils."""
+    pwm = EmulatedPca9685(coils.address, emulation.now_ns)
+    noise = emulation.section.current_noise
+    circuit = CoilCircuit(
+        pwm, true_coils(emulation, coils), emulation.generator, emulation.now_ns, noise, BUS_VOLTAGE
+    )
     for axis in coils.absent:
         circuit.become(axis, CoilCondition.OPEN)
-    monitor, fitted = None, config.power_monitor
-    if fitted is not None:
-        monitor = EmulatedIna219(fitted.address, now_ns, circuit.mean_supply, fitted.shunt)
-    bus = EmulatedI2cBus([pwm] if monitor is None else [pwm, monitor])
-    return CoilHardware(bus, pwm, monitor, circuit)
+    emulation.wires.i2c(coils.bus).attach(pwm)
+    return circuit
+
+
+def emulate_ina219(emulation: Emulation, fitted: PowerMonitorSection) -> EmulatedIna219:
+    """Connect an emulated INA219 to its bus."""
+    monitor = EmulatedIna219(fitted.address, emulation.now_ns, emulation.supply, fitted.shunt)
+    emulation.wires.i2c(fitted.bus).attach(monitor)
+    return monitor
 
 
 def _coil_field(config: Config, section: Simulation) -> FloatArray:
@@ -233,40 +288,38 @@ def _coil_field(config: Config, section: Simulation) -> FloatArray:
     return np.array([(*row, 0.0, 0.0)[:count] for row in rows])
 
 
-def _unit(
-    config: Config,
-    section: Simulation,
-    world: World,
-    circuit: CoilCircuit,
-    line: SerialEnd,
-    generator: np.random.Generator,
-    now_ns: int,
-) -> Vn100Emulator:
-    """Return the inertial unit, whose magnetometer has a bias and also measures the field of the coils."""
+def _sense(config: Config, section: Simulation, world: World, circuit: Any) -> Callable[[int], BodyMotion]:
+    """Return the motion at the inertial unit, whose magnetometer also measures the field of the coils."""
     errors, known = description_errors(config, section), config.inertial_unit.calibration
     gyro_matrix, field_matrix = np.array(known.gyro_matrix), np.array(known.field_matrix)
     gyro_matrix, offset = gyro_matrix @ errors.gyro, np.array(known.field_bias)
     coil_field, bias = _coil_field(config, section), np.array(section.imu.field_bias) + errors.field_bias
-    sense = world.motion
-    if coil_field.any() or bias.any() or errors is not NO_ERRORS or known != UnitCalibration():
+    if not (coil_field.any() or bias.any() or errors is not NO_ERRORS or known != UnitCalibration()):
+        return world.motion
 
-        def sense(time_ns: int) -> BodyMotion:
-            # The unit averages its magnetometer over one control period, so the mean coil currents are used.
-            motion = world.motion(time_ns)
-            field = errors.field @ (motion.field_body + coil_field @ circuit.currents()) + bias
-            field = field_matrix @ field + offset
-            return replace(motion, field_body=field, rate=gyro_matrix @ motion.rate)
+    def sense(time_ns: int) -> BodyMotion:
+        # The unit averages its magnetometer over one control period, so the mean coil currents are used.
+        motion = world.motion(time_ns)
+        field = errors.field @ (motion.field_body + coil_field @ circuit.currents()) + bias
+        field = field_matrix @ field + offset
+        return replace(motion, field_body=field, rate=gyro_matrix @ motion.rate)
 
-    imu = section.imu
+    return sense
+
+
+def emulate_vn100(emulation: Emulation, unit: InertialUnitSection) -> Vn100Emulator:
+    """Connect an emulated VN-100 to its serial line."""
+    imu = emulation.section.imu
     profile = NoiseProfile() if imu.profile == "bounds" else PROFILES[imu.profile]
     settings = Vn100EmulatorSettings(
         noise=replace(profile, attitude_bound=imu.quaternion_noise, rate_bound=imu.rate_noise),
-        mounting=np.array(config.inertial_unit.mounting),
+        mounting=np.array(unit.mounting),
         gyro_bias=np.array(imu.gyro_bias),
         clock_ppm=imu.clock_ppm,
-        free_fall=isinstance(world, OrbitingWorld),
+        free_fall=isinstance(emulation.world, OrbitingWorld),
     )
-    return Vn100Emulator(sense, line, generator, settings, now_ns=now_ns)
+    line = emulation.connect(unit.device, unit.baud_rate)
+    return Vn100Emulator(emulation.sense, line, emulation.generator, settings, now_ns=emulation.start_ns)
 
 
 def sky_objects(section: Simulation, now_ns: int, world: World) -> SkyObjects | None:
@@ -293,11 +346,6 @@ def emulated_camera(
     readout_ns, scan_ns = round(sky.readout * 1e9), round(sky.line_time * camera.rows * 1e9)
     tracks = no_objects if objects is None else objects.tracks
     return EmulatedCamera(motion, expose, now_ns, readout_ns, mounting, scan_ns, tracks)
-
-
-def line_generator(seed: int, *line: int) -> np.random.Generator:
-    """Return the random generator for a serial line's faults, independent of the seed's other generators."""
-    return np.random.default_rng([seed, _LINE_STREAM, *line])
 
 
 def fault_generator(seed: int) -> np.random.Generator:
@@ -364,53 +412,59 @@ def _finished(image: Image) -> Future[Image]:
     return future
 
 
-def assemble_orbit(
-    config: Config,
-    section: Simulation,
-    world: World,
-    start_ns: int,
-    now_ns: Callable[[], int],
-    line: SerialEnd | None,
-    expose: ExposeWide | None = None,
-) -> OrbitDevices:
-    """Build the devices that need an orbit. The GPS receiver uses `line`, the device end of a serial line.
+def gps_errors(emulation: Emulation) -> GpsErrors:
+    """Return the errors of the emulated GPS receiver."""
+    from sim_hal.emulators.gps import GpsErrors  # noqa: PLC0415 - see above
 
-    The world began at the time `start_ns`. `expose` replaces the renderer of the horizon cameras. Raises
-    ConfigError in a world without an orbit.
-    """
-    from sim_hal.emulators.gps import EmulatedGps, GpsErrors  # noqa: PLC0415 - see above
+    truth = emulation.section.orbit_devices
+    return GpsErrors(walk=truth.gps_walk, noise=truth.gps_noise, start=truth.gps_start)
+
+
+def emulate_ublox(emulation: Emulation, gps: Gps) -> EmulatedGps:
+    """Connect an emulated u-blox receiver to its serial line. Raises ConfigError without an orbit."""
+    from sim_hal.emulators.gps import EmulatedGps  # noqa: PLC0415 - see above
+
+    world, line = orbiting(emulation.world, "gps"), emulation.connect(gps.device, gps.baud_rate)
+    return EmulatedGps(world, line, emulation.generator, gps_errors(emulation), emulation.start_ns)
+
+
+def emulate_ads1115(emulation: Emulation, section: SolarStringsSection) -> EmulatedSolarCells:
+    """Connect the emulated converters of the solar cells. Raises ConfigError without an orbit."""
     from sim_hal.emulators.solar_cells import EmulatedSolarCells, SolarCellsModel  # noqa: PLC0415 - see above
 
-    receiver, currents, errors = (np.random.default_rng([section.seed, _ORBIT_STREAM, n]) for n in range(3))
-    truth = section.orbit_devices
-    gps, cells = None, None
-    if config.gps is not None and line is not None:
-        settings = GpsErrors(walk=truth.gps_walk, noise=truth.gps_noise, start=truth.gps_start)
-        gps = EmulatedGps(orbiting(world, "gps"), line, receiver, settings, start_ns)
-    if config.solar_strings is not None:
-        strings = config.solar_strings.strings
-        model = SolarCellsModel(
-            normals=np.array([string.normal for string in strings]),
-            peaks=np.array([string.peak for string in strings]),
-            gain_errors=truth.string_gain * errors.standard_normal(len(strings)),
-            noise=truth.string_noise,
-            albedo=truth.albedo,
-        )
-        wired = [StringWiring(one.address, one.channel, one.volt_per_ampere) for one in strings]
-        cells = EmulatedSolarCells(orbiting(world, "solar_strings"), model, wired, now_ns, currents)
+    strings, truth = section.strings, emulation.section.orbit_devices
+    errors = np.random.default_rng([emulation.section.seed, _ORBIT_STREAM, 2])
+    model = SolarCellsModel(
+        normals=np.array([string.normal for string in strings]),
+        peaks=np.array([string.peak for string in strings]),
+        gain_errors=truth.string_gain * errors.standard_normal(len(strings)),
+        noise=truth.string_noise,
+        albedo=truth.albedo,
+    )
+    wired = [StringWiring(one.address, one.channel, one.volt_per_ampere) for one in strings]
+    world = orbiting(emulation.world, "solar_strings")
+    cells = EmulatedSolarCells(world, model, wired, emulation.now_ns, emulation.generator)
+    for part in cells.parts:
+        emulation.wires.i2c(section.bus).attach(part)
+    return cells
+
+
+def _horizon_cameras(
+    config: Config, section: Simulation, world: World, now_ns: Callable[[], int], expose: ExposeWide
+) -> tuple[EmulatedCamera, ...]:
+    """Return the horizon cameras. Raises ConfigError in a world without an orbit."""
     misaligned = description_errors(config, section).horizon
-    wide = tuple(
+    return tuple(
         _horizon_camera(
             camera,
             (section.seed, _ORBIT_STREAM, index),
             world,
             now_ns,
-            expose or inline_wide,
+            expose,
             misaligned[index] if len(misaligned) else np.zeros(3),
         )
         for index, camera in enumerate(config.wide_cameras)
     )
-    return OrbitDevices(gps, cells, wide)
 
 
 def _horizon_camera(

@@ -17,38 +17,38 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from flight.link.telemetry.log import FlightLog
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
+from flight.schema.drivers import driver_of
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
-from hal.buses.i2c_bus import lock_bus
+from hal.buses.i2c_bus import device_file, lock_bus
 from hal.buses.serial_port import PySerialPort
 from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.guardian import CoilReach
-from hal.interfaces.wires import SECOND_NS, Clock, Rig, Wires
+from hal.interfaces.wires import SECOND_NS, Clock, Rig
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitError
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import UsageError
 from sim_hal.assembly import (
-    GPS_LINE,
     Hardware,
     StarRenderer,
     assemble,
     emulated_camera,
     fault_generator,
     inline_exposure,
-    line_generator,
     sky_objects,
 )
 from sim_hal.clock import SimClock, TimedSimulation
+from sim_hal.emulation import EmulatedWires
 from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.faults import schedule
 from sim_hal.faults.bench import Bench
@@ -65,7 +65,7 @@ FARTHEST_ELEMENTS = 100e3
 """Largest accepted distance (m) of the two-line elements from the first revolution of the simulated orbit."""
 _START_S = 20.0
 """Longest time (s) that the server process may take to start."""
-_FACTS = ("serial", "baud_rate", "socket", "camera", "gps", "gps_baud_rate", "wide", "utc_offset_ns")
+_FACTS = ("socket", "camera", "lines", "coil_bus", "wide", "utc_offset_ns")
 OPENER = "sim_hal.serving.device_link:open_bus"
 
 
@@ -115,19 +115,20 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
             raise UsageError("--devices: the devices of a server run in real time: give --realtime too")
         hardware = stack.enter_context(opened_lockstep(config, section, request.out))
         latency = round(section.latency.planner * SECOND_NS), round(section.latency.vision * SECOND_NS)
-        rig = Rig(hardware.clock, hardware.wires, hardware.release, False, section.seed, latency)
-        return with_host_faults(rig, section)
+        return with_host_faults(hardware.rig(section.seed, latency), section)
     if request.devices is not None:
         served = stack.enter_context(running_server(request.devices))
     else:
         served = stack.enter_context(started_server(request.config_path, section.seed, request.out))
-    reach = CoilReach(OPENER, str(served.socket_path), config.coils.address)
+    off = tuple(driver_of("coils", config.coils).off(config.coils))
+    reach = CoilReach(OPENER, str(served.socket_path), off)
     faults = [str(fault) for fault in scheduled(section.faults, True)]
 
     def release(epoch_ns: int) -> None:
         served.release(epoch_ns, faults)
 
-    rig = Rig(served.clock, served.wires, release, True, section.seed, reach=reach)
+    cameras = served.cameras
+    rig = Rig(served.clock, served.wires, release, True, section.seed, reach=reach, cameras=cameras)
     return with_host_faults(rig, section)
 
 
@@ -222,14 +223,22 @@ def with_host_faults(rig: Rig, section: Simulation) -> Rig:
 
 @dataclass(frozen=True, slots=True)
 class LockStep:
-    """Lock-step devices. The flight uses `clock`, `wires` and `release`; only faults and tests use more."""
+    """Lock-step devices. The flight uses `rig`; only faults and tests use more.
+
+    The `line` is the serial line of the inertial unit, if that has one.
+    """
 
     clock: SimClock
-    wires: Wires
+    wires: EmulatedWires
+    cameras: tuple[FrameSource | None, ...]
     release: Callable[[int], None]
     hardware: Hardware
     line: EmulatedSerialLine
     gps_line: EmulatedSerialLine | None = None
+
+    def rig(self, seed: int = 1, latency: tuple[int, int] = (0, 0)) -> Rig:
+        """Return the rig of a flight with these devices."""
+        return Rig(self.clock, self.wires, self.release, False, seed, latency, cameras=self.cameras)
 
 
 def utc_ns(label: str) -> int:
@@ -241,24 +250,19 @@ def build_lockstep(
     config: Config, section: Simulation, truth: TruthRecorder | None, clock: SimClock
 ) -> LockStep:
     """Assemble the simulated hardware and attach it to a clock."""
-    line = EmulatedSerialLine(clock.now_ns, config.inertial_unit.baud_rate, line_generator(section.seed))
-    gps_line = None
-    if config.gps is not None:
-        generator = line_generator(section.seed, GPS_LINE)
-        gps_line = EmulatedSerialLine(clock.now_ns, config.gps.baud_rate, generator)
-    gps_end = None if gps_line is None else gps_line.device
-    hardware = assemble(config, section, clock.now_ns, line.device, truth, gps_line=gps_end)
+    wires = EmulatedWires(clock.now_ns, section.seed, config.coils.bus)
+    hardware = assemble(config, section, clock.now_ns, wires, truth)
     clock.attach(hardware.simulation)
-    gps_port = None if gps_line is None else gps_line.host
-    wires = Wires(line.host, hardware.bus, hardware.camera, gps_port, hardware.orbit.wide)
-    faults = scheduled(section.faults, realtime=False)
-    bench = Bench(hardware, line, clock.now_ns, fault_generator(section.seed), line.host, gps_line=gps_line)
+    line, gps_line = (cast(EmulatedSerialLine, wires.line_of(kind)) for kind in ("inertial_unit", "gps"))
+    faults, cameras = scheduled(section.faults, realtime=False), (hardware.camera, *hardware.orbit.wide)
+    host = None if line is None else line.host
+    bench = Bench(hardware, line, clock.now_ns, fault_generator(section.seed), host, gps_line=gps_line)
 
     def release(epoch_ns: int) -> None:
         hardware.release(epoch_ns)
         put(faults, bench, epoch_ns)
 
-    return LockStep(clock, wires, release, hardware, line, gps_line)
+    return LockStep(clock, wires, cameras, release, hardware, line, gps_line)
 
 
 @contextmanager
@@ -326,12 +330,53 @@ class RemoteFrameSource:
         return Frame(sequence, start_ns, exposure_ns, self._clock.now_ns(), pixels)
 
 
+class ServedWires:
+    """Connections to emulated devices in a server process (`hal.interfaces.wires.Wires`)."""
+
+    def __init__(
+        self, clock: SystemClock, path: Path, lines: dict[str, str], coil_bus: str, stack: ExitStack
+    ) -> None:
+        """Use the socket `path` of the server, and the pseudo-terminals `lines` by device file."""
+        self._clock, self._path, self._lines, self._stack = clock, path, lines, stack
+        self._coil_bus = coil_bus
+        self._open: dict[str, Any] = {}
+
+    def serial(self, device: str, baud_rate: int) -> PySerialPort:
+        """Return the serial port of an emulated device. Raises NotResponding."""
+        if device not in self._lines:
+            raise NotResponding(device, "no emulated device is connected to this line")
+        port: PySerialPort = self._kept(
+            device, lambda: PySerialPort(self._lines[device], baud_rate, self._clock)
+        )
+        return port
+
+    def i2c(self, bus: int | str | None = None) -> RemoteI2cBus:
+        """Return an emulated I2C bus; None means the bus of the coils. Raises NotResponding."""
+        name = self._coil_bus if bus is None else device_file(bus)
+        opened: RemoteI2cBus = self._kept(name, lambda: RemoteI2cBus(self._path, name))
+        return opened
+
+    def spi(self, device: str, speed_hz: int, mode: int) -> RemoteI2cBus:
+        """Return an emulated device on an SPI bus. Raises NotResponding."""
+        return self.i2c(device)
+
+    def _kept(self, name: str, make: Callable[[], Any]) -> Any:
+        if name not in self._open:
+            try:
+                self._open[name] = make()
+            except OSError as error:
+                raise NotResponding(name, f"the emulated devices do not answer ({error})") from error
+            self._stack.callback(self._open[name].close)
+        return self._open[name]
+
+
 @dataclass(frozen=True, slots=True)
 class Served:
     """Connections to the devices in a server process."""
 
     clock: SystemClock
-    wires: Wires
+    wires: ServedWires
+    cameras: tuple[FrameSource | None, ...]
     bus: RemoteI2cBus
     socket_path: Path
 
@@ -398,8 +443,7 @@ def _connected(facts: dict[str, Any]) -> Iterator[Served]:
     clock = SystemClock() if offset_ns is None else SimulatedUtcClock(offset_ns)
     path = Path(facts["socket"])
     with ExitStack() as stack:
-        serial = PySerialPort(facts["serial"], facts["baud_rate"], clock)
-        stack.callback(serial.close)
+        wires = ServedWires(clock, path, facts["lines"], facts["coil_bus"], stack)
         try:
             bus = RemoteI2cBus(path)
             stack.callback(bus.close)
@@ -409,8 +453,4 @@ def _connected(facts: dict[str, Any]) -> Iterator[Served]:
             raise NotResponding("emulated devices", f"no server answers on {path} ({error})") from error
         for source in wide if camera is None else (camera, *wide):
             stack.callback(source.close)
-        gps = None
-        if facts["gps"] is not None:
-            gps = PySerialPort(facts["gps"], facts["gps_baud_rate"], clock)
-            stack.callback(gps.close)
-        yield Served(clock, Wires(serial, bus, camera, gps, wide), bus, path)
+        yield Served(clock, wires, (camera, *wide), bus, path)

@@ -18,12 +18,14 @@ from flight.schema.values import (
     BaudRate,
     Bus,
     Channel,
+    DriverName,
     Estimator,
     NotNegative,
     Positive,
     Quaternion,
     Section,
     Sign,
+    SignedAxis,
     Vector,
 )
 from knightcube.astro.arrays import BoolArray, FloatArray
@@ -66,16 +68,14 @@ class UnitCalibration(Section, frozen=True, kw_only=True):
     field_bias: Vector = (0.0, 0.0, 0.0)
 
 
-class InertialUnitSection(Section, frozen=True, kw_only=True):
-    """The inertial unit, a VN-100, and its serial line.
+class UnitSection(Section, frozen=True, kw_only=True):
+    """The keys of every inertial unit, to which the section of a driver adds its own.
 
     The coils are switched off if a reading would become older than `max_age` s before the next reading is
     used.
     """
 
-    device: str = "/dev/knightcube-imu"
-    baud_rate: BaudRate = 115200
-    output: Literal["binary", "ascii"] = "binary"
+    driver: DriverName = "vn100"
     rate_hz: Literal[1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200] = 40
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
     field_range: Positive = 6.0e-4
@@ -84,6 +84,44 @@ class InertialUnitSection(Section, frozen=True, kw_only=True):
     rate_noise: Positive = 1.01e-4
     calibration: UnitCalibration = UnitCalibration()
     accuracy: UnitAccuracy = UnitAccuracy()
+
+
+class InertialUnitSection(UnitSection, frozen=True, kw_only=True):
+    """The inertial unit, a VN-100, and its serial line."""
+
+    device: str = "/dev/knightcube-imu"
+    baud_rate: BaudRate = 115200
+    output: Literal["binary", "ascii"] = "binary"
+
+
+class Sensor(Section, frozen=True, kw_only=True):
+    """A sensor of an inertial unit that the driver `sensors` composes.
+
+    The value `part` is `icm20948`, `lis3mdl`, `adis16470`, or `module:class` of a CircuitPython driver. The
+    sensor has the I2C `address` on the bus `bus`, by default the bus of the coils, or it is the SPI device
+    `spi`. It is read for the quantities `measures`: `gyro`, `magnetic` and `acceleration`, which are names
+    of CircuitPython. The value `axes` names the sensor's axis along each body axis, such as [y, -x, z]. The
+    attributes `set` are set after each start, for example a data rate or a range. The value `emulator` names
+    the emulator of another sensor, as `module:function`.
+    """
+
+    part: Annotated[str, Meta(min_length=1, max_length=200)]
+    address: Address | None = None
+    bus: Bus | None = None
+    spi: Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$", description="a device file")] | None = None
+    measures: Annotated[tuple[Literal["gyro", "magnetic", "acceleration"], ...], Meta(min_length=1)]
+    axes: tuple[SignedAxis, SignedAxis, SignedAxis] = ("x", "y", "z")
+    set: dict[str, float] | None = None
+    emulator: Annotated[str, Meta(min_length=3, max_length=200)] | None = None
+
+
+class SensorsSection(UnitSection, frozen=True, kw_only=True):
+    """An inertial unit of separate gyro, magnetometer and accelerometer (driver `sensors`).
+
+    Without an accelerometer and a magnetometer, the unit gives no attitude, so it flies in orbit only.
+    """
+
+    sensors: Annotated[tuple[Sensor, ...], Meta(min_length=1, max_length=4)]
 
 
 class Winding(Section, frozen=True, kw_only=True):
@@ -130,12 +168,16 @@ class Winding(Section, frozen=True, kw_only=True):
 class Coils(Section, frozen=True, kw_only=True):
     """The PWM chip, the H-bridges and the coils. The value `bus` is the number or device file of the I2C bus.
 
+    The driver `drv8830` has a DRV8830 for each coil, of which the first has the address `address`, and each
+    other coil's the next address.
+
     The list `windings` has one entry per coil. A satellite has two to six coils. If the coils lie in a plane,
     the flight application treats the axis across the plane like that of a broken coil (`slots`). A dipole
     moment along the magnetic field, which makes no torque, is added so that the missing coil needs no
     current. More than three coils share a dipole moment so that their total heat is minimal.
     """
 
+    driver: DriverName = "pca9685"
     bus: Bus = 1
     address: Address = 0x40
     windings: Annotated[tuple[Winding, ...], Meta(min_length=1, max_length=64)]
@@ -211,8 +253,13 @@ class Coils(Section, frozen=True, kw_only=True):
 
 
 class PowerMonitorSection(Section, frozen=True, kw_only=True):
-    """The INA219, which measures voltage and current of the coils' supply."""
+    """The INA219, which measures voltage and current of the coils' supply.
 
+    The chip is on the I2C bus `bus`, by default the bus of the coils.
+    """
+
+    driver: DriverName = "ina219"
+    bus: Bus | None = None
     address: Address = 0x45
     shunt: Positive = 0.1
 
@@ -284,7 +331,7 @@ PixelName = Literal[
 """Names of the pixel formats of V4L2 that `hal.drivers.pixel_formats` reads."""
 
 
-class V4l2Device(Section, frozen=True, kw_only=True, tag_field="kind", tag="v4l2"):
+class V4l2Device(Section, frozen=True, kw_only=True, tag_field="driver", tag="v4l2"):
     """A Video for Linux camera (`hal.drivers.v4l2_camera`).
 
     The value `gain` is in the camera's own steps, and `stamp_delay` is in s. The pixel format is the name
@@ -298,7 +345,7 @@ class V4l2Device(Section, frozen=True, kw_only=True, tag_field="kind", tag="v4l2
     stamp_delay: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
 
 
-class AravisDevice(Section, frozen=True, kw_only=True, tag_field="kind", tag="aravis"):
+class AravisDevice(Section, frozen=True, kw_only=True, tag_field="driver", tag="aravis"):
     """A GenICam camera (`hal.drivers.aravis_camera`), named as the tool `arv-tool-0.8` lists it."""
 
     name: Annotated[str, Meta(min_length=1)]
@@ -350,11 +397,12 @@ class Camera(Section, frozen=True, kw_only=True):
 
 
 class Gps(Section, frozen=True, kw_only=True):
-    """The u-blox GPS receiver on its own serial line.
+    """The GPS receiver on its own serial line, a u-blox receiver or (driver `nmea`) one that sends NMEA 0183.
 
     The receiver reports a fix every `period` s; the position is unknown after `max_age` s without a fix.
     """
 
+    driver: DriverName = "ublox"
     device: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-gps"
     baud_rate: BaudRate = 115200
     period: Annotated[float, Meta(ge=0.1, le=60.0)] = 1.0
@@ -377,8 +425,13 @@ class SolarString(Section, frozen=True, kw_only=True):
 
 
 class SolarStringsSection(Section, frozen=True, kw_only=True):
-    """The solar cell strings, which are measured every `period` s; a reading is stale after `max_age` s."""
+    """The solar cell strings, which are measured every `period` s; a reading is stale after `max_age` s.
 
+    The converters are on the I2C bus `bus`, by default the bus of the coils.
+    """
+
+    driver: DriverName = "ads1115"
+    bus: Bus | None = None
     strings: Annotated[tuple[SolarString, ...], Meta(min_length=4, max_length=16)]
     period: Annotated[float, Meta(ge=0.04, le=60.0)] = 0.5
     max_age: Positive = 2.0

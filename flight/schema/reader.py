@@ -15,8 +15,16 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from flight.schema.devices import Camera, Coils, SolarStringsSection, structure_mask
+from flight.schema.devices import (
+    AravisDevice,
+    Camera,
+    Coils,
+    SolarStringsSection,
+    V4l2Device,
+    structure_mask,
+)
 from flight.schema.document import ConfigError, Document, convert, read_document, read_text
+from flight.schema.drivers import with_drivers
 from flight.schema.orbit import Craft, ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
@@ -309,7 +317,7 @@ def _check_camera(camera: Camera, refuse: Refuse) -> None:
             f"is {camera.fine_period:g}: must be at least `camera.period` ({camera.period:g}) and less than "
             f"`camera.max_age` ({camera.max_age:g})",
         )
-    if camera.device is not None:
+    if isinstance(camera.device, V4l2Device | AravisDevice):
         pixel_format, possible = camera.device.pixel_format, PIXEL_BITS[camera.device.pixel_format]
         if camera.bits not in possible:
             span = f"{possible[0]}" if len(possible) == 1 else f"{possible[0]} to {possible[-1]}"
@@ -369,7 +377,7 @@ def parse(text: str, name: str = "configuration") -> Config:
             document.values[optional] = None
     # A body defined outside this repository uses the sections of the testbed.
     shape = OrbitConfig if document.values.get("body") == "orbit" else TestbedConfig
-    config: Config = convert(document, shape)
+    config: Config = convert(document, with_drivers(shape, document))
     check_consistency(config, document)
     return config
 

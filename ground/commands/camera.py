@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from flight.app.devices import linux_camera, simulated_camera
+from flight.app.devices import open_camera, real_rig, simulated_camera
 from flight.app.run import RunRequest
 from flight.app.service import requested_config
 from flight.schema.devices import Camera, camera_model
 from flight.schema.document import ConfigError, config_path
 from ground.commands.options import finite
-from hal.buses.clock import SystemClock
 from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock
@@ -188,5 +187,5 @@ def opened_camera(config_path: Path, rate: FloatArray | None = None) -> Iterator
     if rate is not None:
         raise UsageError("--rate: this configuration has a real camera, only a simulated one can be rotated")
     with ExitStack() as stack:
-        clock = SystemClock()
-        yield OpenCamera(clock, linux_camera(config.camera, clock, stack), config.camera)
+        rig = real_rig(config, stack)
+        yield OpenCamera(rig.clock, open_camera(config.camera, rig, stack), config.camera)

@@ -14,7 +14,7 @@ from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock
 
 SPI_MODE, SPI_SPEED, SPI_MESSAGE = 0x40016B01, 0x40046B04, 0x40206B00
-"""Requests of ioctl(2): SPI_IOC_WR_MODE, SPI_IOC_WR_MAX_SPEED_HZ and SPI_IOC_MESSAGE(1), linux/spi/spidev.h."""
+"""Requests SPI_IOC_WR_MODE, SPI_IOC_WR_MAX_SPEED_HZ and SPI_IOC_MESSAGE(1) of linux/spi/spidev.h."""
 
 
 class LinuxSpiDevice:
@@ -76,7 +76,7 @@ class LinuxWires:
         return self._ports[device]
 
     def i2c(self, bus: int | str | None = None) -> LinuxI2cBus:
-        """Return an I2C bus, by number or device file; None means the bus of the coils. Raises DeviceError."""
+        """Return an I2C bus, by number or file; None means the bus of the coils. Raises DeviceError."""
         name, coils = device_file(self._coil_bus if bus is None else bus), device_file(self._coil_bus)
         if name not in self._buses:
             exclusive = self._exclusive and name == coils

@@ -246,8 +246,11 @@ class InertialUnit(Protocol):
 class TorqueCoils(Protocol):
     """Driver of the torque coils, which sets the currents to zero after any failure."""
 
-    def start(self) -> None:
-        """Configure the PWM chip with all outputs off. Raises DeviceError if the chip does not answer."""
+    def start(self, patient: bool = False) -> None:
+        """Configure the chips with all outputs off.
+
+        Raises DeviceError if a chip does not answer, unless the driver is `patient` and keeps trying.
+        """
 
     def command(self, currents: FloatArray) -> None:
         """Request the current of each coil (n,), A. Never waits for the bus.

@@ -25,7 +25,11 @@ def later(named: str) -> Callable[..., Any]:
     An emulator is registered in this way, so that a board does not load the simulator.
     """
     module, _, function = named.partition(":")
-    return lambda *arguments: getattr(importlib.import_module(module), function)(*arguments)
+
+    def call(*arguments: Any) -> Any:
+        return getattr(importlib.import_module(module), function)(*arguments)
+
+    return call
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +44,8 @@ class Driver:
         probe: function that takes a rig and the section, asks the device for a sign of life without changing
             its state, and returns the answer as text. It raises DeviceError without an answer.
         emulate: function that takes a `sim_hal.emulation.Emulation` and the section, connects an emulated
-            device to the emulated wires, and returns the device.
+            device to the emulated wires, and returns the device. A camera needs none, because the simulator
+            emulates the cameras of all drivers. Without an emulator, another device flies on hardware only.
         files: function that returns the device files that the section names.
         check: function that raises OutOfRange for a section that the driver does not accept.
         off: for coils, function that returns the I2C writes (address, register, value) that switch all coils
@@ -51,7 +56,7 @@ class Driver:
     section: type[Any]
     open: Callable[[Rig, Any], Any]
     probe: Callable[[Rig, Any], str]
-    emulate: Callable[[Any, Any], Any]
+    emulate: Callable[[Any, Any], Any] | None = None
     files: Callable[[Any], Sequence[str]] = nothing
     check: Callable[[Any], object] = nothing
     off: Callable[[Any], Sequence[tuple[int, int, int]]] = nothing

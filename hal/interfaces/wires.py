@@ -141,7 +141,7 @@ class Wires(Protocol):
         """Return the serial port of a device file. Raises NotResponding."""
 
     def i2c(self, bus: int | str | None = None) -> RawI2cBus:
-        """Return an I2C bus, by number or device file; None means the bus of the coils. Raises DeviceError."""
+        """Return an I2C bus, by number or file; None means the bus of the coils. Raises DeviceError."""
 
     def spi(self, device: str, speed_hz: int, mode: int) -> SpiDevice:
         """Return a device on an SPI bus, for example `/dev/spidev0.0`. Raises DeviceError."""

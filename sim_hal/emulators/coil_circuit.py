@@ -145,7 +145,11 @@ _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
 
 
 class CoilCircuit:
-    """The coils on one PWM chip, updated at every I2C STOP that may have changed an output."""
+    """The coils on one PWM chip, updated at every I2C STOP that may have changed an output.
+
+    Attributes:
+        chip: the PWM chip.
+    """
 
     def __init__(
         self,
@@ -162,7 +166,7 @@ class CoilCircuit:
         the coil's channels. `bus_voltage` (V) is the voltage that a current monitor measures, by default the
         coils' supply voltage.
         """
-        self._chip = chip
+        self.chip = chip
         self._coils = tuple(
             (
                 coil,
@@ -206,8 +210,8 @@ class CoilCircuit:
         draws = self._generator.random(count).tolist() if written else [0.5] * count
         for axis, (coil, channels, step, limit) in enumerate(self._coils):
             stuck_a, stuck_b = self._stuck[axis]
-            pulse_a = stuck_a or self._chip.high(coil.channel_a)
-            bridge = Bridge(pulse_a, stuck_b or self._chip.high(coil.channel_b))
+            pulse_a = stuck_a or self.chip.high(coil.channel_a)
+            bridge = Bridge(pulse_a, stuck_b or self.chip.high(coil.channel_b))
             if bridge == self._bridges[axis] and not written & channels:
                 continue
             self._bridges[axis] = bridge
@@ -228,9 +232,9 @@ class CoilCircuit:
             self._values[axis] = current
         self._currents = np.array(self._values)
         # Without an oscillator the outputs are constant, and any period gives the same currents.
-        period_ns = 1e9 / (self._chip.frequency or 1.0)
+        period_ns = 1e9 / (self.chip.frequency or 1.0)
         pulses: tuple[tuple[Bridge, float], ...] = tuple(zip(self._bridges, self._drawn, strict=True))
-        self._supply.note(Chopping(self._now_ns(), self._chip.counter_start_ns, period_ns, pulses))
+        self._supply.note(Chopping(self._now_ns(), self.chip.counter_start_ns, period_ns, pulses))
 
     def mean_supply(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Return the mean bus voltage (V) and the mean supply current (A) of all coils over a time window.

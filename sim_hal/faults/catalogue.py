@@ -317,7 +317,7 @@ def _wrong_frequency(bench: Bench, *_: object) -> Removal:
 
 
 def _stuck_monitor(bench: Bench, *_: object) -> Removal:
-    monitor = bench.hardware.monitor
+    monitor: EmulatedIna219 | None = bench.hardware.monitor
     if monitor is None:
         return no_removal
     monitor.frozen = {number: monitor.register(number) for number in range(6)}

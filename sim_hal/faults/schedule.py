@@ -168,6 +168,24 @@ _SECTIONS = {
     "wide": "wide_cameras",
 }
 """Optional configuration section of each device that can be absent."""
+_EMULATED = {
+    "imu": ("inertial_unit", "vn100"),
+    "magnetometer": ("inertial_unit", "vn100"),
+    "monitor": ("power_monitor", "ina219"),
+    "gps": ("gps", "ublox"),
+    "strings": ("solar_strings", "ads1115"),
+    **dict.fromkeys(("coil", "bridge", "pwm"), ("coils", "pca9685")),
+}
+"""Section and driver whose emulated device has the faults of a device, by the first word of its name."""
+
+
+def other_driver(device: str, config: Config) -> str:
+    """Return why the device of a fault has no faults, which is another driver, or an empty text."""
+    kind, driver = _EMULATED.get(device.partition("-")[0], ("", ""))
+    section = getattr(config, kind, None)
+    if section is None or section.driver == driver:
+        return ""
+    return f"faults act on the emulated device of `{kind}.driver: {driver}`, not on {section.driver!r}"
 
 
 def fitted(device: str, config: Config) -> bool:
@@ -196,6 +214,8 @@ def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tupl
             if device.startswith(("coil-", "bridge-")):
                 cure = f"the configuration has {len(config.coils.windings)} coils"
             raise UsageError(f"fault {str(fault)!r}: this flight has no {device}: {cure}")
+        if problem := other_driver(device, config):
+            raise UsageError(f"fault {str(fault)!r}: {problem}")
         if fault.kind.name == "imu: baud" and fault.parameters["rate"] == config.inertial_unit.baud_rate:
             raise UsageError(f"fault {str(fault)!r}: the unit has this rate already: give another rate")
     return faults

@@ -37,6 +37,7 @@ from hal.buses.clock import SystemClock
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import UsageError
 from sim_hal.assembly import assemble_coils
+from sim_hal.emulation import EmulatedWires
 from sim_hal.emulators import i2c_bus
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus, Message
 from sim_hal.settings import Release, Simulation
@@ -181,7 +182,9 @@ def emulate(options: argparse.Namespace) -> int:
     section = configuration.simulation_section(text, str(options.config), Simulation)
     if section is None:  # without this section, the true coils equal the configured ones
         section = Simulation(release=Release(q2=0.0))
-    coils = assemble_coils(config, section, np.random.default_rng(options.seed), SystemClock().now_ns)
+    now_ns = SystemClock().now_ns
+    wires = EmulatedWires(now_ns, options.seed, config.coils.bus)
+    assemble_coils(config, section, np.random.default_rng(options.seed), now_ns, wires)
     with tempfile.TemporaryDirectory(prefix="knightcube-i2c-") as folder:
         path = Path(folder) / "bus.sock"
         environment = {
@@ -189,13 +192,13 @@ def emulate(options: argparse.Namespace) -> int:
             "KNIGHTCUBE_I2C": str(path),
             "KNIGHTCUBE_I2C_BUS": str(options.bus),
         }
-        server = I2cServer(coils.bus, path)
+        server = I2cServer(wires.i2c(), path)
         try:
             if options.program:
                 return _run_program(server, options.program, environment, options.duration)
-            parts = {"pca9685": coils.pwm.address}
-            if coils.monitor is not None:
-                parts["ina219"] = coils.monitor.address
+            parts = {config.coils.driver: config.coils.address}
+            if config.power_monitor is not None:
+                parts[config.power_monitor.driver] = config.power_monitor.address
             facts = {"device": f"/dev/i2c-{options.bus}", "parts": parts, "environment": environment}
             assigned = " ".join(f"{name}={shlex.quote(value)}" for name, value in environment.items())
             sys.stdout.write((json.dumps(facts) if options.json else assigned) + "\n")

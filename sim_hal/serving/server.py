@@ -19,7 +19,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from flight.link.telemetry.log import FlightLog
 from flight.schema.devices import Camera
@@ -28,14 +28,13 @@ from hal.buses.clock import SystemClock
 from hal.interfaces.errors import DeviceError
 from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.assembly import (
-    GPS_LINE,
     Hardware,
     StarRenderer,
     assemble,
     fault_generator,
-    line_generator,
     render_wide,
 )
+from sim_hal.emulation import EmulatedWires
 from sim_hal.emulators.camera import EmulatedCamera
 from sim_hal.emulators.serial_line import PtyLine
 from sim_hal.faults.bench import Bench
@@ -53,6 +52,13 @@ _LONGEST_WAIT_NS = 20_000_000
 _FRAME_SLOTS = 4
 _PR_SET_PDEATHSIG = 1
 
+_BUS_CALLS = (
+    "write_byte",
+    "read_byte_data",
+    "write_byte_data",
+    "read_i2c_block_data",
+    "write_i2c_block_data",
+)
 _renderer: list[StarRenderer] = []
 
 
@@ -74,6 +80,7 @@ class _DeviceClient:
     def __init__(self, line: socket.socket) -> None:
         self.line = line
         self.wants_frames: set[int] = set()
+        self.selected: str | None = None  # name of a bus or SPI device, None for the bus of the coils
         self._inbox = Inbox()
 
     def requests(self) -> list[Any] | None:
@@ -102,21 +109,18 @@ class DeviceServer:
         self._log = FlightLog(folder, "truth", clock=self._clock)
         self._pool = _renderer_pool(config, section)
         self._rendering: Future[Image] | None = None
-        self._pty = PtyLine(config.inertial_unit.baud_rate, line_generator(section.seed))
-        self._gps_pty = None
-        if config.gps is not None:
-            self._gps_pty = PtyLine(config.gps.baud_rate, line_generator(section.seed, GPS_LINE))
+        wires = EmulatedWires(self._clock.now_ns, section.seed, config.coils.bus, pty=True)
         self.hardware: Hardware = assemble(
             config,
             section,
             self._clock.now_ns,
-            self._pty,
+            wires,
             TruthRecorder(self._log),
             self._expose,
-            gps_line=self._gps_pty,
-            expose_wide=self._expose_wide,
+            self._expose_wide,
         )
-        self._lines = [line for line in (self._pty, self._gps_pty) if line is not None]
+        self._lines = {name: line for name, line in wires.lines.items() if isinstance(line, PtyLine)}
+        self.lines = {name: line.name for name, line in self._lines.items()}
         self._faults_drawn = fault_generator(section.seed)
         self._frames_sent = 0
         self._served_anybody = False
@@ -127,10 +131,8 @@ class DeviceServer:
         self._listener.bind(str(self.socket_path))
         self._listener.listen(8)
         self._selector.register(self._listener, selectors.EVENT_READ)
-        for line in self._lines:
+        for line in self._lines.values():
             self._selector.register(line.fileno(), selectors.EVENT_READ)
-        self.serial_device = self._pty.name
-        self.gps_device = None if self._gps_pty is None else self._gps_pty.name
 
     def stop(self, *_: int | FrameType | None) -> None:
         """Stop serving the devices; this method is also a signal handler."""
@@ -147,13 +149,13 @@ class DeviceServer:
                 left_ns = now_ns
             elif patience_ns is not None and now_ns - left_ns > patience_ns:
                 return
-            for pty in self._lines:
+            for pty in self._lines.values():
                 pty.exchange(now_ns)
             self.hardware.simulation.advance_to(now_ns)
             self._deliver_frames()
             due_ns = min(
                 self.hardware.simulation.next_event_ns(),
-                *(pty.to_host.next_arrival_ns() for pty in self._lines),
+                *(pty.to_host.next_arrival_ns() for pty in self._lines.values()),
                 now_ns + _LONGEST_WAIT_NS,
             )
             for key, _ in self._selector.select(max(0, due_ns - self._clock.now_ns()) * 1e-9):
@@ -170,7 +172,7 @@ class DeviceServer:
             connection.line.close()
         self._listener.close()
         self._place.cleanup()
-        for pty in self._lines:
+        for pty in self._lines.values():
             pty.close()
         self._log.close()
 
@@ -215,7 +217,19 @@ class DeviceServer:
                 connection.answer([number, "done", result, ""])
 
     def _operations(self) -> dict[str, Callable[..., Any]]:
-        bus, cameras = self.hardware.bus, self._cameras()
+        wires, cameras = self.hardware.wires, self._cameras()
+
+        def on_bus(name: str) -> Callable[..., Any]:
+            return lambda connection, *a: getattr(wires.i2c(connection.selected), name)(*a)
+
+        def select(connection: _DeviceClient, name: str) -> None:
+            connection.selected = name
+
+        def exchange(connection: _DeviceClient, address: int, data: list[int], count: int) -> list[int]:
+            return list(wires.i2c(connection.selected).exchange(address, bytes(data), count))
+
+        def spi(connection: _DeviceClient, data: list[int]) -> list[int]:
+            return list(wires.spi(connection.selected or "", 0, 0).transfer(bytes(data)))
 
         def trigger(connection: _DeviceClient, exposure_ns: int, number: int = 0) -> None:
             camera = cameras[number]
@@ -224,11 +238,10 @@ class DeviceServer:
                 camera.trigger(exposure_ns)
 
         return {
-            "write_byte": lambda _, *a: bus.write_byte(*a),
-            "read_byte_data": lambda _, *a: bus.read_byte_data(*a),
-            "write_byte_data": lambda _, *a: bus.write_byte_data(*a),
-            "read_i2c_block_data": lambda _, *a: bus.read_i2c_block_data(*a),
-            "write_i2c_block_data": lambda _, *a: bus.write_i2c_block_data(*a),
+            **{name: on_bus(name) for name in _BUS_CALLS},
+            "select": select,
+            "exchange": exchange,
+            "spi": spi,
             "release": lambda _, *a: self._release(*a),
             "currents": lambda _: self.hardware.circuit.currents().tolist(),
             "trigger": trigger,
@@ -238,9 +251,10 @@ class DeviceServer:
         """Release the body and schedule the faults of a flight process."""
         self.hardware.release(epoch_ns)
         generator = self._faults_drawn
-        bench = Bench(
-            self.hardware, self._pty, self._clock.now_ns, generator, None, flight_process, self._gps_pty
+        line, gps_line = (
+            cast(PtyLine, self.hardware.wires.line_of(kind)) for kind in ("inertial_unit", "gps")
         )
+        bench = Bench(self.hardware, line, self._clock.now_ns, generator, None, flight_process, gps_line)
         put([parse(text) for text in faults], bench, epoch_ns)
 
     def _cameras(self) -> tuple[EmulatedCamera | None, ...]:

@@ -152,8 +152,8 @@ def test_device_names_that_were_edited_survive_an_update(image: Image) -> None:
 @pytest.mark.parametrize(
     ("camera", "wanted"),
     [
-        ("{device: {kind: v4l2, pixel_format: Y16}}", False),
-        ("{device: {kind: v4l2, pixel_format: Y16}, star_tracker: {}}", True),
+        ("{device: {driver: v4l2, pixel_format: Y16}}", False),
+        ("{device: {driver: v4l2, pixel_format: Y16}, star_tracker: {}}", True),
     ],
 )
 def test_the_sky_index_is_made_where_the_configuration_wants_one_however_it_is_written(

@@ -29,7 +29,7 @@ from tests.support.flights import CONFIG
 UNITS = ("knightcube.service", "knightcube-safe.service", "knightcube-link.service")
 LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000', serial: {device: /dev/null}}"
 """Beside the network a line that is there, and not plugged in."""
-CAMERA = "{device: {kind: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}}"
+CAMERA = "{device: {driver: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}}"
 
 needs_systemd = pytest.mark.skipif(
     shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing: install systemd"
@@ -121,7 +121,7 @@ def test_a_link_by_one_line_is_exposed_by_at_most_1(tmp_path: Path, line: str) -
 
 @needs_systemd
 def test_a_usb3_vision_camera_beside_a_ground_link_leaves_no_more(tmp_path: Path) -> None:
-    camera = "{device: {kind: aravis, name: Some-1, pixel_format: Mono16}}"
+    camera = "{device: {driver: aravis, name: Some-1, pixel_format: Mono16}}"
     config = changed_testbed(
         tmp_path, camera=camera, commands="{socket: /run/knightcube/commands}", link=LINK
     )
@@ -310,8 +310,8 @@ def test_what_is_not_there_yet_is_let_through_as_what_it_may_be(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("device", "allowed"),
     [
-        ("{kind: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}", "/dev/knightcube-camera"),
-        ("{kind: aravis, name: Some-1, pixel_format: Mono16}", "char-usb_device"),
+        ("{driver: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}", "/dev/knightcube-camera"),
+        ("{driver: aravis, name: Some-1, pixel_format: Mono16}", "char-usb_device"),
     ],
 )
 def test_the_dropin_lets_the_configured_camera_through(tmp_path: Path, device: str, allowed: str) -> None:

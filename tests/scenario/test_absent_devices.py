@@ -11,7 +11,6 @@ import pytest
 from flight.app.devices import open_devices
 from flight.link.modes import Mode
 from hal.interfaces.errors import NotResponding
-from hal.interfaces.wires import Rig
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.rig import LockStep, opened_lockstep
 from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
@@ -56,6 +55,6 @@ def test_on_a_bench_it_is_an_error_at_once(tmp_path: Path, device: str) -> None:
     config = demo_config(1.0, camera=False)
     with ExitStack() as stack, opened_lockstep(config, demo_world(), tmp_path) as lock:
         take_away(lock, device)
-        rig = Rig(lock.clock, lock.wires, lock.release, False, 1)
+        rig = lock.rig()
         with pytest.raises(NotResponding):
             open_devices(config, rig, stack, patient=False)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.app.devices import open_gps, open_strings
+from flight.app.devices import opened as opened_device
 from flight.schema import reader
 from flight.schema.document import ConfigError
 from ground.telemetry import scan
@@ -25,6 +25,7 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal.assembly import assemble, wide_model
 from sim_hal.clock import SimClock
+from sim_hal.emulation import EmulatedWires
 from sim_hal.faults.schedule import parse, put
 from sim_hal.rig import LockStep, build_lockstep, opened_lockstep, utc_ns
 from sim_hal.settings import SkySection
@@ -42,19 +43,19 @@ def lock() -> LockStep:
 
 
 def opened(lock: LockStep, stack: ExitStack) -> Rig:
-    return Rig(lock.clock, lock.wires, lock.release, False, 1)
+    return lock.rig()
 
 
 def shot(lock: LockStep, number: int = 0) -> Frame | None:
     """Return the frame of a wide camera half a second after its trigger."""
-    camera = lock.wires.wide[number]
+    camera = lock.hardware.orbit.wide[number]
     camera.trigger(5_000_000)
     lock.clock.sleep_until_ns(lock.clock.now_ns() + SECOND_NS // 2)
     return camera.poll()
 
 
 def fixes(lock: LockStep, rig: Rig, stack: ExitStack, seconds: int) -> list[GpsReading]:
-    gps = open_gps(orbit_config(), rig, stack)
+    gps = opened_device("gps", orbit_config(), rig, stack)
     assert gps is not None
     found = []
     for _ in range(10 * seconds):
@@ -78,7 +79,7 @@ def test_the_receivers_time_is_the_simulations_and_its_place_the_worlds(lock: Lo
 
 def test_the_strings_are_read_over_the_coils_bus(lock: LockStep) -> None:
     with ExitStack() as stack:
-        strings = open_strings(orbit_config(), opened(lock, stack), stack)
+        strings = opened_device("solar_strings", orbit_config(), opened(lock, stack), stack)
         assert strings is not None
         lock.clock.sleep_until_ns(2 * SECOND_NS)
         reading = strings.latest()
@@ -127,7 +128,7 @@ def test_faults_reach_the_drivers(lock: LockStep) -> None:
     put([parse(fault) for fault in faults], bench_of(lock), 0)
     with ExitStack() as stack:
         rig = opened(lock, stack)
-        strings = open_strings(orbit_config(), rig, stack)
+        strings = opened_device("solar_strings", orbit_config(), rig, stack)
         assert strings is not None
         found = fixes(lock, rig, stack, 6)
         # In a second the satellite moves by 7.1 km over the ground.
@@ -136,7 +137,7 @@ def test_faults_reach_the_drivers(lock: LockStep) -> None:
         assert "check its power" in strings.error()
     assert shot(lock, 0) is not None
     with pytest.raises(NotResponding):
-        lock.wires.wide[1].trigger(5_000_000)
+        lock.hardware.orbit.wide[1].trigger(5_000_000)
 
 
 def test_a_world_without_an_orbit_has_no_such_devices() -> None:
@@ -193,7 +194,7 @@ def test_impossible_devices_are_refused(old: str, new: str, complaint: str) -> N
 def star_frame(boresight: FloatArray) -> Frame:
     """Return a frame of the star camera along a direction, ICRS."""
     lock = looking(boresight, camera=True)
-    frames = lock.wires.frames
+    frames = lock.hardware.camera
     assert frames is not None
     frames.trigger(200_000_000)
     lock.clock.sleep_until_ns(SECOND_NS)
@@ -306,25 +307,11 @@ def test_the_truth_of_the_orbit_is_logged_once_a_second(tmp_path: Path) -> None:
     assert len(packets["truth"]) == 201
 
 
-class SilentLine:
-    """Device end of a serial line on which nobody sends."""
-
-    baud_rate = 115200
-
-    def next_arrival_ns(self) -> int:
-        return 2**62
-
-    def read(self, now_ns: int) -> bytes:
-        return b""
-
-    def write(self, data: bytes, now_ns: int) -> None:
-        """Discard the data."""
-
-
 def test_a_slow_start_shifts_no_device_in_time() -> None:
     """In real time the clock runs on while the devices are built, here by half a second at each reading."""
     clock = itertools.count(10 * SECOND_NS, SECOND_NS // 2)
-    hardware = assemble(orbit_config(), orbit_world(), clock.__next__, SilentLine(), gps_line=SilentLine())
+    wires = EmulatedWires(clock.__next__, 1, orbit_config().coils.bus)
+    hardware = assemble(orbit_config(), orbit_world(), clock.__next__, wires)
     world, gps = hardware.world, hardware.orbit.gps
     assert isinstance(world, OrbitingWorld)
     assert gps is not None

@@ -16,7 +16,7 @@ from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Config, Modes
 from flight.schema.testbed import TestbedConfig, as_testbed
 from ground.telemetry import Run, read_run
-from hal.interfaces.wires import SECOND_NS, Rig
+from hal.interfaces.wires import SECOND_NS
 from sim_hal.rig import LockStep, opened_lockstep, with_host_faults
 from sim_hal.settings import Simulation
 from sim_hal.worlds.testbed import Testbed
@@ -102,7 +102,7 @@ def fly(
             stack.callback(lambda: _assert_off(lock))
         planner_s = section.latency.planner if planner_latency is None else planner_latency
         latency = round(planner_s * SECOND_NS), round(section.latency.vision * SECOND_NS)
-        rig = Rig(lock.clock, lock.wires, lock.release, False, section.seed, latency)
+        rig = lock.rig(section.seed, latency)
         rig = with_host_faults(rig, section)
         if absent is not None:
             absent(lock)

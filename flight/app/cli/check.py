@@ -13,36 +13,26 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flight.app.cli.run import counts_text, summary_facts
-from flight.app.devices import linux_camera, unit_settings
+from flight.app.devices import open_camera, real_rig
 from flight.app.run import RunRequest, RunResult
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera, structure_mask
 from flight.schema.document import ConfigError, config_path, merged_text, names, read_document
+from flight.schema.drivers import DRIVERS, driver_of
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
-from hal.buses.clock import SystemClock
-from hal.buses.i2c_bus import LinuxI2cBus, device_file
-from hal.buses.serial_port import PySerialPort
-from hal.drivers import ads1115, ina219
-from hal.drivers.pca9685 import MODE1
-from hal.drivers.vn100.driver import Vn100
-from hal.interfaces.errors import DeviceError, NotResponding
+from hal.interfaces.errors import DeviceError
 from knightcube.errors import UsageError
 
 if TYPE_CHECKING:  # see `flight.app.run`
     from flight.loop.flight_loop import FlightEnding
-
-_CHIP_CURE = "check power, wiring and address; `i2cdetect -y` lists the chips that answer"
-_LISTENED_NS = 2_500_000_000
-_LOOK_NS = 20_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,76 +47,29 @@ class Probed:
 
 def probe(config: Config) -> list[Probed]:
     """Return the result of each device, file and folder that the configuration needs."""
-    found = list(_chips(config))
-    unit = config.inertial_unit
-    found.append(_probed("inertial_unit", unit.device, lambda stack: _ask_unit(config, stack)))
-    if config.gps is not None:
-        gps = config.gps
-        found.append(_probed("gps", gps.device, lambda stack: _listen(gps.device, gps.baud_rate, stack)))
-    cameras: dict[str, Camera | WideCamera] = {} if config.camera is None else {"camera": config.camera}
-    cameras |= {f"wide_cameras[{index}]": camera for index, camera in enumerate(config.wide_cameras)}
-    for name, camera in cameras.items():
-        device = camera.device
-        place = "" if device is None else str(getattr(device, "path", None) or getattr(device, "name", ""))
-        found.append(_probed(name, place, partial(_open_camera, camera)))
-    return found + list(_files(config))
+    sections = [(kind, getattr(config, kind)) for kind in DRIVERS if kind != "camera"]
+    sections += [("camera", config.camera)]
+    sections += [(f"wide_cameras[{number}]", camera) for number, camera in enumerate(config.wide_cameras)]
+    return [_probed(config, *named) for named in sections if named[1] is not None] + list(_files(config))
 
 
-def _probed(name: str, place: str, ask: Callable[[ExitStack], str]) -> Probed:
+def _probed(config: Config, name: str, section: Any) -> Probed:
+    """Ask one device for a sign of life, with connections of its own."""
+    camera = isinstance(section, Camera | WideCamera)
+    if camera and section.device is None:
+        return Probed(name, "", False, "names no device: give `device`, or no camera")
+    kind = "camera" if camera else name
+    driver = driver_of(kind, section.device if camera else section)
+    place = ", ".join(driver.files(section) or driver_of("coils", config.coils).files(config.coils))
+    place = getattr(section.device, "name", "") or place if camera else place
     with ExitStack() as stack:
+        rig = real_rig(config, stack)
         try:
-            return Probed(name, place, True, ask(stack))
+            if camera:
+                open_camera(section, rig, stack)
+            return Probed(name, place, True, driver.probe(rig, section))
         except DeviceError as error:
             return Probed(name, place, False, error.message)
-
-
-def _chips(config: Config) -> Iterator[Probed]:
-    """Probe the chips on the I2C bus by reading one register of each chip."""
-    bus = device_file(config.coils.bus)
-    addresses = {"coils": (config.coils.address, MODE1)}
-    if config.power_monitor is not None:
-        addresses["power_monitor"] = config.power_monitor.address, ina219.CONFIG
-    if config.solar_strings is not None:
-        for address in sorted({string.address for string in config.solar_strings.strings}):
-            addresses[f"solar_strings, 0x{address:02x}"] = address, ads1115.CONFIG
-    for name, (address, register) in addresses.items():
-
-        def ask(stack: ExitStack, address: int = address, register: int = register) -> str:
-            opened = LinuxI2cBus(config.coils.bus)
-            stack.callback(opened.close)
-            try:
-                opened.read_i2c_block_data(address, register, 2)
-            except OSError as error:
-                raise NotResponding(bus, f"{error.strerror}: {_CHIP_CURE}") from error
-            return "answers"
-
-        yield _probed(name, f"{bus}, 0x{address:02x}", ask)
-
-
-def _ask_unit(config: Config, stack: ExitStack) -> str:
-    clock, unit = SystemClock(), config.inertial_unit
-    port = PySerialPort(unit.device, unit.baud_rate, clock)
-    stack.callback(port.close)
-    return f"answers: {Vn100(port, clock, unit_settings(config)).model()}"
-
-
-def _listen(device: str, baud_rate: int, stack: ExitStack) -> str:
-    """Wait for bytes of the GPS receiver, which sends without a request at least once a second."""
-    clock = SystemClock()
-    port = PySerialPort(device, baud_rate, clock)
-    stack.callback(port.close)
-    deadline_ns = clock.now_ns() + _LISTENED_NS
-    while clock.now_ns() < deadline_ns:
-        if port.receive():
-            return "sends"
-        clock.sleep_until_ns(clock.now_ns() + _LOOK_NS)
-    silence = f"opens, but no byte arrived in {_LISTENED_NS * 1e-9:g} s"
-    raise NotResponding(device, f"{silence}: check power, the cable and the baud rate")
-
-
-def _open_camera(camera: Camera | WideCamera, stack: ExitStack) -> str:
-    linux_camera(camera, SystemClock(), stack)
-    return "opens; `knightcube camera` shows its images"
 
 
 def _files(config: Config) -> Iterator[Probed]:

@@ -163,7 +163,7 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
         ),
         (
             "  star_tracker: {}",
-            "  star_tracker: {}\n  device: {kind: v4l2, pixel_format: Y10}",
+            "  star_tracker: {}\n  device: {driver: v4l2, pixel_format: Y10}",
             "`camera.bits` is 16: pixels of Y10 have 10 bits$",
         ),
         (

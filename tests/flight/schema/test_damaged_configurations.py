@@ -12,7 +12,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 
-from flight.app.devices import coil_settings, unit_settings
+from flight.app.drivers import coil_settings, unit_settings
 from flight.app.flight import workers
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
@@ -75,7 +75,7 @@ def test_a_damaged_configuration_is_refused_in_one_line_or_usable(chance: Random
         config = configuration.parse(text, "damaged.yaml")
         if config.simulation is not None:
             configuration.simulation_section(text, "damaged.yaml", Simulation)
-        coils, unit = coil_settings(config), unit_settings(config)
+        coils, unit = coil_settings(config.coils), unit_settings(config.inertial_unit)
         workers(config)
     except ConfigError as error:
         message = str(error)

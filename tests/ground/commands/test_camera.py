@@ -43,7 +43,7 @@ def camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> IoctlCamera:
 def test_frames_of_a_real_camera_are_listed_and_kept(
     tmp_path: Path, camera: IoctlCamera, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = with_camera(tmp_path, f"{{kind: v4l2, path: {camera.path}, pixel_format: Y10, gain: 7}}", 10)
+    config = with_camera(tmp_path, f"{{driver: v4l2, path: {camera.path}, pixel_format: Y10, gain: 7}}", 10)
     out = tmp_path / "frame.png"
     assert main(["camera", "--config", str(config), "--out", str(out), "--count", "3", "--json"]) == 0
     output = json.loads(capsys.readouterr().out)
@@ -65,7 +65,7 @@ def test_a_frozen_camera_ends_with_status_1(
     tmp_path: Path, camera: IoctlCamera, capsys: pytest.CaptureFixture[str]
 ) -> None:
     camera.frozen = True
-    config = with_camera(tmp_path, f"{{kind: v4l2, path: {camera.path}}}")
+    config = with_camera(tmp_path, f"{{driver: v4l2, path: {camera.path}}}")
     assert main(["camera", "--config", str(config), "--count", "2"]) == 1
     assert "it is frozen" in capsys.readouterr().err
 
@@ -73,7 +73,7 @@ def test_a_frozen_camera_ends_with_status_1(
 def test_a_missing_camera_is_one_line_and_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = with_camera(tmp_path, f"{{kind: v4l2, path: {tmp_path}/none}}")
+    config = with_camera(tmp_path, f"{{driver: v4l2, path: {tmp_path}/none}}")
     assert main(["camera", "--config", str(config)]) == 1
     output = capsys.readouterr().err
     assert "no such camera" in output
@@ -115,10 +115,10 @@ def test_real_devices_need_a_camera_that_is_named(tmp_path: Path, capsys: pytest
 
 
 def test_each_kind_of_camera_has_its_own_keys(tmp_path: Path) -> None:
-    output = configuration.load(with_camera(tmp_path, "{kind: aravis, name: Fake_1, pixel_format: Mono8}"))
+    output = configuration.load(with_camera(tmp_path, "{driver: aravis, name: Fake_1, pixel_format: Mono8}"))
     assert output.camera is not None
     assert output.camera.device == AravisDevice(name="Fake_1", pixel_format="Mono8")
-    output = configuration.load(with_camera(tmp_path, "{kind: v4l2, stamp: end, stamp_delay: 0.01}"))
+    output = configuration.load(with_camera(tmp_path, "{driver: v4l2, stamp: end, stamp_delay: 0.01}"))
     assert output.camera is not None
     assert output.camera.device == V4l2Device(stamp="end", stamp_delay=0.01)
 
@@ -126,13 +126,13 @@ def test_each_kind_of_camera_has_its_own_keys(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("device", "bits", "message"),
     [
-        ("{kind: v4l2, gian: 3}", 8, "unknown key, did you mean `gain`"),
-        ("{kind: aravis, name: x, nane: 3}", 12, "unknown key, did you mean `name`"),
-        ("{kind: aravis, name: x, path: /dev/video0}", 12, "known keys: name, pixel_format, gain"),
+        ("{driver: v4l2, gian: 3}", 8, "unknown key, did you mean `gain`"),
+        ("{driver: aravis, name: x, nane: 3}", 12, "unknown key, did you mean `name`"),
+        ("{driver: aravis, name: x, path: /dev/video0}", 12, "known keys: name, pixel_format, gain"),
         ("{kind: webcam}", 8, "webcam"),
-        ("{kind: v4l2, pixel_format: GREY}", 12, "pixels of GREY have 8"),
-        ("{kind: v4l2, pixel_format: Y16}", 8, "pixels of Y16 have 9 to 16"),
-        ("{kind: aravis}", 8, "`camera.device.name` is missing"),
+        ("{driver: v4l2, pixel_format: GREY}", 12, "pixels of GREY have 8"),
+        ("{driver: v4l2, pixel_format: Y16}", 8, "pixels of Y16 have 9 to 16"),
+        ("{driver: aravis}", 8, "`camera.device.name` is missing"),
     ],
 )
 def test_a_camera_that_makes_no_sense_is_refused(

@@ -119,7 +119,9 @@ def test_a_rate_that_no_picture_shows_is_refused(words: list[str], complaint: st
 def test_a_real_camera_does_not_turn_by_itself(tmp_path: Path) -> None:
     text = (DEMO.parent / "testbed.yaml").read_text(encoding="utf-8")
     path = tmp_path / "real.yaml"
-    path.write_text(text.replace("camera: none", "camera: {device: {kind: v4l2}, bits: 8}"), encoding="utf-8")
+    path.write_text(
+        text.replace("camera: none", "camera: {device: {driver: v4l2}, bits: 8}"), encoding="utf-8"
+    )
     done = command("camera", "--config", path, "--rate", "0", "0", "0.01")
     assert done.returncode == 2
     assert "has a real camera" in done.stderr

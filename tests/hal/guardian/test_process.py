@@ -103,7 +103,8 @@ _FLIGHT = """
 import sys, time
 from hal.interfaces.guardian import CoilReach
 from hal.guardian import GuardianLine
-line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", sys.argv[1], ((int(sys.argv[2]), 0xFD, 0x10),)))
+writes = ((int(sys.argv[2]), 0xFD, 0x10),)
+line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", sys.argv[1], writes))
 line.wait_ready(20.0)
 print(line.process_id, flush=True)
 time.sleep(60.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flight.app.devices import coil_settings, unit_settings
+from flight.app.drivers import coil_settings, unit_settings
 from flight.app.flight import next_whole_second
 from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import ResponseSettings
@@ -92,11 +92,11 @@ def observe(
     section = configuration.replace(demo_world(), seed=seed, faults=entries, truth=truth)
     clock = SimClock()
     lock = build_lockstep(config, section, None, clock)
-    pca = Pca9685(lock.wires.i2c, config.coils.address, clock)
-    coils = PwmTorqueCoils(pca, clock, coil_settings(config))
+    pca = Pca9685(lock.hardware.bus, config.coils.address, clock)
+    coils = PwmTorqueCoils(pca, clock, coil_settings(config.coils))
     coils.start()
-    monitor = Ina219(lock.wires.i2c, 0x45, clock)
-    unit = Vn100(lock.wires.serial, clock, unit_settings(config))
+    monitor = Ina219(lock.hardware.bus, 0x45, clock)
+    unit = Vn100(lock.line.host, clock, unit_settings(config.inertial_unit))
     unit.configure()
     watch = CoilMonitor(watch_settings(config, monitor_only))
     epoch_ns = next_whole_second(clock)

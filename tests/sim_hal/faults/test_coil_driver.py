@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.app.devices import coil_settings
+from flight.app.drivers import coil_settings
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.pca9685 import Pca9685
 from sim_hal.clock import SimClock
@@ -22,7 +22,9 @@ def errors_under(fault: str) -> tuple[list[tuple[float, str]], float]:
     """Command for six seconds under a fault; return (time, error) by cycle, and the last miss in A."""
     config = demo_config(10.0, camera=False)
     lock = build_lockstep(config, demo_world(), None, SimClock())
-    coils = PwmTorqueCoils(Pca9685(lock.wires.i2c, 0x40, lock.clock), lock.clock, coil_settings(config))
+    coils = PwmTorqueCoils(
+        Pca9685(lock.hardware.bus, 0x40, lock.clock), lock.clock, coil_settings(config.coils)
+    )
     coils.start()
     epoch_ns = lock.clock.now_ns()
     bench = Bench(lock.hardware, lock.line, lock.clock.now_ns, np.random.default_rng(4), lock.line.host)

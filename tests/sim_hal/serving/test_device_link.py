@@ -115,12 +115,10 @@ def test_a_file_that_names_no_server_is_refused(tmp_path: Path, facts: str | Non
 
 def test_a_server_that_has_gone_is_said_so(tmp_path: Path) -> None:
     path = tmp_path / "facts.json"
-    unit = {"serial": "/dev/ptmx", "baud_rate": 115200, "camera": False}
+    unit = {"lines": {"/dev/knightcube-imu": "/dev/ptmx"}, "coil_bus": "/dev/i2c-1", "camera": False}
     gone = {
         **unit,
         "socket": str(tmp_path / "gone"),
-        "gps": None,
-        "gps_baud_rate": 0,
         "wide": [],
         "utc_offset_ns": None,
     }

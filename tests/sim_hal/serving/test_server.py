@@ -17,7 +17,7 @@ from unittest.mock import Mock, call
 import numpy as np
 import pytest
 
-from flight.app.devices import open_gps, open_strings
+from flight.app.devices import opened as opened_device
 from flight.schema import reader
 from hal.interfaces.devices import Frame, GpsReading
 from hal.interfaces.wires import SECOND_NS, Rig
@@ -69,18 +69,19 @@ def test_receiver_strings_and_wide_cameras_answer_in_real_time_with_their_faults
     with ExitStack() as stack:
         served = stack.enter_context(started_server(path, 1, tmp_path))
         rig = Rig(served.clock, served.wires, served.release, True, 1)
-        gps, strings = open_gps(config, rig, stack), open_strings(config, rig, stack)
+        gps, strings = (opened_device(kind, config, rig, stack) for kind in ("gps", "solar_strings"))
         assert gps is not None
         assert strings is not None
         served.release(served.clock.now_ns(), ["gps: no-fix @ 1.5", "wide: black (camera=2) @ 0"])
-        for camera in served.wires.wide:
+        wide = [camera for camera in served.cameras[1:] if camera is not None]
+        for camera in wide:
             camera.trigger(SECOND_NS // 200)
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline and not (
             len(frames) == 2 and strings.latest() is not None and fixes and not fixes[-1].valid
         ):
             fixes += gps.poll()
-            for number, camera in enumerate(served.wires.wide):
+            for number, camera in enumerate(wide):
                 frame = camera.poll()
                 if frame is not None:
                     frames[number] = frame
@@ -103,7 +104,7 @@ def test_the_facts_are_written_before_the_devices_are_served(
 ) -> None:
     """The parent process waits for the line, so it must not remain in a buffer."""
     calls = Mock()
-    calls.server.serial_device, calls.server.gps_device = "/dev/pts/7", None
+    calls.server.lines = {"/dev/knightcube-imu": "/dev/pts/7"}
     calls.server.socket_path = tmp_path / "devices"
     calls.server.hardware.utc_offset_ns = 5
     made: list[Any] = []
@@ -137,7 +138,7 @@ def test_the_facts_are_written_before_the_devices_are_served(
     ]
     facts = json.loads(written)
     assert json.loads((tmp_path / "facts").read_text(encoding="utf-8")) == facts
-    assert (facts["serial"], facts["camera"], facts["gps"], facts["wide"]) == ("/dev/pts/7", True, None, 0)
+    assert (facts["lines"], facts["camera"], facts["wide"]) == (calls.server.lines, True, 0)
     ((config, section, folder),) = made
     assert (section.seed, folder) == (9, tmp_path)
-    assert facts["baud_rate"] == config.inertial_unit.baud_rate
+    assert facts["coil_bus"] == f"/dev/i2c-{config.coils.bus}"

@@ -133,7 +133,7 @@ def test_devices_that_are_missing_are_named_with_the_cure_and_one_that_is_there_
         "inertial_unit": {**tree["inertial_unit"], "device": str(unit)},
         "coils": {**tree["coils"], "bus": str(tmp_path / "no-bus")},
         "camera": {
-            "device": {"kind": "v4l2", "path": str(tmp_path / "no-camera")},
+            "device": {"driver": "v4l2", "path": str(tmp_path / "no-camera")},
             "bits": 8,
             "star_tracker": {"index": "x"},
         },
@@ -184,7 +184,7 @@ def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) 
                 "solar_strings": {"strings": strings},
                 "wide_cameras": [
                     {
-                        "device": {"kind": "v4l2", "path": str(tmp_path / "none")},
+                        "device": {"driver": "v4l2", "path": str(tmp_path / "none")},
                         "structure_file": str(mask),
                     }
                 ],
@@ -194,7 +194,7 @@ def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) 
             assert done.returncode == 1, done.stderr
             found = {item["name"]: item for item in json.loads(done.stdout)["devices"]}
             assert found["gps"]["found"] is answer, found["gps"]
-            assert {"solar_strings, 0x48", "solar_strings, 0x49", "wide_cameras[0]"} < set(found)
+            assert {"solar_strings", "wide_cameras[0]"} < set(found)
             assert "no byte arrived" in found["gps"]["text"] or answer
             hidden = found["wide_cameras[0].structure_file"]
             assert hidden["found"] is answer, hidden
