@@ -6,7 +6,10 @@ and `files_` returns the device files that the section names.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -17,23 +20,31 @@ from flight.schema.devices import (
     Gps,
     InertialUnitSection,
     PowerMonitorSection,
+    Sensor,
+    SensorsSection,
     SolarStringsSection,
     V4l2Device,
     WideCamera,
 )
+from flight.schema.document import ConfigError, imported
+from flight.schema.drivers import SENSOR_PARTS, axis_matrix
 from hal.buses.i2c_bus import device_file
-from hal.drivers import ads1115, ina219
+from hal.drivers import ads1115, drv8830, ina219
 from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
 from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.coils import CoilSettings, PwmTorqueCoils, wirings
+from hal.drivers.drv8830 import Drv8830Bridges, Drv8830Coils
 from hal.drivers.ina219 import Ina219
+from hal.drivers.nmea import NmeaReceiver
 from hal.drivers.pca9685 import ALL_LED_OFF_H, FULL, MODE1, Pca9685
+from hal.drivers.sensor_unit import CircuitPythonI2c, SensorPart, SensorUnit, SensorUnitSettings
 from hal.drivers.ublox import EARLIEST_NS, UbloxReceiver
 from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
 from hal.interfaces.devices import GpsReceiver, TorqueCoils
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SECOND_NS, Rig
+from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import NED_TO_TESTBED, attitude_map, attitude_matrix
 
 _CHIP_CURE = "check power, wiring and address; `i2cdetect -y` lists the chips that answer"
@@ -71,6 +82,65 @@ def files_vn100(unit: InertialUnitSection) -> Sequence[str]:
     return (unit.device,)
 
 
+def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
+    """Return the driver of an inertial unit of separate sensors. Raises ConfigError for an unknown sensor."""
+    parts, measured = [], set[str]()
+    for number, sensor in enumerate(unit.sensors):
+        key = f"inertial_unit.sensors[{number}]"
+        part = imported(f"{key}.part", sensor.part, SENSOR_PARTS, os.environ)
+        if (sensor.spi is not None) != hasattr(part, "SPEED_HZ"):
+            problem = (
+                "goes with a sensor on an SPI bus" if sensor.spi else "is missing: this is an SPI device"
+            )
+            raise ConfigError(f"{key}.spi", problem)
+        axes: dict[str, FloatArray] = {
+            quantity: axis_matrix(names) for quantity, names in sensor.measures.items()
+        }
+        parts.append(SensorPart(sensor.part, partial(_started, part, rig, sensor), axes))
+        measured |= set(axes)
+    if missing := {"gyro", "magnetic"} - measured:
+        raise ConfigError("inertial_unit.sensors", f"measure no {' and no '.join(sorted(missing))}")
+    known = unit.calibration
+    settings = SensorUnitSettings(
+        mounting=attitude_matrix(np.array(unit.mounting)),
+        gyro_matrix=np.array(known.gyro_matrix),
+        field_matrix=np.array(known.field_matrix),
+        field_bias=np.array(known.field_bias),
+        rate_hz=unit.rate_hz,
+        field_range=unit.field_range,
+    )
+    return SensorUnit(rig.clock, parts, settings)
+
+
+def _started(part: Callable[..., Any], rig: Rig, sensor: Sensor) -> Any:
+    """Start a sensor, and return its driver."""
+    if sensor.spi is not None:
+        kind: Any = part
+        driver = part(rig.wires.spi(sensor.spi, kind.SPEED_HZ, kind.MODE))
+    else:
+        given = {} if sensor.address is None else {"address": sensor.address}
+        driver = part(CircuitPythonI2c(rig.wires.i2c(sensor.bus)), **given)
+    for name, value in (sensor.set or {}).items():
+        setattr(driver, name, value)
+    return driver
+
+
+def probe_sensors(rig: Rig, unit: SensorsSection) -> str:
+    """Start all sensors, which writes their settings. Raises NotResponding."""
+    opened = open_sensors(rig, unit)
+    try:
+        opened.configure()
+    finally:
+        opened.close()
+    return f"{', '.join(sensor.part for sensor in unit.sensors)}: each answers"
+
+
+def files_sensors(unit: SensorsSection) -> Sequence[str]:
+    """Return the SPI devices, and the I2C buses other than that of the coils."""
+    buses = [device_file(sensor.bus) for sensor in unit.sensors if sensor.bus is not None]
+    return list(dict.fromkeys([*buses, *(sensor.spi for sensor in unit.sensors if sensor.spi)]))
+
+
 def coil_settings(coils: Coils) -> CoilSettings:
     """Return the settings of the coil driver."""
     wired = wirings(coils.channels, coils.resistance, coils.signs, coils.limits)
@@ -96,6 +166,30 @@ def files_pca9685(coils: Coils) -> Sequence[str]:
 def off_pca9685(coils: Coils) -> Sequence[tuple[int, int, int]]:
     """Return the write that switches all outputs off."""
     return ((coils.address, ALL_LED_OFF_H, FULL),)
+
+
+def open_drv8830(rig: Rig, coils: Coils) -> TorqueCoils:
+    """Return the driver of coils on DRV8830 bridges."""
+    settings = coil_settings(coils)
+    bridges = Drv8830Bridges(rig.wires.i2c(coils.bus), coils.address, rig.clock, settings)
+    return Drv8830Coils(bridges, rig.clock, settings)
+
+
+def probe_drv8830(rig: Rig, coils: Coils) -> str:
+    """Read a register of each bridge. Raises NotResponding."""
+    return _read_chips(rig, coils.bus, drv8830.CONTROL, *_bridges(coils))
+
+
+def off_drv8830(coils: Coils) -> Sequence[tuple[int, int, int]]:
+    """Return the writes that switch all bridges off."""
+    return tuple((address, drv8830.CONTROL, drv8830.OFF) for address in _bridges(coils))
+
+
+def _bridges(coils: Coils) -> range:
+    return range(coils.address, coils.address + len(coils.slots))
+
+
+files_drv8830: Callable[[Coils], Sequence[str]] = files_pca9685
 
 
 def open_ina219(rig: Rig, monitor: PowerMonitorSection) -> Ina219:
@@ -134,6 +228,16 @@ def probe_ublox(rig: Rig, gps: Gps) -> str:
 def files_ublox(gps: Gps) -> Sequence[str]:
     """Return the serial device."""
     return (gps.device,)
+
+
+def open_nmea(rig: Rig, gps: Gps) -> GpsReceiver:
+    """Return the driver of a receiver that sends NMEA 0183 sentences by itself."""
+    port = rig.wires.serial(gps.device, gps.baud_rate)
+    return NmeaReceiver(port, rig.clock, max(EARLIEST_NS, rig.earliest_utc_ns))
+
+
+probe_nmea: Callable[[Rig, Gps], str] = probe_ublox
+files_nmea: Callable[[Gps], Sequence[str]] = files_ublox
 
 
 def open_ads1115(rig: Rig, section: SolarStringsSection) -> AdsSolarStrings:

@@ -39,6 +39,7 @@ _KNOWN = CameraKnowledge()
 _MOST_HIDDEN = 0.5
 """Largest fraction of a horizon camera's image that the configured structure may cover."""
 Polygon = Annotated[tuple[tuple[float, float], ...], Meta(min_length=3, max_length=64)]
+Quantity = Literal["gyro", "magnetic", "acceleration"]
 ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
 
 
@@ -99,9 +100,9 @@ class Sensor(Section, frozen=True, kw_only=True):
 
     The value `part` is `icm20948`, `lis3mdl`, `adis16470`, or `module:class` of a CircuitPython driver. The
     sensor has the I2C `address` on the bus `bus`, by default the bus of the coils, or it is the SPI device
-    `spi`. It is read for the quantities `measures`: `gyro`, `magnetic` and `acceleration`, which are names
-    of CircuitPython. The value `axes` names the sensor's axis along each body axis, such as [y, -x, z]. The
-    attributes `set` are set after each start, for example a data rate or a range. The value `emulator` names
+    `spi`. The mapping `measures` names the quantities that are read from the sensor, and for each quantity
+    the sensor's axis along the axes x, y and z of the unit, such as `gyro: [y, -x, z]`. The attributes `set`
+    of the CircuitPython driver are set after each start, for example a data rate. The value `emulator` names
     the emulator of another sensor, as `module:function`.
     """
 
@@ -109,16 +110,16 @@ class Sensor(Section, frozen=True, kw_only=True):
     address: Address | None = None
     bus: Bus | None = None
     spi: Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$", description="a device file")] | None = None
-    measures: Annotated[tuple[Literal["gyro", "magnetic", "acceleration"], ...], Meta(min_length=1)]
-    axes: tuple[SignedAxis, SignedAxis, SignedAxis] = ("x", "y", "z")
-    set: dict[str, float] | None = None
+    measures: dict[Quantity, tuple[SignedAxis, SignedAxis, SignedAxis]]
+    set: dict[str, int | float] | None = None
     emulator: Annotated[str, Meta(min_length=3, max_length=200)] | None = None
 
 
 class SensorsSection(UnitSection, frozen=True, kw_only=True):
     """An inertial unit of separate gyro, magnetometer and accelerometer (driver `sensors`).
 
-    Without an accelerometer and a magnetometer, the unit gives no attitude, so it flies in orbit only.
+    The attitude follows from acceleration and magnetic field. Without an accelerometer the unit gives no
+    attitude, and flies in orbit only.
     """
 
     sensors: Annotated[tuple[Sensor, ...], Meta(min_length=1, max_length=4)]

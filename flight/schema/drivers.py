@@ -8,11 +8,12 @@ drivers nor simulator.
 from __future__ import annotations
 
 import os
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 import msgspec
+import numpy as np
 
 from flight.schema.devices import (
     AravisDevice,
@@ -28,6 +29,7 @@ from flight.schema.devices import (
 )
 from flight.schema.document import ConfigError, Document, imported
 from hal.interfaces.driver import Driver, later
+from knightcube.astro.arrays import FloatArray
 
 
 def _ours(kind: str, section: type[Any], name: str, emulators: str = "", **more: Any) -> Driver:
@@ -79,6 +81,19 @@ DRIVERS: Mapping[str, Mapping[str, str]] = {
 """Registrations (`module:object`) of each section by built-in name; the first name is the default."""
 
 
+SENSOR_PARTS: Mapping[str, str] = {
+    "icm20948": "adafruit_icm20x:ICM20948",
+    "lis3mdl": "adafruit_lis3mdl:LIS3MDL",
+    "adis16470": "hal.drivers.adis16470:Adis16470",
+}
+"""Classes (`module:class`) of the sensors with an emulator, by name."""
+
+
+def axis_matrix(names: Sequence[str]) -> FloatArray:
+    """Return the matrix (3, 3) from sensor axes to the axes whose sensor axes are named, such as "-x"."""
+    return np.array([[(1.0, -1.0)[name[0] == "-"] * (name[-1] == axis) for axis in "xyz"] for name in names])
+
+
 def driver_of(kind: str, section: Any, key: str = "") -> Driver:
     """Return the registration of the driver that a section names. Raises ConfigError.
 
@@ -115,6 +130,7 @@ def with_drivers(shape: type[Any], document: Document) -> type[Any]:
         named = section.get("driver") if isinstance(section, dict) else None
         if isinstance(named, str) and kind != "camera" and named != next(iter(DRIVERS[kind])):
             fields.append((kind, section_of(kind, named, f"{kind}.driver")))
+            _drop_inherited(kind, fields[-1][1], document)
     others: dict[str, type[Any]] = {}
     for key, camera in _cameras(document.values):
         device = camera.get("device")
@@ -123,7 +139,15 @@ def with_drivers(shape: type[Any], document: Document) -> type[Any]:
             others[named] = section_of("camera", named, f"{key}.device.driver")
     if others:
         fields += _camera_fields(tuple(sorted(others.items())))
-    return _shape(shape, tuple(fields)) if fields else shape
+    return _shape(cast(Hashable, shape), tuple(fields)) if fields else shape
+
+
+def _drop_inherited(kind: str, section: type[Any], document: Document) -> None:
+    """Remove the keys of another driver that an extended file gives, because they do not apply."""
+    known = {field.encode_name for field in msgspec.structs.fields(section)}
+    for key in set(document.values[kind]) - known:
+        if f"{kind}.{key}" in document.files:
+            del document.values[kind][key]
 
 
 def _cameras(values: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:

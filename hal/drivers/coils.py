@@ -25,11 +25,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import RLock
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
-from hal.drivers.pca9685 import BLOCK_CHANNELS, CHANNELS, COUNTS, FULL_OFF, FULL_ON, Pca9685, PwmCounts
+from hal.drivers.pca9685 import BLOCK_CHANNELS, CHANNELS, COUNTS, FULL_OFF, FULL_ON, PwmCounts
 from hal.interfaces.devices import COIL_NAMES, MOST_COILS, NO_AXES, Axes, CoilState, FloatArray
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
 from hal.interfaces.wires import Clock, Ticker
@@ -283,6 +283,27 @@ _CHECK_PERIOD_NS = 500_000_000
 _Answer = TypeVar("_Answer")
 
 
+class PwmOutputs(Protocol):
+    """PWM chip of the bridges, or bridges that act like one; each method raises DeviceError on failure."""
+
+    name: str
+
+    def configure(self) -> None:
+        """Configure the chip with all outputs off."""
+
+    def is_configured(self) -> bool:
+        """Return whether the chip still has its configuration."""
+
+    def holds(self, first: int, counts: Sequence[PwmCounts]) -> bool:
+        """Return whether consecutive channels have the given counts."""
+
+    def write_channels(self, first: int, counts: Sequence[PwmCounts]) -> None:
+        """Write the counts of consecutive channels."""
+
+    def all_off(self) -> None:
+        """Switch all outputs off."""
+
+
 class CoilOutputs:
     """Writer of signed counts to the PWM chip, which records the last acknowledged outputs.
 
@@ -295,7 +316,7 @@ class CoilOutputs:
         error: text of the current failure, empty if there is none.
     """
 
-    def __init__(self, pca: Pca9685, clock: Clock, settings: CoilSettings, lock: RLock) -> None:
+    def __init__(self, pca: PwmOutputs, clock: Clock, settings: CoilSettings, lock: RLock) -> None:
         """Use a PWM chip. The lock protects the attributes `written`, `braked` and `written_ns`."""
         self.written = self._zero = (0,) * len(settings.coils)
         self.braked = NO_AXES
@@ -421,7 +442,7 @@ _OFF_PATIENCE = 0.3  # longest time (s) for which `off` waits for the lock
 class PwmTorqueCoils:
     """Driver of the torque coils. All methods are thread-safe."""
 
-    def __init__(self, pca: Pca9685, clock: Clock, settings: CoilSettings) -> None:
+    def __init__(self, pca: PwmOutputs, clock: Clock, settings: CoilSettings) -> None:
         self._clock = clock
         self._settings = settings
         self._steps = tuple(current_step(coil.resistance, settings.supply_voltage) for coil in settings.coils)

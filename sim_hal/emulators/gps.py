@@ -129,11 +129,15 @@ class EmulatedGps:
         while self._epoch_ns <= now_ns:
             epoch_ns = self._epoch_ns
             self._epoch_ns += self._period_ns
-            data = frame(NAV_PVT, self._measure(epoch_ns).packed()) if self._enabled else NMEA
+            data = self._message(epoch_ns)
             self._sending.append((epoch_ns + round(self._errors.latency * SECOND_NS), data))
         while self._sending and self._sending[0][0] <= now_ns:
             sent_ns, data = self._sending.pop(0)
             self._line.write(data, sent_ns)
+
+    def _message(self, epoch_ns: int) -> bytes:
+        """Return the message about the fix at `epoch_ns`."""
+        return frame(NAV_PVT, self._measure(epoch_ns).packed()) if self._enabled else NMEA
 
     def _power(self, now_ns: int, start: float) -> None:
         self._parser = UbxParser()

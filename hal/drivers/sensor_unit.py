@@ -1,0 +1,262 @@
+"""Inertial unit of separate sensors, each with a driver that has the properties of CircuitPython drivers.
+
+CircuitPython drivers of motion sensors have the properties `gyro` (rad/s), `magnetic` (microtesla) and
+`acceleration` (m/s^2), take an I2C bus with the methods of `busio.I2C`, and sleep while they start. All
+sensors are started before the flight, and read by a periodic job of their own, never by the control loop.
+After a failure the job starts all sensors again, because a brown-out clears their settings.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hal.interfaces.devices import FloatArray, ImuLink, ImuReading
+from hal.interfaces.errors import DeviceError, NotResponding
+from hal.interfaces.wires import SECOND_NS, Clock, RawI2cBus
+
+TESLA_PER_UNIT = 1e-6
+_FAILURES = 3
+"""Number of consecutive failures after which the sensors are started again."""
+_ALIKE = 10
+"""Number of consecutive equal samples that are accepted; working sensors have noise."""
+_FREE_FALL = 1.0
+"""Specific force (m/s^2) below which the vertical is unknown."""
+
+
+class CircuitPythonI2c:
+    """An I2C bus as CircuitPython drivers expect it (`busio.I2C`), on a bus of the flight."""
+
+    def __init__(self, bus: RawI2cBus) -> None:
+        self._bus = bus
+        self._lock = threading.Lock()
+
+    def try_lock(self) -> bool:
+        """Reserve the bus for one driver, and return whether it was free."""
+        return self._lock.acquire(blocking=False)
+
+    def unlock(self) -> None:
+        """Release the bus."""
+        self._lock.release()
+
+    def writeto(self, address: int, buffer: Any, *, start: int = 0, end: int | None = None) -> None:
+        """Write the bytes of a buffer."""
+        self._bus.exchange(address, bytes(buffer[start:end]), 0)
+
+    def readfrom_into(self, address: int, buffer: Any, *, start: int = 0, end: int | None = None) -> None:
+        """Read bytes into a buffer."""
+        place = slice(start, len(buffer) if end is None else end)
+        buffer[place] = self._bus.exchange(address, b"", place.stop - start)
+
+    def writeto_then_readfrom(
+        self,
+        address: int,
+        out_buffer: Any,
+        in_buffer: Any,
+        *,
+        out_start: int = 0,
+        out_end: int | None = None,
+        in_start: int = 0,
+        in_end: int | None = None,
+    ) -> None:
+        """Write bytes, and read bytes after a repeated START."""
+        place = slice(in_start, len(in_buffer) if in_end is None else in_end)
+        sent = bytes(out_buffer[out_start:out_end])
+        in_buffer[place] = self._bus.exchange(address, sent, place.stop - in_start)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorPart:
+    """One sensor of a unit.
+
+    Attributes:
+        name: name of the sensor in messages.
+        make: function that starts the sensor and returns its driver.
+        measures: matrix (3, 3) from sensor axes to unit axes for each quantity that is read.
+    """
+
+    name: str
+    make: Callable[[], Any]
+    measures: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorUnitSettings:
+    """Settings of an inertial unit of separate sensors.
+
+    Attributes:
+        mounting: (3, 3) rotation matrix from unit axes into body axes.
+        gyro_matrix: (3, 3) matrix from the rate to the rate that the gyro measures, body axes.
+        field_matrix: (3, 3) matrix from the field to the field that the magnetometer measures, body axes.
+        field_bias: (3,) bias of the magnetometer, T, body axes.
+        rate_hz: samples per second.
+        field_range: largest accepted magnetic field per axis, T.
+        rate_range: largest accepted body rate per axis, rad/s.
+    """
+
+    mounting: FloatArray
+    gyro_matrix: FloatArray
+    field_matrix: FloatArray
+    field_bias: FloatArray
+    rate_hz: int
+    field_range: float
+    rate_range: float = math.radians(2000.0)
+
+
+class SensorUnit:
+    """Inertial unit of separate sensors, which implements `hal.interfaces.devices.InertialUnit`."""
+
+    def __init__(self, clock: Clock, parts: Sequence[SensorPart], settings: SensorUnitSettings) -> None:
+        self.name = "inertial unit"
+        self._clock, self._parts, self._settings = clock, parts, settings
+        self._rate_map, field_map = (
+            np.linalg.inv(matrix) @ settings.mounting
+            for matrix in (settings.gyro_matrix, settings.field_matrix)
+        )
+        self._field_map = field_map
+        self._field_offset = np.linalg.inv(settings.field_matrix) @ settings.field_bias
+        self._drivers: list[Any] = []
+        self._readings: list[ImuReading] = []
+        self._lock = threading.Lock()
+        self._failures = self._samples = self._out_of_range = self._not_finite = self._alike = 0
+        self._error = self._rejection = ""
+        self._last_ns = -1
+        self._before: dict[str, FloatArray] = {}
+        self._ticker = clock.ticker("sensors", SECOND_NS // settings.rate_hz, self._serve)
+
+    def configure(self) -> None:
+        """Start all sensors, which may take seconds. Raises NotResponding."""
+        with self._lock:
+            self._start()
+
+    def poll(self) -> list[ImuReading]:
+        """Return the samples since the last call. Raises NotResponding while a sensor does not answer."""
+        # The list is replaced instead of locked, because a sensor that starts holds the lock.
+        readings, self._readings = self._readings, []
+        if not readings and self._failures >= _FAILURES:
+            raise NotResponding(self.name, self._error)
+        return readings
+
+    def link(self) -> ImuLink:
+        """Return the counters of the samples; each sample counts as one byte."""
+        counts = self._samples, self._samples, 0, 0, self._out_of_range, self._not_finite
+        return ImuLink(*counts, self._last_ns, self._rejection)
+
+    def close(self) -> None:
+        """Stop reading."""
+        self._ticker.stop()
+
+    def _start(self) -> None:
+        self._drivers = []
+        for part in self._parts:
+            try:
+                self._drivers.append(part.make())
+            # CircuitPython drivers raise RuntimeError or ValueError for a missing or another sensor.
+            except (OSError, RuntimeError, ValueError, DeviceError) as error:
+                self._drivers = []
+                raise NotResponding(self.name, f"{part.name}: {error}; check power and wiring") from error
+
+    def _serve(self) -> None:
+        """Read all sensors once. The clock calls this method periodically."""
+        with self._lock:
+            try:
+                if not self._drivers or self._failures == _FAILURES:
+                    self._failures = _FAILURES
+                    self._start()
+                begun_ns, values = self._clock.now_ns(), self._read()
+            except (OSError, RuntimeError, ValueError, DeviceError) as error:
+                self._error, self._failures = str(error), min(self._failures + 1, _FAILURES)
+                return
+            self._failures, self._error = 0, ""
+        self._samples += 1
+        self._last_ns = self._clock.now_ns()
+        if self._accepts(values):
+            self._readings.append(self._reading(values, (begun_ns + self._last_ns) // 2))
+
+    def _read(self) -> dict[str, FloatArray]:
+        return {
+            quantity: axes @ np.array(getattr(driver, quantity), dtype=float)
+            for part, driver in zip(self._parts, self._drivers, strict=True)
+            for quantity, axes in part.measures.items()
+        }
+
+    def _accepts(self, values: dict[str, FloatArray]) -> bool:
+        """Return whether a sample is finite, within the ranges and not stuck; otherwise count it."""
+        settings, before = self._settings, self._before
+        alike = bool(before) and all(np.array_equal(values[name], before[name]) for name in values)
+        self._alike, self._before = self._alike + 1 if alike else 0, values
+        for name, value in values.items():
+            if not np.isfinite(value).all():
+                self._not_finite += 1
+                self._rejection = f"{name} = {value.tolist()}"
+                return False
+        largest = {"gyro": settings.rate_range, "magnetic": settings.field_range / TESLA_PER_UNIT}
+        for name, bound in largest.items():
+            if np.abs(values[name]).max() > bound or self._alike >= _ALIKE:
+                self._out_of_range += 1
+                self._rejection = f"{name} = {values[name].tolist()}"
+                return False
+        return True
+
+    def _reading(self, values: dict[str, FloatArray], time_ns: int) -> ImuReading:
+        mounting = self._settings.mounting
+        field = self._field_map @ values["magnetic"] * TESLA_PER_UNIT - self._field_offset
+        acceleration = mounting @ values.get("acceleration", np.zeros(3))
+        return ImuReading(
+            time_ns=time_ns,
+            arrival_ns=self._last_ns,
+            device_time_ns=time_ns,
+            quaternion=level_attitude(field, acceleration),
+            rate=self._rate_map @ values["gyro"],
+            field=field,
+            acceleration=acceleration,
+        )
+
+
+def level_attitude(field: FloatArray, acceleration: FloatArray) -> FloatArray:
+    """Return the quaternion (4,) from the testbed frame into the body, from field and specific force at rest.
+
+    The testbed's y axis points down, and the horizontal field points along its -z axis. In free fall the
+    quaternion is the identity.
+    """
+    size = float(np.linalg.norm(acceleration))
+    if size < _FREE_FALL:
+        return np.array([0.0, 0.0, 0.0, 1.0])
+    y = -acceleration / size
+    z = -(field - float(field @ y) * y)
+    length = float(np.linalg.norm(z))
+    if length == 0.0:
+        return np.array([0.0, 0.0, 0.0, 1.0])
+    z = z / length
+    x = np.cross(y, z)
+    # The columns of the attitude matrix are the testbed's axes in body axes.
+    return quaternion_of(np.column_stack((x, y, z)))
+
+
+def quaternion_of(matrix: FloatArray) -> FloatArray:
+    """Return the quaternion (4,), scalar last and not negative, of an attitude matrix (3, 3)."""
+    a = matrix
+    squares = np.array(
+        [
+            1.0 + a[0, 0] - a[1, 1] - a[2, 2],
+            1.0 - a[0, 0] + a[1, 1] - a[2, 2],
+            1.0 - a[0, 0] - a[1, 1] + a[2, 2],
+            1.0 + a[0, 0] + a[1, 1] + a[2, 2],
+        ]
+    )
+    largest = int(squares.argmax())
+    vector = (a[1, 2] - a[2, 1], a[2, 0] - a[0, 2], a[0, 1] - a[1, 0])
+    sums = (a[1, 2] + a[2, 1], a[2, 0] + a[0, 2], a[0, 1] + a[1, 0])
+    q = np.empty(4)
+    if largest == 3:
+        q[:3], q[3] = vector, squares[3]
+    else:
+        q[:3] = [squares[largest] if axis == largest else sums[3 - axis - largest] for axis in range(3)]
+        q[3] = vector[largest]
+    q /= np.linalg.norm(q)
+    return q if q[3] >= 0.0 else -q

@@ -1,0 +1,301 @@
+"""Emulated gyros, magnetometers and accelerometers at the registers: ICM-20948, LIS3MDL and ADIS16470.
+
+The sensors measure at their data rates with the white noise of their data sheets. A configuration names the
+emulator of another sensor as `module:function`, which takes `Measurements` and the sensor's section, and
+returns an `I2cPart` or an SPI device.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flight.schema.devices import Sensor, SensorsSection
+from flight.schema.document import ConfigError, imported
+from flight.schema.drivers import SENSOR_PARTS, axis_matrix
+from hal.drivers.adis16470 import (
+    ACCELERATION_STEP,
+    DATA_CNTR,
+    DEC_RATE,
+    GYRO_STEP,
+    MSC_CTRL,
+    PROD_ID,
+    PRODUCT,
+    SAMPLE_HZ,
+    X_ACCL_LOW,
+    X_GYRO_LOW,
+)
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from sim_hal.emulation import Emulation
+from sim_hal.worlds.world import STANDARD_GRAVITY, BodyMotion
+
+_TURN = math.radians(1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Measurements:
+    """The quantities that an ideal sensor measures in sensor axes, with white noise added on request.
+
+    Attributes:
+        sense: function from a time (ns) to the motion at the sensor, body axes.
+        to_sensor: matrix (3, 3) from body axes to sensor axes by quantity.
+        generator: random generator of the noise.
+        now_ns: function that returns the simulation time, ns.
+    """
+
+    sense: Callable[[int], BodyMotion]
+    to_sensor: dict[str, FloatArray]
+    generator: np.random.Generator
+    now_ns: Callable[[], int]
+
+    def of(self, quantity: str, deviation: float) -> FloatArray:
+        """Return a quantity (3,) in rad/s, T or m/s^2, with white noise of a standard deviation."""
+        motion = self.sense(self.now_ns())
+        true = {
+            "gyro": motion.rate,
+            "magnetic": motion.field_body,
+            "acceleration": motion.specific_force_body,
+        }[quantity]
+        turned = self.to_sensor.get(quantity, np.eye(3)) @ true
+        return np.asarray(turned + deviation * self.generator.standard_normal(3))
+
+
+class Registers:
+    """A chip on the I2C bus with a register pointer that increments at each byte."""
+
+    def __init__(self, address: int) -> None:
+        self.address = address
+        self._pointer = 0
+
+    def answers(self, address: int) -> bool:
+        """Return whether the chip acknowledges an address."""
+        return address == self.address
+
+    def write(self, address: int, data: bytes) -> None:
+        """Set the register pointer, and write registers."""
+        self._pointer = data[0]
+        for value in data[1:]:
+            self.store(self._pointer, value)
+            self._pointer += 1
+
+    def read(self, count: int) -> bytes:
+        """Return registers from the pointer on."""
+        self.latch()
+        self._pointer += count
+        return bytes(self.load(register) for register in range(self._pointer - count, self._pointer))
+
+    def latch(self) -> None:
+        """Make a new sample if one is due, before registers are read."""
+
+    def store(self, register: int, value: int) -> None:
+        """Write a register."""
+        raise NotImplementedError
+
+    def load(self, register: int) -> int:
+        """Return a register's value."""
+        raise NotImplementedError
+
+
+class EmulatedLis3mdl(Registers):
+    """A LIS3MDL magnetometer (ST DocID024204)."""
+
+    _WHO_AM_I, _CTRL1, _CTRL2, _CTRL3, _OUT = 0x0F, 0x20, 0x21, 0x22, 0x28
+    _COUNTS_PER_GAUSS = (6842, 3421, 2281, 1711)
+    _SLOW_HZ = (0.625, 1.25, 2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
+    _FAST_HZ = (1000.0, 560.0, 300.0, 155.0)
+    _NOISE_T = 0.35e-6
+    """RMS noise (T) in ultra-high performance at 12 gauss, which doubles with each lower performance mode."""
+
+    def __init__(self, address: int, measured: Measurements) -> None:
+        super().__init__(address)
+        self._measured = measured
+        self.reset()
+
+    def reset(self) -> None:
+        """Set every register to its power-on value."""
+        self._held = {self._CTRL1: 0x10, self._CTRL3: 0x03}
+        self._sample = b"\0" * 6
+        self._number = -1
+
+    def store(self, register: int, value: int) -> None:
+        """Write a register; bit 2 of CTRL_REG2 resets the chip."""
+        if register == self._CTRL2 and value & 0x04:
+            self.reset()
+        elif 0x20 <= register <= 0x24:
+            self._held[register] = value
+
+    def load(self, register: int) -> int:
+        """Return a register's value."""
+        if self._OUT <= register < self._OUT + 6:
+            return self._sample[register - self._OUT]
+        return 0x3D if register == self._WHO_AM_I else self._held.get(register, 0)
+
+    def latch(self) -> None:
+        """Convert at the data rate while the chip is in continuous mode."""
+        control = self._held[self._CTRL1]
+        mode = control >> 5 & 3
+        rate = self._FAST_HZ[mode] if control & 2 else self._SLOW_HZ[control >> 2 & 7]
+        number = int(self._measured.now_ns() * rate // SECOND_NS)
+        if self._held[self._CTRL3] & 3 or number == self._number:
+            return
+        self._number = number
+        scale = 1e4 * self._COUNTS_PER_GAUSS[self._held.get(self._CTRL2, 0) >> 5 & 3]
+        counts = np.rint(scale * self._measured.of("magnetic", self._NOISE_T * 2 ** (3 - mode)))
+        self._sample = np.clip(counts, -32768, 32767).astype("<i2").tobytes()
+
+
+class EmulatedIcm20948(Registers):
+    """An ICM-20948 with its AK09916 magnetometer behind the internal I2C master (TDK DS-000189)."""
+
+    _BANK, _AK09916 = 0x7F, 0x0C
+    _GYRO_PER_DEGREE = (131.0, 65.5, 32.8, 16.4)
+    _COUNTS_PER_G = (16384, 8192, 4096, 2048)
+    _FIELD_STEP_T, _FIELD_NOISE_T = 0.15e-6, 0.3e-6
+    _GYRO_BANDWIDTH_HZ = (229.8, 187.6, 154.3, 73.3, 35.9, 17.8, 8.9, 376.5)
+    """Noise bandwidths (Hz) of the gyro filter; without the filter it is 12.1 kHz."""
+    _FORCE_BANDWIDTH_HZ = (265.0, 265.0, 136.0, 68.8, 34.4, 17.0, 8.3, 499.0)
+
+    def __init__(self, address: int, measured: Measurements) -> None:
+        super().__init__(address)
+        self._measured = measured
+        self.reset()
+
+    def reset(self) -> None:
+        """Set every register to its power-on value."""
+        self._held = {(0, 0x00): 0xEA, (0, 0x06): 0x41, (2, 0x01): 0x01, (2, 0x14): 0x01}
+        self._mag = {0x00: 0x48, 0x01: 0x09}
+        self._bank = 0
+        self._number = self._field_number = -1
+
+    def store(self, register: int, value: int) -> None:
+        """Write a register; bit 7 of PWR_MGMT_1 resets the chip."""
+        if register == self._BANK:
+            self._bank = value >> 4 & 3
+            return
+        self._held[self._bank, register] = value
+        if (self._bank, register) == (0, 0x06) and value & 0x80:
+            self.reset()
+        if (self._bank, register) == (3, 0x15) and value & 0x80:  # a transfer through slave 4
+            self._transfer()
+
+    def load(self, register: int) -> int:
+        """Return a register's value."""
+        return self._bank << 4 if register == self._BANK else self._held.get((self._bank, register), 0)
+
+    def latch(self) -> None:
+        """Convert at the data rates of gyro and magnetometer, unless the chip sleeps."""
+        if self._held[0, 0x06] & 0x40:
+            return
+        now_ns, held, measured = self._measured.now_ns(), self._held, self._measured
+        number = now_ns * 1100 // (SECOND_NS * (1 + held.get((2, 0x00), 0)))
+        if number != self._number:
+            self._number = number
+            gyro, force = held[2, 0x01], held[2, 0x14]
+            width = self._GYRO_BANDWIDTH_HZ[gyro >> 3 & 7] if gyro & 1 else 12_106.0
+            rate = measured.of("gyro", 0.015 * _TURN * math.sqrt(width))
+            self._put(0x33, rate / _TURN * self._GYRO_PER_DEGREE[gyro >> 1 & 3])
+            width = self._FORCE_BANDWIDTH_HZ[force >> 3 & 7] if force & 1 else 1_209.0
+            specific = measured.of("acceleration", 230e-6 * STANDARD_GRAVITY * math.sqrt(width))
+            self._put(0x2D, specific / STANDARD_GRAVITY * self._COUNTS_PER_G[force >> 1 & 3])
+        slow = {0x02: 10, 0x04: 20, 0x06: 50, 0x08: 100}.get(self._mag.get(0x31, 0), 0)
+        read = held.get((3, 0x03)) == 0x80 | self._AK09916 and held.get((3, 0x05), 0) & 0x80
+        if slow and read and now_ns * slow // SECOND_NS != self._field_number:
+            self._field_number = now_ns * slow // SECOND_NS
+            field = measured.of("magnetic", self._FIELD_NOISE_T) / self._FIELD_STEP_T
+            self._put(0x3B, field, "<i2")
+
+    def _put(self, register: int, counts: FloatArray, kind: str = ">i2") -> None:
+        data = np.clip(np.rint(counts), -32768, 32767).astype(kind).tobytes()
+        self._held |= {(0, register + offset): byte for offset, byte in enumerate(data)}
+
+    def _transfer(self) -> None:
+        address, register = self._held.get((3, 0x13), 0), self._held.get((3, 0x14), 0)
+        if address & 0x7F == self._AK09916:
+            if address & 0x80:
+                self._held[3, 0x17] = self._mag.get(register, 0)
+            else:
+                self._mag[register] = self._held.get((3, 0x16), 0)
+        self._held[0, 0x17] = 0x40
+
+
+class EmulatedAdis16470:
+    """An ADIS16470 on an SPI bus, whose answers come one frame after the requests."""
+
+    _GYRO_DENSITY, _FORCE_DENSITY = 0.008 * _TURN, 100e-6 * STANDARD_GRAVITY
+
+    def __init__(self, _: int, measured: Measurements) -> None:
+        self._measured = measured
+        self._held = {PROD_ID: PRODUCT, MSC_CTRL: 0x00C1, DEC_RATE: 0}
+        self._number = -1
+        self._answer = b"\0\0"
+
+    def transfer(self, data: bytes) -> bytes:
+        """Execute the request in a frame of two bytes, and return the answer to the request before."""
+        answer, (address, value) = self._answer, data
+        register = address & 0x7E
+        if address & 0x80:
+            shift = 8 * (address & 1)
+            self._held[register] = self._held.get(register, 0) & ~(0xFF << shift) | value << shift
+        else:
+            self._latch()
+            self._answer = self._held.get(register, 0).to_bytes(2, "big")
+        return answer
+
+    def _latch(self) -> None:
+        """Make a new sample if one is due."""
+        rate = SAMPLE_HZ / (1 + self._held[DEC_RATE])
+        number = int(self._measured.now_ns() * rate // SECOND_NS)
+        if number == self._number:
+            return
+        self._number, root = number, math.sqrt(0.5 * rate)
+        self._held[DATA_CNTR] = number & 0xFFFF
+        for first, quantity, density, step in (
+            (X_GYRO_LOW, "gyro", self._GYRO_DENSITY, GYRO_STEP),
+            (X_ACCL_LOW, "acceleration", self._FORCE_DENSITY, ACCELERATION_STEP),
+        ):
+            counts = np.rint(self._measured.of(quantity, density * root) / step).astype(np.int64)
+            for axis, count in enumerate(counts.tolist()):
+                low = first + 4 * axis
+                self._held |= {low: count & 0xFFFF, low + 2: count >> 16 & 0xFFFF}
+
+
+EMULATORS: dict[str, Callable[[int, Measurements], Any]] = {
+    SENSOR_PARTS["icm20948"]: EmulatedIcm20948,
+    SENSOR_PARTS["lis3mdl"]: EmulatedLis3mdl,
+    SENSOR_PARTS["adis16470"]: EmulatedAdis16470,
+}
+_ADDRESSES = {SENSOR_PARTS["icm20948"]: 0x69, SENSOR_PARTS["lis3mdl"]: 0x1C}
+"""I2C addresses that the drivers use if the configuration gives none."""
+
+
+def emulate_sensors(emulation: Emulation, unit: SensorsSection) -> tuple[Any, ...]:
+    """Connect the sensors of an inertial unit. Raises ConfigError for a sensor without an emulator."""
+    to_unit, made = emulation.to_sensor(), []
+    for number, sensor in enumerate(unit.sensors):
+        axes: dict[str, FloatArray] = {
+            quantity: axis_matrix(names).T @ to_unit for quantity, names in sensor.measures.items()
+        }
+        measured = Measurements(emulation.sense, axes, emulation.generator, emulation.now_ns)
+        part = _emulator(sensor, f"inertial_unit.sensors[{number}]", measured)
+        made.append(part)
+        if sensor.spi is not None:
+            emulation.wires.spi_devices[sensor.spi] = part
+        else:
+            emulation.wires.i2c(sensor.bus).attach(part)
+    return tuple(made)
+
+
+def _emulator(sensor: Sensor, key: str, measured: Measurements) -> Any:
+    place = SENSOR_PARTS.get(sensor.part, sensor.part)
+    if sensor.emulator is not None:
+        return imported(f"{key}.emulator", sensor.emulator, {}, os.environ)(measured, sensor)
+    if place not in EMULATORS:
+        known = ", ".join(SENSOR_PARTS)
+        raise ConfigError(f"{key}.emulator", f"is missing: only {known} have one; name yours by `emulator`")
+    return EMULATORS[place](sensor.address or _ADDRESSES.get(place, 0), measured)
