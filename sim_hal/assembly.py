@@ -18,32 +18,21 @@ import numpy as np
 
 from flight.schema.devices import (
     Camera,
-    Coils,
-    Gps,
-    InertialUnitSection,
-    PowerMonitorSection,
-    SolarStringsSection,
     UnitCalibration,
     WideCamera,
 )
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
-from hal.drivers.ads1115 import StringWiring
-from hal.drivers.coils import CoilSettings, wirings
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.vision.camera.lens import Lens, Pinhole
 from sim_hal.clock import FaultTimeline, TimedSimulation
 from sim_hal.description_errors import NO_ERRORS, description_errors
-from sim_hal.emulation import EmulatedWires, Emulation, emulated
+from sim_hal.emulation import ORBIT_STREAM, EmulatedWires, Emulation, emulated
 from sim_hal.emulators.camera import EmulatedCamera, Expose, no_objects
-from sim_hal.emulators.coil_circuit import CoilCircuit, CoilCondition, EmulatedIna219
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
-from sim_hal.emulators.pca9685 import EmulatedPca9685
-from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
-from sim_hal.emulators.vn100_sensors import PROFILES, NoiseProfile
 from sim_hal.settings import Simulation, SkySection
 from sim_hal.worlds.world import (
     BodyMotion,
@@ -58,15 +47,11 @@ from sim_hal.worlds.world import (
 
 if TYPE_CHECKING:
     from sim_hal.earth_camera import EarthCameraModel, EarthScene
-    from sim_hal.emulators.gps import EmulatedGps, GpsErrors
-    from sim_hal.emulators.solar_cells import EmulatedSolarCells
     from sim_hal.star_camera import SourceTrack, StarCameraModel
     from sim_hal.star_camera.objects import SkyObjects
 
-BUS_VOLTAGE = 5.0
-"""Supply voltage (V) of the coils before the losses of the H-bridge (Sease, chapter 5: a 5 V power bus)."""
 READOUT_NS = 50_000_000
-_FAULT_STREAM, _ORBIT_STREAM = 0xFA017, 0x0B17
+_FAULT_STREAM = 0xFA017
 _EARTH_RATE = 2.0 * math.pi * 1.002_737_909_35 / 86_400.0
 
 ExposeWide = Callable[["EarthCameraModel", "EarthScene", tuple[int, ...]], "Future[Image]"]
@@ -142,7 +127,7 @@ def assemble(
     circuit, monitor = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wires)
     world = make_world(WorldInputs(config, section, circuit.currents, start_ns))
     utc_offset_ns = world.utc_ns() - start_ns if isinstance(world, OrbitingWorld) else None
-    receiver, currents = (np.random.default_rng([section.seed, _ORBIT_STREAM, n]) for n in range(2))
+    receiver, currents = (np.random.default_rng([section.seed, ORBIT_STREAM, n]) for n in range(2))
     unit_generator = np.random.default_rng(unit_seed)
     given = Emulation(
         "inertial_unit",
@@ -249,34 +234,6 @@ def assemble_coils(
     return circuit, emulated(replace(given_coils, kind="power_monitor", supply=circuit.mean_supply))
 
 
-def true_coils(emulation: Emulation, coils: Coils) -> CoilSettings:
-    """Return the true properties of the coils."""
-    truth = emulation.section.truth
-    wired = wirings(coils.channels, truth.resistance or coils.resistance, coils.signs, coils.limits)
-    supply = truth.supply_voltage or coils.supply_voltage
-    return CoilSettings(wired, supply, max(coils.limits), coils.stale_after)
-
-
-def emulate_pca9685(emulation: Emulation, coils: Coils) -> CoilCircuit:
-    """Connect an emulated PCA9685 to the bus, and return the circuit of the coils."""
-    pwm = EmulatedPca9685(coils.address, emulation.now_ns)
-    noise = emulation.section.current_noise
-    circuit = CoilCircuit(
-        pwm, true_coils(emulation, coils), emulation.generator, emulation.now_ns, noise, BUS_VOLTAGE
-    )
-    for axis in coils.absent:
-        circuit.become(axis, CoilCondition.OPEN)
-    emulation.wires.i2c(coils.bus).attach(pwm)
-    return circuit
-
-
-def emulate_ina219(emulation: Emulation, fitted: PowerMonitorSection) -> EmulatedIna219:
-    """Connect an emulated INA219 to its bus."""
-    monitor = EmulatedIna219(fitted.address, emulation.now_ns, emulation.supply, fitted.shunt)
-    emulation.wires.i2c(fitted.bus).attach(monitor)
-    return monitor
-
-
 def _coil_field(config: Config, section: Simulation) -> FloatArray:
     """Return the matrix (3, n), T/A, from the coil currents to their field at the magnetometer."""
     count = len(config.coils.slots)
@@ -305,21 +262,6 @@ def _sense(config: Config, section: Simulation, world: World, circuit: Any) -> C
         return replace(motion, field_body=field, rate=gyro_matrix @ motion.rate)
 
     return sense
-
-
-def emulate_vn100(emulation: Emulation, unit: InertialUnitSection) -> Vn100Emulator:
-    """Connect an emulated VN-100 to its serial line."""
-    imu = emulation.section.imu
-    profile = NoiseProfile() if imu.profile == "bounds" else PROFILES[imu.profile]
-    settings = Vn100EmulatorSettings(
-        noise=replace(profile, attitude_bound=imu.quaternion_noise, rate_bound=imu.rate_noise),
-        mounting=np.array(unit.mounting),
-        gyro_bias=np.array(imu.gyro_bias),
-        clock_ppm=imu.clock_ppm,
-        free_fall=isinstance(emulation.world, OrbitingWorld),
-    )
-    line = emulation.connect(unit.device, unit.baud_rate)
-    return Vn100Emulator(emulation.sense, line, emulation.generator, settings, now_ns=emulation.start_ns)
 
 
 def sky_objects(section: Simulation, now_ns: int, world: World) -> SkyObjects | None:
@@ -412,43 +354,6 @@ def _finished(image: Image) -> Future[Image]:
     return future
 
 
-def gps_errors(emulation: Emulation) -> GpsErrors:
-    """Return the errors of the emulated GPS receiver."""
-    from sim_hal.emulators.gps import GpsErrors  # noqa: PLC0415 - see above
-
-    truth = emulation.section.orbit_devices
-    return GpsErrors(walk=truth.gps_walk, noise=truth.gps_noise, start=truth.gps_start)
-
-
-def emulate_ublox(emulation: Emulation, gps: Gps) -> EmulatedGps:
-    """Connect an emulated u-blox receiver to its serial line. Raises ConfigError without an orbit."""
-    from sim_hal.emulators.gps import EmulatedGps  # noqa: PLC0415 - see above
-
-    world, line = orbiting(emulation.world, "gps"), emulation.connect(gps.device, gps.baud_rate)
-    return EmulatedGps(world, line, emulation.generator, gps_errors(emulation), emulation.start_ns)
-
-
-def emulate_ads1115(emulation: Emulation, section: SolarStringsSection) -> EmulatedSolarCells:
-    """Connect the emulated converters of the solar cells. Raises ConfigError without an orbit."""
-    from sim_hal.emulators.solar_cells import EmulatedSolarCells, SolarCellsModel  # noqa: PLC0415 - see above
-
-    strings, truth = section.strings, emulation.section.orbit_devices
-    errors = np.random.default_rng([emulation.section.seed, _ORBIT_STREAM, 2])
-    model = SolarCellsModel(
-        normals=np.array([string.normal for string in strings]),
-        peaks=np.array([string.peak for string in strings]),
-        gain_errors=truth.string_gain * errors.standard_normal(len(strings)),
-        noise=truth.string_noise,
-        albedo=truth.albedo,
-    )
-    wired = [StringWiring(one.address, one.channel, one.volt_per_ampere) for one in strings]
-    world = orbiting(emulation.world, "solar_strings")
-    cells = EmulatedSolarCells(world, model, wired, emulation.now_ns, emulation.generator)
-    for part in cells.parts:
-        emulation.wires.i2c(section.bus).attach(part)
-    return cells
-
-
 def _horizon_cameras(
     config: Config, section: Simulation, world: World, now_ns: Callable[[], int], expose: ExposeWide
 ) -> tuple[EmulatedCamera, ...]:
@@ -457,7 +362,7 @@ def _horizon_cameras(
     return tuple(
         _horizon_camera(
             camera,
-            (section.seed, _ORBIT_STREAM, index),
+            (section.seed, ORBIT_STREAM, index),
             world,
             now_ns,
             expose,

@@ -27,6 +27,8 @@ from sim_hal.settings import Simulation
 from sim_hal.worlds.world import BodyMotion, World
 
 _LINE_STREAM = 0x11E
+ORBIT_STREAM = 0x0B17
+"""First key of the random streams of the devices that need an orbit."""
 _LINE_KEYS = {"inertial_unit": (), "gps": (1,)}
 """Keys of the random streams for faults of the serial lines."""
 

@@ -32,10 +32,10 @@ from hal.interfaces.driver import Driver, later
 from knightcube.astro.arrays import FloatArray
 
 
-def _ours(kind: str, section: type[Any], name: str, emulators: str = "", **more: Any) -> Driver:
-    """Return the registration of a driver of ours, with functions in `flight.app.drivers` and `emulators`."""
+def _ours(kind: str, section: type[Any], name: str, **more: Any) -> Driver:
+    """Return the registration of a driver of ours, with functions in `flight.app.drivers`."""
     functions = {word: later(f"flight.app.drivers:{word}_{name}") for word in ("open", "probe", "files")}
-    emulate = later(f"{emulators}:emulate_{name}") if emulators else None
+    emulate = None if kind == "camera" else later(f"sim_hal.devices:emulate_{name}")
     return Driver(kind, section, emulate=emulate, **functions, **more)
 
 
@@ -43,15 +43,13 @@ VN100 = _ours(
     "inertial_unit",
     InertialUnitSection,
     "vn100",
-    "sim_hal.assembly",
     check=later("flight.app.drivers:unit_settings"),
 )
-SENSORS = _ours("inertial_unit", SensorsSection, "sensors", "sim_hal.emulators.sensors")
+SENSORS = _ours("inertial_unit", SensorsSection, "sensors")
 PCA9685 = _ours(
     "coils",
     Coils,
     "pca9685",
-    "sim_hal.assembly",
     check=later("flight.app.drivers:coil_settings"),
     off=later("flight.app.drivers:off_pca9685"),
 )
@@ -59,14 +57,13 @@ DRV8830 = _ours(
     "coils",
     Coils,
     "drv8830",
-    "sim_hal.emulators.drv8830",
     check=later("flight.app.drivers:coil_settings"),
     off=later("flight.app.drivers:off_drv8830"),
 )
-INA219 = _ours("power_monitor", PowerMonitorSection, "ina219", "sim_hal.assembly")
-UBLOX = _ours("gps", Gps, "ublox", "sim_hal.assembly")
-NMEA = _ours("gps", Gps, "nmea", "sim_hal.emulators.nmea")
-ADS1115 = _ours("solar_strings", SolarStringsSection, "ads1115", "sim_hal.assembly")
+INA219 = _ours("power_monitor", PowerMonitorSection, "ina219")
+UBLOX = _ours("gps", Gps, "ublox")
+NMEA = _ours("gps", Gps, "nmea")
+ADS1115 = _ours("solar_strings", SolarStringsSection, "ads1115")
 V4L2 = _ours("camera", V4l2Device, "v4l2")
 ARAVIS = _ours("camera", AravisDevice, "aravis")
 

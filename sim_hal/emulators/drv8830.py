@@ -6,13 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flight.schema.devices import Coils
 from hal.drivers.coils import CoilSettings
 from hal.drivers.drv8830 import CLEAR, CONTROL, FAULT, volts_of
 from knightcube.astro.arrays import FloatArray
-from sim_hal.assembly import BUS_VOLTAGE, true_coils
-from sim_hal.emulation import Emulation
-from sim_hal.emulators.i2c_bus import I2cPart
 
 
 class EmulatedDrv8830:
@@ -62,11 +58,19 @@ class BridgeCircuit:
     chip = None
 
     def __init__(
-        self, address: int, truth: CoilSettings, generator: np.random.Generator, noise: float
+        self,
+        address: int,
+        truth: CoilSettings,
+        generator: np.random.Generator,
+        noise: float,
+        supply: float,
     ) -> None:
-        """Make one bridge for each coil; `noise` (A) bounds the error of a driven current."""
+        """Make one bridge for each coil.
+
+        `noise` (A) bounds the error of a driven current, and `supply` (V) is the voltage of the supply.
+        """
         self.parts = [EmulatedDrv8830(address + n, self._update) for n in range(len(truth.coils))]
-        self._truth, self._generator, self._noise = truth, generator, noise
+        self._truth, self._generator, self._noise, self._supply = truth, generator, noise, supply
         self._currents: FloatArray = np.zeros(len(truth.coils))
 
     def currents(self) -> FloatArray:
@@ -75,21 +79,10 @@ class BridgeCircuit:
 
     def mean_supply(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Return the supply voltage (V) and the present supply current (A)."""
-        return BUS_VOLTAGE, float(np.abs(self._currents).sum())
+        return self._supply, float(np.abs(self._currents).sum())
 
     def _update(self) -> None:
         volts = np.array([volts_of(part.registers[CONTROL]) for part in self.parts])
         noise = self._noise * (2.0 * self._generator.random(len(volts)) - 1.0)
         ohm = np.array([coil.sign * coil.resistance for coil in self._truth.coils])
         self._currents = np.where(volts != 0.0, volts / ohm + noise, 0.0)
-
-
-def emulate_drv8830(emulation: Emulation, coils: Coils) -> BridgeCircuit:
-    """Connect the bridges to the bus, and return the circuit of the coils."""
-    settings, noise = true_coils(emulation, coils), emulation.section.current_noise
-    circuit = BridgeCircuit(coils.address, settings, emulation.generator, noise)
-    for index, part in enumerate(circuit.parts):
-        if index not in coils.absent:
-            connected: I2cPart = part
-            emulation.wires.i2c(coils.bus).attach(connected)
-    return circuit

@@ -6,13 +6,9 @@ import math
 from functools import reduce
 from operator import xor
 
-from flight.schema.devices import Gps
 from hal.drivers.nmea import KNOT, RANGE_ERROR
 from hal.drivers.ublox import FIX_OK
-from sim_hal.assembly import gps_errors
-from sim_hal.emulation import Emulation
 from sim_hal.emulators.gps import EmulatedGps
-from sim_hal.worlds.world import orbiting
 
 
 class EmulatedNmeaGps(EmulatedGps):
@@ -44,11 +40,3 @@ def _angle(value: int, digits: int, hemispheres: str) -> str:
     """Return an angle (1e-7 deg) as degrees and minutes, with its hemisphere."""
     minutes = round(abs(value) * 60e-7, 6)
     return f"{int(minutes // 60):0{digits}}{minutes % 60.0:09.6f},{hemispheres[value < 0]}"
-
-
-def emulate_nmea(emulation: Emulation, gps: Gps) -> EmulatedNmeaGps:
-    """Connect an emulated receiver to its serial line. Raises ConfigError without an orbit."""
-    world, line = orbiting(emulation.world, "gps"), emulation.connect(gps.device, gps.baud_rate)
-    receiver = EmulatedNmeaGps(world, line, emulation.generator, gps_errors(emulation), emulation.start_ns)
-    receiver.obeys = False
-    return receiver

@@ -8,16 +8,11 @@ returns an `I2cPart` or an SPI device.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from flight.schema.devices import Sensor, SensorsSection
-from flight.schema.document import ConfigError, imported
-from flight.schema.drivers import SENSOR_PARTS, axis_matrix
 from hal.drivers.adis16470 import (
     ACCELERATION_STEP,
     DATA_CNTR,
@@ -32,7 +27,6 @@ from hal.drivers.adis16470 import (
 )
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
-from sim_hal.emulation import Emulation
 from sim_hal.worlds.world import STANDARD_GRAVITY, BodyMotion
 
 _TURN = math.radians(1.0)
@@ -263,39 +257,3 @@ class EmulatedAdis16470:
             for axis, count in enumerate(counts.tolist()):
                 low = first + 4 * axis
                 self._held |= {low: count & 0xFFFF, low + 2: count >> 16 & 0xFFFF}
-
-
-EMULATORS: dict[str, Callable[[int, Measurements], Any]] = {
-    SENSOR_PARTS["icm20948"]: EmulatedIcm20948,
-    SENSOR_PARTS["lis3mdl"]: EmulatedLis3mdl,
-    SENSOR_PARTS["adis16470"]: EmulatedAdis16470,
-}
-_ADDRESSES = {SENSOR_PARTS["icm20948"]: 0x69, SENSOR_PARTS["lis3mdl"]: 0x1C}
-"""I2C addresses that the drivers use if the configuration gives none."""
-
-
-def emulate_sensors(emulation: Emulation, unit: SensorsSection) -> tuple[Any, ...]:
-    """Connect the sensors of an inertial unit. Raises ConfigError for a sensor without an emulator."""
-    to_unit, made = emulation.to_sensor(), []
-    for number, sensor in enumerate(unit.sensors):
-        axes: dict[str, FloatArray] = {
-            quantity: axis_matrix(names).T @ to_unit for quantity, names in sensor.measures.items()
-        }
-        measured = Measurements(emulation.sense, axes, emulation.generator, emulation.now_ns)
-        part = _emulator(sensor, f"inertial_unit.sensors[{number}]", measured)
-        made.append(part)
-        if sensor.spi is not None:
-            emulation.wires.spi_devices[sensor.spi] = part
-        else:
-            emulation.wires.i2c(sensor.bus).attach(part)
-    return tuple(made)
-
-
-def _emulator(sensor: Sensor, key: str, measured: Measurements) -> Any:
-    place = SENSOR_PARTS.get(sensor.part, sensor.part)
-    if sensor.emulator is not None:
-        return imported(f"{key}.emulator", sensor.emulator, {}, os.environ)(measured, sensor)
-    if place not in EMULATORS:
-        known = ", ".join(SENSOR_PARTS)
-        raise ConfigError(f"{key}.emulator", f"is missing: only {known} have one; name yours by `emulator`")
-    return EMULATORS[place](sensor.address or _ADDRESSES.get(place, 0), measured)
