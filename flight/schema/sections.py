@@ -184,18 +184,18 @@ class LinkCoding(Section, frozen=True, kw_only=True):
 class Link(Section, frozen=True, kw_only=True):
     """The link process (`knightcube link`), which exchanges protected frames with the ground.
 
-    The folder `keys` contains keys and counters (`knightcube keys`), and `spacecraft` is the identifier
-    in each frame. The addresses `udp` and `tcp` (HOST:PORT) accept frames only from the networks `peers`.
+    The folder `keys` contains keys and counters (`knightcube keys`), and `spacecraft` is the identifier in
+    each frame. The addresses `udp` and `tcp` (HOST:PORT) accept frames only from the networks `peers`.
     Without `peers`, a loopback address accepts frames from this machine, any other address from its network
     of 256 addresses. The value `serial` describes the line of a radio. Telemetry is sent to authenticated
-    senders, to `telemetry_to` (HOST:PORT, UDP), to all clients of `tcp`, to `serial` and to the TNC at `kiss`
-    (HOST:PORT, TCP). With the two `call_signs` (to, from), KISS frames contain AX.25 frames. Telemetry frames
-    have `frame_bytes` bytes, and telecommand frames have at most `command_frame_bytes` bytes. Each line
-    carries at most `rate` bytes/s of telemetry frames. Idle frames raise the rate to `idle_rate` bytes/s.
-    Telemetry is always authenticated, and readable without a key if `encrypt_telemetry` is false. The section
-    `coding` describes the channel coding. After `command_loss` s with power without an authentic frame, a
-    board returns to its previous release, after the same time again to its previous configuration, then to
-    the configuration accepted on the ground; 0 disables these returns.
+    senders, to `telemetry_to` (HOST:PORT, UDP), to `serial` and to the TNC at `kiss` (HOST:PORT, TCP). With
+    the two `call_signs` (to, from), KISS frames contain AX.25 frames. Telemetry frames have `frame_bytes`
+    bytes, and telecommand frames have at most `command_frame_bytes` bytes. Each line carries at most `rate`
+    bytes/s of telemetry frames. Idle frames raise the rate to `idle_rate` bytes/s. Telemetry is always
+    authenticated, and readable without a key if `encrypt_telemetry` is false. The section `coding` describes
+    the channel coding. After `command_loss` s with power without an authentic frame, a board returns to its
+    previous release, after the same time again to its previous configuration, then to the configuration
+    accepted on the ground; 0 disables these returns.
     """
 
     keys: Annotated[str, Meta(min_length=1)]

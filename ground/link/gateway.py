@@ -48,7 +48,7 @@ _PING_PERIOD_S = 20.0
 """Time (s) between the gateway's own pings, because the link forgets a UDP sender after a minute."""
 _TOKEN_S = 5.0
 """Time (s) after which a connection without the token is closed."""
-_MOST_WITHOUT_TOKEN = 16
+_MOST_WITHOUT_TOKEN = 256
 """Maximum number of connections that have not sent the token; a further connection closes the oldest."""
 _REPORT_S = 1.0
 """Minimum time (s) between two reports about connections without the token."""

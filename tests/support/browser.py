@@ -122,12 +122,12 @@ def audit(page: Page) -> list[str]:
 
 
 @contextlib.contextmanager
-def browsing() -> Iterator[Any]:
-    """Yield a running browser, as playwright calls it."""
+def browsing(*arguments: str) -> Iterator[Any]:
+    """Yield a running browser, as playwright calls it, started with more `arguments`."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415
 
     with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=_chromium(), args=["--no-sandbox"])
+        browser = play.chromium.launch(executable_path=_chromium(), args=["--no-sandbox", *arguments])
         try:
             yield browser
         finally:

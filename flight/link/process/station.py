@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import select
 import socket
 import struct
 from collections import deque
@@ -86,10 +87,10 @@ _BUFFER = 1 << 20
 _HEARD_NS = 60_000_000_000
 _CONNECTIONS = 4
 """Maximum number of TCP connections that have sent an authentic frame."""
-_STRANGERS = 32
+_STRANGERS = 256
 """Maximum number of TCP connections that have not sent an authentic frame.
 
-If 200 strangers connect per second, a new connection has 160 ms for its first frame.
+If 200 strangers connect per second, a new connection has 1.3 s for its first frame.
 """
 _UNSENT = 1 << 18
 _SO_ATTACH_FILTER = 26  # Linux, asm-generic/socket.h; not in Python's module socket
@@ -233,8 +234,9 @@ class _Connection:
 class TcpLine:
     """TCP server on which each frame follows a sync marker, or has the configured code.
 
-    Connections that have sent an authentic frame are limited to four, other connections to 32. A further
+    Connections that have sent an authentic frame are limited to four, other connections to 256. A further
     connection replaces the oldest connection of the same kind, so that strangers displace only strangers.
+    Telemetry is sent to connections that have sent an authentic frame.
     """
 
     def __init__(
@@ -253,8 +255,9 @@ class TcpLine:
         self._peers = peers
         self._framing = framing or LinkCodes().on_board()
         self._connections: dict[socket.socket, _Connection] = {}
+        self._readable = select.poll()
         try:
-            self._listener = socket.create_server(host_port(address))
+            self._listener = socket.create_server(host_port(address), backlog=_STRANGERS)
         except (OSError, OverflowError) as error:
             raise UsageError(f"link.tcp: {address} cannot be listened to: {error}") from error
         self._listener.setblocking(False)
@@ -268,7 +271,10 @@ class TcpLine:
         """Return the frames received from all connections."""
         self._accept()
         found: list[tuple[bytes, Any]] = []
+        ready = {file for file, _ in self._readable.poll(0)}
         for connection, state in list(self._connections.items()):
+            if connection.fileno() not in ready:
+                continue
             try:
                 data = connection.recv(_PIECE)
             except BlockingIOError:
@@ -282,16 +288,18 @@ class TcpLine:
         return found
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Keep the connection `sender` when strangers connect. All connections receive the telemetry."""
+        """Keep the connection `sender` when strangers connect, and send the telemetry to it."""
         state = self._connections.get(sender)
         if state is not None and not state.trusted:
             self._make_room(trusted=True, most=_CONNECTIONS)
             state.trusted = True
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send frames to all connections, and close connections that do not read the frames."""
+        """Send frames to the authenticated connections, and close connections that do not read the frames."""
         marked = b"".join(map(self._framing.wrap, frames))
         for connection, state in list(self._connections.items()):
+            if not state.trusted:
+                continue
             unsent = state.unsent
             unsent.extend(marked)
             try:
@@ -322,6 +330,7 @@ class TcpLine:
             connection.setblocking(False)
             self._make_room(trusted=False, most=_STRANGERS)
             self._connections[connection] = _Connection(self._framing.stream())
+            self._readable.register(connection, select.POLLIN)
 
     def _make_room(self, trusted: bool, most: int) -> None:
         """Drop the oldest connection of a kind (`trusted` or not) if there are `most` of this kind."""
@@ -330,7 +339,8 @@ class TcpLine:
             self._drop(same[0])
 
     def _drop(self, connection: socket.socket) -> None:
-        self._connections.pop(connection, None)
+        if self._connections.pop(connection, None) is not None:
+            self._readable.unregister(connection)
         connection.close()
 
 

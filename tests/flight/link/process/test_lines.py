@@ -67,6 +67,26 @@ def test_strangers_do_not_fill_the_buffer_of_the_peers_datagrams() -> None:
     line.close()
 
 
+def test_an_operator_whose_frame_is_late_is_not_displaced_by_200_strangers_a_second() -> None:
+    """The link turns five times a second only, as on a busy board; the frame follows after half a second."""
+    line = TcpLine("127.0.0.1:0")
+    with ExitStack() as stack:
+        (operator,) = callers_of(line, stack, 1)
+        for turn in range(5):
+            if turn == 3:
+                operator.sendall(SYNC + FRAME)
+            for _ in range(40):
+                stranger = stack.enter_context(
+                    socket.create_connection(("127.0.0.1", line.port), timeout=5.0)
+                )
+                stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
+            if found := [one for one in line.receive() if one[0] == FRAME]:
+                line.trust(found[0][1], 0)
+        line.send([b"telemetry"], 0)
+        assert operator.recv(4096).endswith(b"telemetry")
+    line.close()
+
+
 def callers_of(line: TcpLine, stack: ExitStack, count: int) -> list[socket.socket]:
     callers = []
     for _ in range(count):
@@ -97,8 +117,8 @@ def test_strangers_displace_the_oldest_stranger_and_no_connection_with_an_authen
             operator.sendall(SYNC + FRAME)
             line.trust(received_by(line)[0][1], 0)
         assert [is_closed(operator) for operator in operators] == [True, False, False, False, False]
-        strangers = callers_of(line, stack, 40)
-        assert [is_closed(stranger) for stranger in strangers] == [True] * 8 + [False] * 32
+        strangers = callers_of(line, stack, 264)
+        assert [is_closed(stranger) for stranger in strangers] == [True] * 8 + [False] * 256
         assert not any(is_closed(operator) for operator in operators[1:])
     line.close()
 
@@ -106,15 +126,18 @@ def test_strangers_displace_the_oldest_stranger_and_no_connection_with_an_authen
 def test_a_connection_that_does_not_read_is_closed() -> None:
     line = TcpLine("127.0.0.1:0")
     with ExitStack() as stack:
-        callers = callers_of(line, stack, 2)
-        callers[1].sendall(SYNC + FRAME)
-        found: list[tuple[bytes, object]] = []
-        while not found:
-            found = line.receive()
-        assert [frame for frame, _ in found] == [FRAME]
+        caller, stranger = callers_of(line, stack, 2)
+        caller.sendall(SYNC + FRAME)
+        ((frame, sender),) = received_by(line)
+        assert frame == FRAME
+        line.trust(sender, 0)
         for _ in range(300):  # far more than the sockets hold
             line.send([bytes(1 << 16)], 0)
-        assert line._connections == {}
+        assert sender not in line._connections
+        assert len(line._connections) == 1
+        stranger.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            stranger.recv(1)
     line.close()
 
 

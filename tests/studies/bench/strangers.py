@@ -1,0 +1,200 @@
+"""Commands and lateness beside strangers: `python -m tests.studies.bench strangers [--rounds N]`.
+
+In each round the step demonstration flies twice in real time on its emulated devices beside its link process:
+quiet, and attacked. The attackers share one core. They send 30,000 datagrams a second from an address that is
+not a peer's, and open 200 TCP connections a second from a peer's address, each with bytes that are no frame.
+In both flights the operator sends 40 commands, in turn by UDP, by a TCP connection that stays open and by a
+new one. Printed are the obeyed commands, the rates of the attackers and the lateness of the control cycles.
+The exit status is 1 if a command was not obeyed, or if the 99 % quantile of the lateness is more than twice
+that of the quiet flights (medians over the rounds).
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import multiprocessing
+import os
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from flight.app.run import utc_ns
+from flight.link.commands import CommandPacker, Ping
+from ground.link.commanding import obeyed
+from ground.link.terminal import make_keys, open_terminal
+from knightcube.errors import FlightError
+from tests.flight.app.cli.linked_board import free_ports
+from tests.support.flights import CONFIG
+from tests.support.flooded_flight import lateness, process, wait_for
+
+DATAGRAMS, CONNECTIONS, COMMANDS = 30_000, 200, 40
+"""Datagrams a second, TCP connections a second, and commands of the operator in each flight."""
+WITHIN = 2.0
+_STRANGER = "127.0.0.2"
+_BURST_S = 0.01
+_START_S, _ANSWER_S, _PAUSE_S = 12.0, 5.0, 1.0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly all rounds, print, and return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=3, metavar="N", help="of two flights (default 3)")
+    parser.add_argument(
+        "--commands", type=int, default=COMMANDS, metavar="N", help=f"in each flight (default {COMMANDS})"
+    )
+    options = parser.parse_args(arguments)
+    p99: dict[str, list[float]] = {"quiet": [], "attacked": []}
+    missing = 0
+    for _ in range(options.rounds):
+        for name, late in p99.items():
+            with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
+                facts = measure(Path(place), options.commands, attacked=name == "attacked")
+            late.append(facts["lateness_ms"]["p99"])
+            missing += options.commands - facts["obeyed"]
+            sys.stdout.write(json.dumps({"flight": name, **facts}) + "\n")
+            sys.stdout.flush()
+    ratio = median(p99["attacked"]) / median(p99["quiet"])
+    sys.stdout.write(json.dumps({"p99_over_quiet": round(ratio, 2), "commands_missing": missing}) + "\n")
+    return int(missing > 0 or ratio > WITHIN)
+
+
+def measure(place: Path, commands: int, *, attacked: bool) -> dict[str, Any]:
+    """Fly once; return the commands that were obeyed, the lateness in ms and the strangers' rates."""
+    udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
+    seconds = _START_S + (_PAUSE_S + 0.5) * commands
+    with ExitStack() as stack:
+        config, run = _config(place, udp, tcp), place / "run"
+        flight = stack.enter_context(
+            process("run", config, "--realtime", "--out", run, "--duration", seconds)
+        )
+        wait_for(run / "flight-0001.ccsds")
+        link = stack.enter_context(process("link", config, "--log", run))
+        wait_for(place / "commands")
+        _wait_for_port(tcp)
+        rates = stack.enter_context(_strangers(udp, tcp)) if attacked else dict
+        time.sleep(_START_S / 2.0)
+        done = _command(commands, udp, tcp, place / "keys" / "ground")
+        found = rates()
+        flight.wait()
+        assert link.poll() is None, "the link has ended by itself"
+    return {"obeyed": done, "commands": commands, **found, **lateness(run)}
+
+
+def _wait_for_port(tcp: int) -> None:
+    """Wait until a link listens. Raises TimeoutError."""
+    until = time.monotonic() + 2.0 * _START_S
+    while time.monotonic() < until:
+        with contextlib.suppress(OSError):
+            socket.create_connection(("127.0.0.1", tcp)).close()
+            return
+        time.sleep(0.1)
+    raise TimeoutError(f"no link listens on port {tcp}")
+
+
+def _command(count: int, udp: int, tcp: int, keys: Path) -> int:
+    """Send commands in turn by three lines; return how many were obeyed."""
+    packer, done = CommandPacker(), 0
+    ways = (f"127.0.0.1:{udp}", f"tcp:127.0.0.1:{tcp}", f"tcp:127.0.0.1:{tcp}")
+    with ExitStack() as stack:
+        lasting = [stack.enter_context(contextlib.closing(open_terminal(way, keys))) for way in ways[:2]]
+        for terminal in lasting:  # as gateway and console do; strangers displace a connection without a frame
+            terminal.send(packer.pack(Ping(), utc_ns()))
+        for number in range(count):
+            with ExitStack() as fresh, contextlib.suppress(FlightError):
+                if (turn := number % len(ways)) < len(lasting):
+                    terminal = lasting[turn]
+                else:
+                    terminal = fresh.enter_context(contextlib.closing(open_terminal(ways[turn], keys)))
+                counter = terminal.send(packer.pack(Ping(number), utc_ns()))
+                done += obeyed(list(terminal.follow(counter, 1, _ANSWER_S)))
+            time.sleep(_PAUSE_S)
+    return done
+
+
+@contextmanager
+def _strangers(udp: int, tcp: int) -> Iterator[Callable[[], dict[str, float]]]:
+    """Run both floods on one core; yield a function that returns their rates until now."""
+    context = multiprocessing.get_context("fork")
+    begun, counts = time.monotonic(), [context.Value("Q", 0), context.Value("Q", 0)]
+    floods = [
+        context.Process(target=flood, args=(port, count), daemon=True)
+        for flood, port, count in zip((_datagrams, _connections), (udp, tcp), counts, strict=True)
+    ]
+    for one in floods:
+        one.start()
+
+    def rates() -> dict[str, float]:
+        seconds = time.monotonic() - begun
+        names = ("datagrams_a_second", "connections_a_second")
+        return {name: round(count.value / seconds) for name, count in zip(names, counts, strict=True)}
+
+    try:
+        yield rates
+    finally:
+        for one in floods:
+            one.terminate()
+            one.join()
+
+
+def _datagrams(port: int, count: Any) -> None:
+    """Send datagrams from an address that is not a peer's."""
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+        line.bind((_STRANGER, 0))
+        line.connect(("127.0.0.1", port))
+        for _ in _grid(_BURST_S):
+            for _ in range(round(DATAGRAMS * _BURST_S)):
+                with contextlib.suppress(OSError):
+                    line.send(bytes(64))
+            count.value += round(DATAGRAMS * _BURST_S)
+
+
+def _connections(port: int, count: Any) -> None:
+    """Open connections from a peer's address, and leave each open until the link closes it."""
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    lines: list[socket.socket] = []
+    for _ in _grid(1.0 / CONNECTIONS):
+        with contextlib.suppress(OSError):
+            lines.append(socket.create_connection(("127.0.0.1", port), timeout=1.0))
+            count.value += 1
+            lines[-1].sendall(b"GET / HTTP/1.1\r\n\r\n" * 8)
+        while len(lines) > CONNECTIONS:
+            lines.pop(0).close()
+
+
+def _grid(period: float) -> Iterator[None]:
+    """Yield once a period; periods that were missed are made up for at once."""
+    due = time.monotonic()
+    while True:
+        yield
+        due += period
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+def _config(place: Path, udp: int, tcp: int) -> Path:
+    """Write the configuration of a flight whose link has this machine's first address as its peer."""
+    satellite, _ = make_keys(place / "keys")
+    link = {
+        "keys": str(satellite),
+        "udp": f"127.0.0.1:{udp}",
+        "tcp": f"127.0.0.1:{tcp}",
+        "peers": ["127.0.0.1/32"],
+        "rate": 1e5,
+    }
+    commands = json.dumps({"socket": str(place / "commands")})
+    path = place / "flight.yaml"
+    text = CONFIG.read_text(encoding="utf-8")
+    path.write_text(f"{text}\ncommands: {commands}\nlink: {json.dumps(link)}\n", encoding="utf-8")
+    return path
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
