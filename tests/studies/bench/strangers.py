@@ -2,7 +2,7 @@
 
 In each round the step demonstration flies twice in real time on its emulated devices beside its link process:
 quiet, and attacked. The attackers share one core. They send 30,000 datagrams a second from an address that is
-not a peer's, and open 200 TCP connections a second from a peer's address, each with bytes that are no frame.
+not a peer's, and open 200 TCP connections a second from a peer's address, each with bytes that form no frame.
 In both flights the operator sends 40 commands, in turn by UDP, by a TCP connection that stays open and by a
 new one. Printed are the obeyed commands, the rates of the attackers and the lateness of the control cycles.
 The exit status is 1 if a command was not obeyed, or if the 99 % quantile of the lateness is more than twice
