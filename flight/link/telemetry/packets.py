@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from spacepackets.ccsds.spacepacket import (  # type: ignore[import-untyped]  # it ships no py.typed
+from spacepackets.ccsds.spacepacket import (
     PacketId,
     PacketSeqCtrl,
     PacketType,

@@ -43,7 +43,7 @@ _IGNORED = tuple(
 )
 
 
-class User(CfdpUserBase):
+class User(CfdpUserBase):  # type: ignore[misc]
     """Keeps the condition with which each transfer ended."""
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class User(CfdpUserBase):
     resumed_indication = fault_indication = abandoned_indication = eof_recv_indication = _nothing
 
 
-class Faults(DefaultFaultHandlerBase):
+class Faults(DefaultFaultHandlerBase):  # type: ignore[misc]
     """Does nothing beyond what the handlers do by themselves."""
 
     def notice_of_suspension_cb(self, *_: Any) -> None:
@@ -70,7 +70,7 @@ class Faults(DefaultFaultHandlerBase):
     notice_of_cancellation_cb = abandoned_cb = ignore_cb = notice_of_suspension_cb
 
 
-class Timers(CheckTimerProvider):
+class Timers(CheckTimerProvider):  # type: ignore[misc]
     def provide_check_timer(self, *_: Any, **__: Any) -> Countdown:
         return Countdown.from_seconds(5.0)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from spacepackets.cfdp import (  # type: ignore[import-untyped]  # it ships no py.typed
+from spacepackets.cfdp import (
     ChecksumType,
     ConditionCode,
     CrcFlag,
@@ -16,7 +16,7 @@ from spacepackets.cfdp import (  # type: ignore[import-untyped]  # it ships no p
     PduConfig,
     TransmissionMode,
 )
-from spacepackets.cfdp.pdu import (  # type: ignore[import-untyped]
+from spacepackets.cfdp.pdu import (
     AckPdu,
     DeliveryCode,
     EofPdu,
@@ -29,8 +29,8 @@ from spacepackets.cfdp.pdu import (  # type: ignore[import-untyped]
     NakPdu,
     TransactionStatus,
 )
-from spacepackets.cfdp.pdu.file_data import FileDataParams  # type: ignore[import-untyped]
-from spacepackets.util import ByteFieldU16, ByteFieldU32  # type: ignore[import-untyped]
+from spacepackets.cfdp.pdu.file_data import FileDataParams
+from spacepackets.util import ByteFieldU16, ByteFieldU32
 
 from flight.link.files.transfer import CRC32, CRC32C, MODULAR, FileSum, add
 from flight.link.files.units import (

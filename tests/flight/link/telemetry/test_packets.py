@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from spacepackets.ccsds.spacepacket import (  # type: ignore[import-untyped]  # it ships no py.typed
+from spacepackets.ccsds.spacepacket import (
     PacketId,
     PacketType,
     SpacePacketHeader,
