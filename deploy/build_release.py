@@ -19,7 +19,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from releases import MANIFEST, linked, manifest_text
+from releases import MANIFEST, damage, linked, manifest_text
 
 SOURCE = "source"
 """File of a release with the SHA-256 digest of its sources and build options."""
@@ -93,6 +93,9 @@ class Build:
         """Copy the packages of an older release, which must have been built from the same lock file."""
         if _text(old / LOCK) != _text(self._source / _BOARD_LOCK) or not _text(old / LOCK):
             sys.stderr.write(f"install: failed: {old.name} has other packages: add the folder wheels\n")
+            raise SystemExit(1)
+        if problem := damage(old, thorough=True):
+            sys.stderr.write(f"install: failed: add the folder wheels, because {problem}\n")
             raise SystemExit(1)
         ours = shutil.ignore_patterns("flight", "hal", "sim_hal", "knightcube", "knightcube*.dist-info")
         caches = shutil.ignore_patterns("__pycache__")

@@ -41,7 +41,7 @@ FIRST_CONTACT_S = 60.0
 """Time (s) that a flight must last before its note about a renewal is deleted."""
 MOST_TRIES = 3
 """Maximum number of attempts to build a release, because a kill or a power loss may end an attempt."""
-LARGEST_RECORD, LARGEST_BUNDLE = 1 << 16, 64 << 20
+LARGEST_RECORD, LARGEST_BUNDLE = 1 << 16, 128 << 20
 """Maximum sizes (bytes) of a record (request or state) and of a bundle."""
 KEPT_REPORTS, KEPT_REQUESTS = 16, 64
 MOST_HOURS = 2400.0
@@ -352,10 +352,10 @@ class Board:
         """Return whether a systemd unit is active."""
         return self.run(["systemctl", "is-active", "--quiet", unit], 60.0).returncode == 0
 
-    def flown_release(self) -> str:
-        """Return the name of the release whose Python runs the flight, or an empty text."""
+    def flown_release(self, unit: str) -> str:
+        """Return the name of the release whose Python runs a unit, or an empty text."""
         with suppress(OSError, ValueError):
-            pid = int(self.run(["systemctl", "show", "--property=MainPID", "--value", FLIGHT], 60.0).stdout)
+            pid = int(self.run(["systemctl", "show", "--property=MainPID", "--value", unit], 60.0).stdout)
             first = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0", 1)[0].decode()
             parts = Path(first).parts
             if "releases" in parts[:-1]:
@@ -408,7 +408,10 @@ class Renewal:
         trial = state.trial
         text = f"{trial.kind} {trial.version}: {trial.stage}, {trial.left_s:.0f} s left" if trial else ""
         shown = {"reports": state.reports, "trial": text, "note": state.note}
-        replace_file(self._board.own / "status", encoded(shown))
+        try:
+            replace_file(self._board.own / "status", encoded(shown))
+        except OSError as error:  # the step continues, and the next one writes the reports again
+            sys.stderr.write(f"renewal: cannot write the status: {error}\n")
 
     def _report(self, request: str, result: str, name: str, text: str) -> None:
         """Add a report for the link, and a line in the journal."""
@@ -700,13 +703,14 @@ class Renewal:
         up = board.active(FLIGHT) and board.active(LINK)
         trial.down_s = 0.0 if up else trial.down_s + self._elapsed
         trial.left_s -= self._elapsed
-        flown = board.flown_release() if up and trial.what == "release" else ""
+        units = (FLIGHT, LINK) if up and trial.what == "release" else ()
+        others = [name for name in map(board.flown_release, units) if name not in {"", trial.new}]
         if board.active(SAFE):
             self._begin_revert("the flight ended five times in a minute")
         elif trial.down_s >= DOWN_S:
             self._begin_revert(f"flight or link were not up for {DOWN_S:.0f} s")
-        elif flown and flown != trial.new:
-            self._begin_revert(f"release {flown} flies in its place")
+        elif others:
+            self._begin_revert(f"flight or link run release {others[0]} instead")
         elif contact.get("safe") and contact["session"] != trial.session and not trial.despite_faults:
             self._begin_revert(f"the flight went to SAFE: {contact['safe']}")
         elif trial.left_s <= 0.0:

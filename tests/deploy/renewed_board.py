@@ -21,7 +21,7 @@ _SYSTEMCTL = """#!/bin/sh
 echo "$*" >>"$BOARD/calls"
 case "$*" in
     "is-active "*) for unit; do :; done; [ -e "$BOARD/active/$unit" ] ;;
-    *MainPID*) cat "$BOARD/pid" ;;
+    *MainPID*) for unit; do :; done; cat "$BOARD/pid-$unit" ;;
 esac
 """
 
@@ -56,7 +56,6 @@ class RenewedBoard:
         (place / "active").mkdir()
         for unit in ("knightcube.service", "knightcube-link.service"):
             board.set_active(unit, True)
-        (place / "pid").write_text("0\n", encoding="ascii")
         (board.link / "renewal").mkdir(parents=True)
         return board
 

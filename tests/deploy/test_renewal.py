@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from flight.link.process.renewal import decoded, encoded
 from ground.commands.renewal import replace_signing_key
+from tests.deploy.boards import FIRST
 from tests.deploy.renewed_board import RenewedBoard
 from tests.deploy.scripts import script
 
@@ -263,6 +265,59 @@ def test_a_release_is_built_from_the_packages_of_the_present_one_and_tried(board
     board.request("withdraw", "release")
     board.step()
     assert board.release() == "old"
+
+
+@pytest.mark.parametrize("unit", ["knightcube.service", "knightcube-link.service"])
+def test_a_trial_ends_if_flight_or_link_run_another_release(board: RenewedBoard, unit: str) -> None:
+    request = board.activate(board.bundle("release", board.source("new"), 1), "release")
+    board.step()
+    old = board.files.prefix / "previous"
+    place = board.files.prefix / "releases" / old.readlink().name / "venv/bin/python"
+    with subprocess.Popen([str(place), "60"], executable="/bin/sleep") as process:
+        (board.place / f"pid-{unit}").write_text(f"{process.pid}\n", encoding="ascii")
+        board.step()
+        process.kill()
+    assert board.release() == "old"
+    result, text = board.reports(request)[-1]
+    assert (result, f"run release {FIRST} instead" in text) == ("failed", True), text
+
+
+def test_a_release_is_not_built_from_damaged_packages(board: RenewedBoard) -> None:
+    (library,) = (board.files.prefix / "current").glob("venv/lib/python3*/site-packages/numpy/numpy.py")
+    library.write_text(library.read_text(encoding="ascii").upper(), encoding="ascii")
+    request = board.activate(board.bundle("release", board.source("new"), 1), "release")
+    board.step()
+    assert board.release() == "old"
+    result, text = board.reports(request)[-1]
+    assert (result, "add the folder wheels, because venv/lib" in text) == ("failed", True), text
+
+
+def test_a_trial_ends_although_its_reports_cannot_be_written(board: RenewedBoard) -> None:
+    before = board.flown()
+    activated(board)
+    (board.own / "status").unlink()
+    (board.own / "status").mkdir()
+    complaints = board.step(4000.0)
+    assert board.flown() == before
+    assert "cannot write the status" in complaints
+    (board.own / "status").rmdir()
+    board.step()
+    status = decoded((board.own / "status").read_bytes())
+    assert "did not confirm" in status["reports"][-1][-1]
+
+
+@pytest.mark.parametrize("damage", ["flip", "empty", "missing"])
+def test_damaged_trusted_metadata_do_not_prevent_a_renewal(board: RenewedBoard, damage: str) -> None:
+    activated(board)
+    board.request("confirm")
+    board.step()
+    for path in sorted((board.own / "trusted").rglob("*.json")):
+        if path.is_symlink():
+            continue
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        path.unlink() if damage == "missing" else path.write_bytes(data if damage == "flip" else b"")
+    activated(board, "third", 2)
 
 
 def test_a_release_that_fails_its_trial_is_never_returned_to(board: RenewedBoard) -> None:
