@@ -280,7 +280,7 @@ class SatelliteEstimation(BodyEstimation):
         measured = self.orbit_filter.field_at_rest
         if measured is not None and abs(reading.time_ns - measured[0]) <= LATEST_WITNESS_NS:
             field = measured[1]
-            sigma = math.hypot(_FIELD_ERROR, self._field_bias, self._errors.field_matrix * field)
+            sigma = _UNIFORM * math.hypot(self._field_bias, self._errors.field_matrix * field)
         sun = self._sun
         if sun is not None and sun.newest is not None:
             recent = abs(reading.time_ns - sun.newest.time_ns) <= LATEST_WITNESS_NS

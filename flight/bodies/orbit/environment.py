@@ -70,7 +70,7 @@ TIME_GATE_NS, CLOCK_DRIFT = SECOND_NS // 2, 1e-4
 UNKNOWN_SIGMA, UNKNOWN_VELOCITY_SIGMA = 100.0, 1.0
 """Standard deviations of position (m) and velocity (m/s) per axis if the receiver does not know them."""
 WITNESS_GATE, LATEST_WITNESS_NS = 4.0, 20 * SECOND_NS
-"""Deviation (standard deviations) at which the field strength refutes an orbit, and largest age (ns)."""
+"""RMS deviation (standard deviations) at which the field strength refutes an orbit, and largest age (ns)."""
 _SHORTEST = 1.0
 
 
@@ -103,7 +103,8 @@ class FixSequence:
         self.joined = 1
         self._offset_ns = offset_ns
         self._offered = 1
-        self._strength = np.zeros(3)  # sums of the deviations of the field from both orbits, and number
+        self._strength = np.zeros(3)  # sums of squared deviations of the field, and number
+        self._is_refuted = False
         self._shadowed = np.zeros(2)  # number of fixes at which the Sun shines in the shadow of both orbits
 
     @property
@@ -115,10 +116,11 @@ class FixSequence:
     @property
     def refuted(self) -> bool:
         """Whether field or Sun contradict the orbit of the fixes, and agree with the orbit known before."""
-        strength, number = np.abs(self._strength[:2]), float(self._strength[2])
-        by_field = number > 0 and strength[0] > WITNESS_GATE * number > strength[1]
+        here, known, number = self._strength.tolist()
+        by_field = here > WITNESS_GATE**2 * number > known
         half = 0.5 * self.joined
-        return bool(by_field or self._shadowed[0] > half > self._shadowed[1])
+        self._is_refuted |= bool(by_field or self._shadowed[0] > half > self._shadowed[1])
+        return self._is_refuted
 
     def is_over(self, fix: GpsFix) -> bool:
         """Return whether a new fix comes too late, or most fixes disagree, so that the sequence has ended."""
@@ -139,7 +141,7 @@ class FixSequence:
         states = here, known
         if witness.field is not None:
             strengths = [float(np.linalg.norm(field(here.julian_date, one.position))) for one in states]
-            self._strength[:2] += (witness.field - np.array(strengths)) / witness.field_sigma
+            self._strength[:2] += ((witness.field - np.array(strengths)) / witness.field_sigma) ** 2
             self._strength[2] += 1.0
         if witness.sunlit:
             date = float(terrestrial_time(here.julian_date))

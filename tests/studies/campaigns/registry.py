@@ -18,6 +18,7 @@ from tests.studies.campaigns.first_orbits import FIRST_ORBITS
 from tests.studies.campaigns.frames import FRAMES_CAMPAIGN
 from tests.studies.campaigns.horizon_methods import HORIZON_METHODS
 from tests.studies.campaigns.installer_kill import INSTALLER_KILL
+from tests.studies.campaigns.knowledge import AGED_ELEMENTS, CALENDAR
 from tests.studies.campaigns.link_start import LINK_START
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
@@ -97,5 +98,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         ORBIT_SLEWS,
         ACQUISITION,
         ECLIPSE,
+        AGED_ELEMENTS,
+        CALENDAR,
     )
 }
