@@ -24,12 +24,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from spacepackets.ccsds.spacepacket import (
-    PacketId,
-    PacketSeqCtrl,
-    PacketType,
-    SequenceFlags,
-)
 
 from flight.link.telemetry.definitions import PACKETS, Field, Packet
 from knightcube.errors import FlightError
@@ -38,10 +32,11 @@ PacketArray = npt.NDArray[np.void]
 
 HEADER_BYTES = 6
 SECONDARY_BYTES = 9
+_SECONDARY_HEADER = 1 << 11  # flag of the secondary header in the first word of the primary header
 CRC_BYTES = 2
 LONGEST_PACKET = 4096  # maximum packet length (bytes), which limits the search in a damaged log
 SEQUENCE_MODULUS = 1 << 14
-UNSEGMENTED = int(PacketSeqCtrl(SequenceFlags.UNSEGMENTED, 0).raw())
+UNSEGMENTED = 0b11 << 14  # sequence flags in the second word of the primary header
 
 _STRUCT_CODES = {"f8": "d", "f4": "f", "u1": "B", "u2": "H", "u4": "I", "u8": "Q", "i8": "q"}
 
@@ -98,8 +93,7 @@ class Layout:
     @cached_property
     def identifier(self) -> int:
         """First 16 bits of the primary header, which identify the packet type."""
-        kind = PacketType.TC if self.packet.telecommand else PacketType.TM
-        return int(PacketId(kind, sec_header_flag=True, apid=self.packet.apid).raw())
+        return self.packet.telecommand << 12 | _SECONDARY_HEADER | self.packet.apid
 
     @cached_property
     def body(self) -> struct.Struct:

@@ -97,7 +97,7 @@ def _machine() -> str:
 
 
 def _libraries() -> list[str]:
-    names = ("numpy", "scipy", "nlopt", "msgspec", "spacepackets", "pyerfa", "pyyaml", "pillow")
+    names = ("numpy", "scipy", "nlopt", "msgspec", "pyerfa", "pyyaml", "pillow")
     found = []
     for name in names:
         try:

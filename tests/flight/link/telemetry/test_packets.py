@@ -17,10 +17,12 @@ from spacepackets.ccsds.spacepacket import (
     parse_space_packets,
 )
 
+from flight.link.commands import LAYOUTS as COMMAND_LAYOUTS
 from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, PACKETS, TARGET, Field, Packet
 from flight.link.telemetry.packets import (
     LAYOUTS,
     SEQUENCE_MODULUS,
+    Layout,
     Packer,
     TelemetryError,
     compile_layouts,
@@ -49,6 +51,13 @@ def test_the_primary_header_is_that_of_the_spacepackets_library(packet: Packet) 
     assert raw[:6] == bytes(header.pack())
     assert SpacePacketHeader.unpack(raw) == header
     assert SpacePacketHeader.unpack(raw).packet_len == len(raw) == LAYOUTS[packet.name].length
+
+
+@pytest.mark.parametrize("layouts", [LAYOUTS, COMMAND_LAYOUTS], ids=["telemetry", "commands"])
+def test_the_identifiers_are_those_of_the_spacepackets_library(layouts: dict[str, Layout]) -> None:
+    for layout in layouts.values():
+        kind = PacketType.TC if layouts is COMMAND_LAYOUTS else PacketType.TM
+        assert layout.identifier == PacketId(kind, True, layout.packet.apid).raw()
 
 
 def test_the_stream_parser_of_spacepackets_splits_a_log_as_we_do() -> None:
