@@ -21,6 +21,7 @@ from flight.loop.body import BodyView, FlightBody
 from flight.loop.executive import Cycle, JobResult
 from flight.loop.facts import Services
 from flight.loop.navigation import Navigation
+from flight.schema.devices import FAST
 from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS
@@ -64,8 +65,8 @@ class ImagingSettings:
 
     Attributes:
         exposures: exposure time as a function of the body rate.
-        fine_rest_ns: minimum time (ns) between exposures while the attitude is fine and no object is searched
-            for.
+        fine_rest_ns: minimum time (ns) between exposures while the attitude is fine, the body rotates slowly
+            and no object is searched for.
         seeks: function that returns whether the body searches for an object.
         calm: function of a time and an exposure time that returns the first later time at which no coil
             switches during the exposure.
@@ -474,16 +475,17 @@ class Imaging:
         """Order the next exposure of the star camera, if one may be made now.
 
         No exposure is made while the body rotates faster than permitted. Exposures are less frequent while
-        the attitude is fine. An exposure starts when no coil will switch until its end, so that the body rate
-        is nearly constant.
+        the attitude is fine and the body rotates slowly. An exposure starts when no coil will switch until
+        its end, so that the body rate is nearly constant.
         """
-        if self._navigation.speed > self._settings.max_rate:
+        speed = self._navigation.speed
+        if speed > self._settings.max_rate:
             self._last_frame_ns = cycle.start_ns
             self._streams.note("camera", cycle.start_ns)  # the pause is intended, so the camera is not stale
             return
         rested_ns = cycle.start_ns - self._triggered_ns
         fine = self._settings.knowledge() is Knowledge.FINE and not self._settings.seeks()
-        if rested_ns < self._settings.fine_rest_ns and fine:
+        if rested_ns < self._settings.fine_rest_ns and fine and speed <= FAST:
             return
         self._triggered_ns = now_ns = cycle.start_ns
         exposure_ns = self._measurer.exposure_ns(now_ns)

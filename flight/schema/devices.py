@@ -354,6 +354,10 @@ class AravisDevice(Section, frozen=True, kw_only=True, tag_field="driver", tag="
     gain: float | None = None
 
 
+FAST = 0.02
+"""Body rate (rad/s) at which scale and alignment of the gyro add 0.01 deg to the attitude in 10 s."""
+
+
 class Camera(Section, frozen=True, kw_only=True):
     """The star camera: properties that are needed to process its frames, and the real camera `device`.
 
@@ -361,11 +365,11 @@ class Camera(Section, frozen=True, kw_only=True):
 
     A frame in which stars form streaks is exposed for a time within the range `streak_exposure` (s) that
     depends on the body's rate. Frames without streaks, and all frames if `streak_exposure` is omitted, are
-    exposed for `exposure` s. While the attitude is fine, a frame is taken every `fine_period` s, if this
-    value is given, otherwise every `period` s. If `max_rate` is given, no exposure begins while the body
-    rotates faster than `max_rate` rad/s. A frame counts as late `late_after` s after the end of its exposure,
-    and vision counts as slow if a frame takes longer than `vision_slow_after` s. The newest `keep_frames`
-    frames are kept in the folder `frames` of the run.
+    exposed for `exposure` s. A frame is taken every `period` s or, if `fine_period` is given, every
+    `fine_period` s while the attitude is fine and the body rotates slower than 0.02 rad/s. If `max_rate` is
+    given, no exposure begins while the body rotates faster than `max_rate` rad/s. A frame counts as late
+    `late_after` s after the end of its exposure, and vision counts as slow if a frame takes longer than
+    `vision_slow_after` s. The newest `keep_frames` frames are kept in the folder `frames` of the run.
     """
 
     device: V4l2Device | AravisDevice | None = None

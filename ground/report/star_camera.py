@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flight.link.telemetry.packets import PacketArray
-from flight.schema.devices import Camera
+from flight.schema.devices import FAST, Camera
 from flight.schema.orbit import OrbitConfig
 from ground.report.signals import seconds
 from ground.telemetry import Run, text_of
@@ -26,11 +26,11 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
     """Return how often the unobstructed star camera gave an attitude or a rate.
 
     The instants are those of the camera's schedule: every `camera.period` s, and every `camera.fine_period` s
-    while the attitude is fine. An instant is unobstructed if the true body rate is below `camera.max_rate`
-    and the true boresight is outside `pointing.cones` of Sun and Earth. An instant gave a measurement if the
-    frame that was exposed before the next instant shows an attitude or a rate. The longest gap is the longest
-    time of consecutive unobstructed instants without a measurement. Returns None without a star camera or a
-    truth log.
+    while the attitude is fine and the body rotates slowly. An instant is unobstructed if the true body rate
+    is below `camera.max_rate` and the true boresight is outside `pointing.cones` of Sun and Earth. An instant
+    gave a measurement if the frame that was exposed before the next instant shows an attitude or a rate. The
+    longest gap is the longest time of consecutive unobstructed instants without a measurement. Returns None
+    without a star camera or a truth log.
     """
     camera = config.camera
     if camera is None or not len(run["truth"]) or not len(run["orbit_truth"]):
@@ -62,12 +62,13 @@ def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArr
     ticks = np.arange(0.0, last + camera.period, camera.period)
     truth, known = run["truth"], run["navigation"]
     rates = np.linalg.norm(truth["rate"][_rows(truth, ticks)].astype(float), axis=1)
+    steady = rates <= FAST
     slow = rates < (math.inf if camera.max_rate is None else camera.max_rate)
     fine = known["knowledge"][_rows(known, ticks)] == FINE if len(known) else np.zeros(len(ticks), dtype=bool)
     rest = camera.period if camera.fine_period is None else camera.fine_period
     chosen, exposed = [], -math.inf
     for tick, at in enumerate(ticks):
-        if not slow[tick] or not fine[tick] or at - exposed >= rest:
+        if not (slow[tick] and steady[tick] and fine[tick]) or at - exposed >= rest:
             chosen.append(tick)
             exposed = at if slow[tick] else exposed
     instants, ends = ticks[chosen[:-1]], ticks[chosen[1:]]

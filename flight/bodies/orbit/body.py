@@ -403,8 +403,8 @@ def fastest_rate(config: OrbitConfig) -> float:
     return config.modes.tumble_rate if camera is None else min(config.modes.tumble_rate, camera)
 
 
-_FIELD_ERROR = 5.0e-8
-"""Standard deviation of the magnetic field model, T per axis."""
+_FIELD_ERROR = 2.5e-8
+"""Standard deviation (T per axis) of the field model: ring current 20 nT, crust and core 15 nT."""
 _FIELD_BIAS_WALK = 3.0e-10
 """Random walk of the magnetometer's bias, T per sqrt(s)."""
 _DIPOLE_WALK, _SUNLIT_WALK = 1.5e-6, 2.0e-7

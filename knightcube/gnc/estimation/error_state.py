@@ -173,6 +173,19 @@ def reset(covariance: FloatArray, at: slice, rotation: Sequence[float]) -> None:
     covariance[at, at] = 0.5 * (among + among.T)
 
 
+def keep_scale(covariance: FloatArray, at: slice, values: FloatArray, change: FloatArray) -> None:
+    """Keep the uncertainty of the common scale of some states in a correction of these states, in place.
+
+    If no measurement shows the common scale, the unobservable direction is that of the states themselves,
+    which the correction `change` (n,) moves. The covariance is moved with this direction. Otherwise each
+    correction would make the uncertainty of the scale smaller. The slice `at` of the error state, with the
+    values (m,) before the correction, measures the scale.
+    """
+    along = values / (values @ values)
+    covariance += np.outer(change, along @ covariance[at])
+    covariance += np.outer(covariance[:, at] @ along, change)
+
+
 _MOTION = slice(0, 6)
 """Indices of attitude and rate in the error state of a filter."""
 _IDENTITY: FloatArray = np.eye(6)

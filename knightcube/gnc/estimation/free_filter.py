@@ -57,6 +57,7 @@ from knightcube.gnc.estimation.error_state import (
     StateBlock,
     gate_bounds,
     joined,
+    keep_scale,
     propagated,
     reset,
     slices,
@@ -131,6 +132,8 @@ class FreeMotion:
         self._assumed: FloatArray = np.asarray(inertia, dtype=float)
         self.trace = float(np.trace(self._assumed))
         """Trace of the assumed inertia, kg m^2."""
+        self.elements: FloatArray = self._assumed[_ROWS, _COLUMNS] / self.trace
+        """Elements (6,) of the assumed inertia, relative to its trace."""
         self._areas = box_areas(self._assumed)
         self._error: FloatArray = np.full(6, math.nan)
         self.correct(np.zeros(6))
@@ -213,7 +216,9 @@ _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
 LASTING = 20.0
-"""Correlation time (s), in body axes, of the errors of coils and field, represented by scaled white noise."""
+"""Correlation time (s), in a body at rest, of the errors of coils and field, represented by white noise."""
+CURVATURE = 6.0
+"""Correlation time (s) of the acceleration that is of second order in the error of the inertia."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
 """Expected sizes of the constant torque and of the torques by air and sunlight, relative to that by air. The
 constant torque is small, because the error of the inertia has its own states. At one attitude the torques
@@ -271,7 +276,7 @@ class FreeFilterSettings:
     coil_error: float = 0.005
     coil_noise: float = 0.0
     coil_walk: float = 1e-4
-    inertia_walk: float = 1e-4
+    inertia_walk: float = 5e-5
     errors: BodyErrors = dataclasses.field(default_factory=BodyErrors)
     coils: FloatArray | None = None
     roles: Mapping[str, Role] = dataclasses.field(default_factory=dict)
@@ -790,7 +795,7 @@ class FreeFilter:
         self.quaternion = multiply(rotation, self.quaternion)
         self.acceleration, self.driven = acceleration, driven
         self.rate = after
-        noise = self.rate_noise(driven, around, doubt)
+        noise = self.rate_noise(driven, around, doubt) + self._curvature(flow[3:6, INERTIA])
         self.covariance = propagated(self.covariance, flow, dt, noise, self.layout.walks)
         self.covariance[TORQUES, TORQUES] += dt * density_walk(self._constants[TORQUES])
         if self.layout.prior[INERTIA, INERTIA].any():
@@ -798,6 +803,16 @@ class FreeFilter:
             self.covariance.reshape(-1)[_INERTIA_DIAGONAL] += dt * flexed
         self._propagate_field_error(dt, around.field_sigma)
         self._propagate_horizon(dt)
+
+    def _curvature(self, by_inertia: FloatArray) -> FloatArray:
+        """Return the noise density (3, 3), rad^2/s^3, of second order in the error of the inertia.
+
+        The derivative of the acceleration with respect to the error is `by_inertia` (3, 6). Without this
+        noise, the first seconds of a fast tumble make the uncertainty of an unknown inertia too small.
+        """
+        spread = self.covariance[INERTIA, INERTIA]
+        relative = spread.diagonal()[:3] * (self.motion.trace / self.motion.inertia.diagonal()) ** 2
+        return np.asarray(2.0 * CURVATURE * float(relative.max()) * (by_inertia @ spread @ by_inertia.T))
 
     def rate_noise(self, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0) -> FloatArray:
         """Return the noise density (3, 3) of the angular acceleration, rad^2/s^3.
@@ -816,8 +831,10 @@ class FreeFilter:
             density = density + coils * (across @ across.T)
         if square:
             across = motion.inverse @ cross_matrix(dipole)
+            # In a rotating body, the two components of the field's error across the rate average out.
+            rotated = 1.0 + 0.25 * LASTING**2 * float(self.rate @ self.rate)
             error = max(self.field_error, around.field_sigma)
-            density = density + LASTING * error**2 * (across @ across.T)
+            density = density + LASTING * (1.0 + 2.0 / rotated) / 3.0 * error**2 * (across @ across.T)
         return np.asarray(density)
 
     def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:
@@ -833,6 +850,7 @@ class FreeFilter:
         gain = self.layout.estimated(gain)
         self.covariance = updated(self.covariance, gain, cross, spread)
         error = gain @ value
+        keep_scale(self.covariance, INERTIA, self.motion.elements + self._constants[INERTIA], error * _SCALED)
         reset(self.covariance, ATTITUDE, error[ATTITUDE].tolist())
         self.quaternion = multiply(from_rotation_vector(error[ATTITUDE]), self.quaternion)
         self.rate = self.rate + error[RATE]
@@ -840,6 +858,9 @@ class FreeFilter:
         return True
 
 
+# Twice these states give the same motion, because inertia, dipoles and torques have a common scale.
+_SCALED: FloatArray = np.zeros(STATES)
+_SCALED[np.r_[DIPOLE, SUNLIT, TORQUES, INERTIA, COILS]] = 1.0
 _CAMERA_ROWS: FloatArray = np.zeros((3, STATES))
 _CAMERA_ROWS[:, ATTITUDE] = _CAMERA_ROWS[:, CAMERA] = _EYE
 

@@ -217,18 +217,20 @@ def test_no_exposure_begins_while_the_body_rotates_too_fast() -> None:
 
 
 @pytest.mark.parametrize(
-    ("knowledge", "seeks", "at", "exposed"),
+    ("knowledge", "seeks", "speed", "at", "exposed"),
     [
-        (Knowledge.FINE, False, 10 * S - 1, 1),
-        (Knowledge.FINE, False, 10 * S, 2),
-        (Knowledge.FINE, True, 5 * S, 2),
-        (Knowledge.COARSE, False, 5 * S, 2),
+        (Knowledge.FINE, False, 0.019, 10 * S - 1, 1),
+        (Knowledge.FINE, False, 0.019, 10 * S, 2),
+        (Knowledge.FINE, True, 0.019, 5 * S, 2),
+        (Knowledge.FINE, False, 0.1, 5 * S, 2),
+        (Knowledge.COARSE, False, 0.019, 5 * S, 2),
     ],
 )
-def test_while_the_attitude_is_fine_exposures_rest(
-    knowledge: Knowledge, seeks: bool, at: int, exposed: int
+def test_while_the_attitude_is_fine_and_the_body_slow_exposures_rest(
+    knowledge: Knowledge, seeks: bool, speed: float, at: int, exposed: int
 ) -> None:
     bench = Bench(knowledge=lambda: knowledge, seeks=lambda: seeks)
+    bench.navigation.speed = speed
     bench.task.trigger(bench.cycle(0))
     assert len(bench.triggers) == 1, "the first frame needs no rest"
     bench.task.trigger(bench.cycle(at))

@@ -104,6 +104,18 @@ def test_missing_measurements_lower_the_share_and_the_longest_gap_is_stated() ->
     assert found["longest_gap_s"] == 3 * FINE_PERIOD
 
 
+@pytest.mark.parametrize(("rate", "period"), [(0.019, FINE_PERIOD), (0.021, PERIOD)])
+def test_a_fine_attitude_lengthens_the_period_only_while_the_body_is_slow(rate: float, period: int) -> None:
+    run = cast(dict[str, PacketArray], flight([21.0]))
+    run["truth"]["rate"] = [0.0, 0.0, rate]
+    run["navigation"]["knowledge"] = 2
+    camera = config().camera
+    assert camera is not None
+    found = star_camera(cast(Run, run), reader.replace(config(), camera=reader.replace(camera, max_rate=0.1)))
+    assert found is not None
+    assert found["instants"] == END // period
+
+
 def test_the_sun_in_its_cone_leaves_no_unobstructed_instant() -> None:
     run = cast(dict[str, PacketArray], flight([21.0]))
     run["orbit_truth"]["sun"] = [0.0, 0.5, math.sqrt(0.75)]
