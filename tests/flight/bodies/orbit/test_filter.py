@@ -302,7 +302,7 @@ def test_a_correction_of_a_coil_is_applied_in_the_currents_and_not_in_the_learne
     """The filter has learned a gain of 0.8 before the coil monitor multiplies the dipole by 0.8."""
     flown = acquired(pulses=True)
     flown.carries = 0.8
-    for _ in range(8):
+    for _ in range(10):
         flown.fly(5.0)
         flown.see(52 * PERIOD_NS)
     learned, _ = _coil_x(flown)
