@@ -30,7 +30,7 @@ from knightcube.astro.earth.ephemeris import FieldAhead
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.coil_map import CoilMap, limited
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.field_detumbler import FieldDetumbler
+from knightcube.gnc.control.field_detumbler import FieldDetumbler, FieldPrediction
 from knightcube.gnc.control.pointing_law import damping_dipole
 from knightcube.gnc.control.sun_acquisition import SunAcquisition
 from knightcube.gnc.estimation.estimate import Estimate
@@ -83,20 +83,22 @@ class FieldDetumblingLaw(_MagneticLaw):
 
 def expected_field(
     filter_: OrbitFilter, environment: EstimatedEnvironment, instants: FloatArray
-) -> Callable[[int], FloatArray | None]:
-    """Return a function that predicts the magnetic field (n, 3), T, at `instants` (n,), s, after a time.
+) -> Callable[[int], FieldPrediction | None]:
+    """Return a function that predicts the magnetic field at `instants` (n,), s, after a time.
 
-    The predicted field is given in the body axes at the time of the prediction. The returned function gives
-    None while attitude or orbit are unknown.
+    The predicted field is given in the body axes at the time of the prediction, or in ICRS while the attitude
+    is unknown. The returned function gives None while the orbit is unknown.
     """
     field = FieldAhead()
 
-    def expected(now_ns: int) -> FloatArray | None:
+    def expected(now_ns: int) -> FieldPrediction | None:
         state = environment.state(now_ns)
-        if state is None or environment.at(now_ns) is None or not filter_.started:
+        if state is None or environment.at(now_ns) is None:
             return None
         ahead = field.along(state, instants)
-        return np.asarray(ahead @ attitude_matrix(filter_.at(now_ns).quaternion).T)
+        if not filter_.started:
+            return FieldPrediction(ahead, False)
+        return FieldPrediction(ahead @ attitude_matrix(filter_.at(now_ns).quaternion).T, True)
 
     return expected
 

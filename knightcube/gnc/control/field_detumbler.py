@@ -5,13 +5,15 @@ until the field of the coils has decayed, then to measure the field. The driven 
 short while the estimated rate is uncertain, as with the magnetometer alone. The filter
 `knightcube.gnc.estimation.field_rate` uses the samples in these pauses to estimate all components of the body
 rate and the rotation of the field in inertial axes. A gyro sample gives the rate along the field at once. The
-momentum plan uses a predicted field. If the attitude is known, the field is predicted along the orbit.
-Without a known attitude, the measured field is assumed to continue to rotate at the present rate. In contrast
-to B-dot control, a spin along the field is also removed, as soon as the field has rotated. The coils stay off
-until `TRUSTED` consecutive samples agree with the prediction of the filter and the standard deviation of the
-rate across the field is below `BOUNDED`. Until the coils are driven, samples outside the pauses are used as
-well. The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a
-restarted sensor may give only unusable fields.
+momentum plan uses a predicted field. If the orbit is known, the field is predicted along the orbit. Without a
+known attitude, the predicted field is rotated so that its direction and its change agree with the measured
+field. Without a known orbit, the measured field is assumed to continue to rotate at the present rate. Near
+the equator it does not: the field's direction oscillates by some 20 deg in each orbit. In contrast to B-dot
+control, a spin along the field is also removed, as soon as the field has rotated. The coils stay off until
+`TRUSTED` consecutive samples agree with the prediction of the filter and the standard deviation of the rate
+across the field is below `BOUNDED`. Until the coils are driven, samples outside the pauses are used as well.
+The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a restarted
+sensor may give only unusable fields.
 
 The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
 momentum h obeys h' = m x B, where m is the dipole moment and B the field. This equation contains neither
@@ -46,6 +48,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -184,6 +187,35 @@ def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
     return np.asarray(fields @ (back @ halves).T)
 
 
+def aligned_to_change(
+    fields: FloatArray, times: FloatArray, field: FloatArray, change: FloatArray
+) -> FloatArray:
+    """Return `fields` (n, 3) in the axes in which the present field and its change are known.
+
+    The fields are predicted after `times` (n,), s, in any inertial axes. The result begins with the direction
+    of `field` (3,), and rotates from there in the direction of the time derivative `change` (3,).
+    """
+    soon = min(int(np.searchsorted(times, CHANGED)), len(times) - 1)
+    predicted = _axes(fields[0], fields[soon] - fields[0])
+    return np.asarray(fields @ predicted.T @ _axes(field, change))
+
+
+def _axes(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return orthonormal axes (3, 3), row by row: along a vector (3,), and then towards a second one (3,)."""
+    along = first / math.sqrt(float(first @ first))
+    across = second - along * float(along @ second)
+    if not across.any():  # any axes serve a field that does not rotate
+        across = cross_product(along, np.eye(3)[int(np.abs(along).argmin())])
+    across /= math.sqrt(float(across @ across))
+    return np.array([along, across, cross_product(along, across)])
+
+
+def _agree(predicted: FloatArray, measured: FloatArray) -> bool:
+    """Return whether two fields (3,) have the same strength within `STRENGTH`."""
+    ratio = math.sqrt(float(predicted @ predicted) / float(measured @ measured))
+    return abs(ratio - 1.0) < STRENGTH
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _FieldPreview:
     """The predicted field of a momentum plan.
@@ -235,6 +267,10 @@ SHORTEST = 9
 """Shortest driven phase while the rate is uncertain, as a multiple of the coil pause."""
 OLDEST_NS = 100_000_000
 """Largest age (ns) of an accepted sample; a late sample is propagated to the present with the body rate."""
+CHANGED = 30.0
+"""Time (s) over which the change of a predicted field is compared with that of the measured field."""
+STRENGTH = 0.2
+"""Relative difference in strength from the measured field that shows that the predicted orbit is wrong."""
 INSTANTS = 150
 DENSER = 1.5
 """Exponent of the power law that makes the times of the field prediction denser at the start. For a
@@ -287,6 +323,13 @@ class FieldDetumblerSettings:
         return np.asarray(self.horizon * (np.arange(INSTANTS) / INSTANTS) ** DENSER, dtype=float)
 
 
+class FieldPrediction(NamedTuple):
+    """The magnetic field (n, 3), T, at the instants of a plan, in body axes or in other inertial axes."""
+
+    field: FloatArray
+    in_body_axes: bool
+
+
 class FieldDetumbler:
     """A detumbler that accepts magnetometer samples and computes the dipole moment of each cycle."""
 
@@ -295,12 +338,13 @@ class FieldDetumbler:
         schedule: WindowSchedule,
         braking: FieldDetumblerSettings,
         settings: FieldRateSettings,
-        expected: Callable[[int], FloatArray | None] = lambda _: None,
+        expected: Callable[[int], FieldPrediction | None] = lambda _: None,
     ) -> None:
         """Create a detumbler whose rate filter has not started.
 
-        The function `expected` predicts the field (n, 3), T, at `braking.instants` after a given time, in the
-        body axes at that time. The function `expected` returns None while attitude or orbit are unknown.
+        The function `expected` predicts the field at `braking.instants` after a given time, in the body axes
+        at that time or, without a known attitude, in inertial axes. The function `expected` returns None
+        while the orbit is unknown.
         """
         self._schedule = schedule
         self._braking = braking
@@ -478,10 +522,12 @@ class FieldDetumbler:
         """Return a momentum plan in the present body axes."""
         found, times = self._filter, self._braking.instants
         expected = self._expected(now_ns)
-        if expected is None:
+        if expected is None or not (expected.in_body_axes or _agree(expected.field[0], found.field)):
             ahead = rotating_field(found.field, found.change, times)
+        elif expected.in_body_axes:
+            ahead = aligned_to(expected.field, found.field)
         else:
-            ahead = aligned_to(expected, found.field)
+            ahead = aligned_to_change(expected.field, times, found.field, found.change)
         share = self._act_ns / (self._pause_ns + self._act_ns)
         limit = share * float(np.mean(self._braking.limit))
         return momentum_plan(found.momentum, ahead, times, limit, self._rest)

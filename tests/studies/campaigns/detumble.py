@@ -1,7 +1,7 @@
 """Campaign `detumble`: from 10 deg/s to 0.5 by coils alone, in the simulated world with all disturbances.
 
 Two craft, each in a Sun-synchronous, an ISS-like and an equatorial orbit. The law `magnetometer` has only a
-magnetometer. The law `attitude` also has a gyro with a bias, a coarse attitude and the orbit. The law
+magnetometer and the orbit. The law `attitude` also has a gyro with a bias and a coarse attitude. The law
 `inertia` has the same sensors, but the body's moments and principal axes differ from the described ones by up
 to the default accuracies. The coils are off for a twentieth of each four seconds, as the magnetometer needs,
 and before the rate is known. While the rate is uncertain, they are off for a tenth of each two seconds. Coils
@@ -29,7 +29,7 @@ from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.field_detumbler import FieldDetumbler, FieldDetumblerSettings
+from knightcube.gnc.control.field_detumbler import FieldDetumbler, FieldDetumblerSettings, FieldPrediction
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from knightcube.gnc.estimation.rigid_body import BodyErrors
 from sim_hal.description_errors import NO_ERRORS, DescriptionErrors
@@ -307,16 +307,16 @@ class _Law:
     def dipole(self) -> FloatArray:
         return self._law.dipole(self._flight.time_ns)
 
-    def _expected(self, _: int) -> FloatArray | None:
-        """Return the field expected ahead along the orbit, in the axes of a coarse attitude."""
-        if not self._knows:
-            return None
+    def _expected(self, _: int) -> FieldPrediction:
+        """Return the field expected ahead along the orbit, in the axes of a coarse attitude or in ICRS."""
         flight = self._flight
         truth, draw = flight.body.orbit_truth(), flight.generator.standard_normal
         place, velocity = truth.position + FIX_SIGMA * draw(3), truth.velocity + 0.05 * draw(3)
         state = OrbitState(truth.utc, place, velocity, FIX_SIGMA)
         ahead = self._field.along(state, self._instants)
-        return np.asarray(ahead @ attitude_matrix(flight.attitude(ATTITUDE_SIGMA)).T)
+        if not self._knows:
+            return FieldPrediction(ahead, False)
+        return FieldPrediction(ahead @ attitude_matrix(flight.attitude(ATTITUDE_SIGMA)).T, True)
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:

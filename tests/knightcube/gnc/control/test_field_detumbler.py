@@ -23,7 +23,9 @@ from knightcube.gnc.control.field_detumbler import (
     TRUSTED,
     FieldDetumbler,
     FieldDetumblerSettings,
+    FieldPrediction,
     aligned_to,
+    aligned_to_change,
     braking_dipole,
     momentum_plan,
     rotating_field,
@@ -361,6 +363,48 @@ def test_the_field_ahead_begins_as_it_is_measured() -> None:
         if ahead[0] @ field > 0.0:
             along = field / np.linalg.norm(field) * np.linalg.norm(ahead[0])
             np.testing.assert_allclose(turned[0], along, atol=1e-12)
+
+
+def test_a_field_along_the_orbit_is_known_from_its_direction_and_its_change() -> None:
+    """The direction of the field near the equator oscillates; the prediction is in other axes."""
+    times = FieldDetumblerSettings(limit=LIMIT).instants
+    angle = 0.3 * np.sin(1.1e-3 * times)
+    true = 3e-5 * np.stack([np.sin(angle), 0.2 * np.cos(angle) ** 2, np.cos(angle)], axis=1)
+    turned = attitude_matrix(from_rotation_vector(np.array([0.4, -1.1, 2.0])))
+    change = (true[1] - true[0]) / (times[1] - times[0])
+    found = aligned_to_change(true @ turned.T, times, true[0], change)
+    np.testing.assert_allclose(found, true, atol=2e-7)
+    extrapolated = rotating_field(true[0], change, times)
+    assert np.abs(extrapolated - true).max() > 4e-6, "the field does not continue to rotate"
+    still = np.tile(true[0], (len(times), 1))
+    unmoved = aligned_to_change(still @ turned.T, times, true[0], np.zeros(3))
+    np.testing.assert_allclose(unmoved, still, atol=1e-15)
+
+
+@pytest.mark.parametrize(("strength", "used"), [(1.1, True), (1.5, False)])
+def test_a_prediction_of_a_wrong_orbit_is_not_used(strength: float, used: bool) -> None:
+    asked: list[FloatArray] = []
+
+    def expected(_: int) -> FieldPrediction:
+        ahead = strength * rotating_field(FIELD, np.array([1e-8, 0.0, 0.0]), instants)
+        asked.append(ahead)
+        return FieldPrediction(ahead, False)
+
+    noise = FieldRateSettings(inertia=INERTIA, field_sigma=2e-7, torque_walk=1e-4)
+    braking = FieldDetumblerSettings(limit=LIMIT)
+    instants = braking.instants
+    costates = []
+    for source in (expected, lambda _: None):
+        law = FieldDetumbler(SCHEDULE, braking, noise, source)
+        law.begin(0)
+        for cycle in range(60):
+            turned = attitude_matrix(from_rotation_vector(0.1 * cycle * np.array([0.02, 0.08, 0.05])))
+            law.dipole(cycle * CYCLE_NS)
+            law.sample(cycle * CYCLE_NS, turned @ FIELD)
+        assert law.trusted
+        costates.append(law._planned(60 * CYCLE_NS).costate)
+    assert asked
+    assert bool(np.linalg.norm(costates[0] - costates[1]) > 1e-6 * np.linalg.norm(costates[1])) is used
 
 
 def test_the_dipole_never_adds_energy_to_what_the_plan_brakes_and_keeps_each_limit() -> None:
