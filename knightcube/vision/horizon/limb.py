@@ -293,13 +293,20 @@ def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior)
             return None
         last = float(np.max(np.abs(step[:3])))
     factor = _correlation_factor(view.nadir, rays[used], (residuals / sigma)[used])
-    covariance = _solved((normal - information) / factor + information, np.eye(PARAMETERS))
+    loss = _huber_loss(np.minimum(np.abs(residuals / sigma), _BEYOND))
+    # The weights include the median residual; a few large residuals increase the variances further.
+    fitted = weights[used] * residuals[used] ** 2
+    excess = max(1.0, float(np.sum(fitted)) / max(len(fitted) - 3, 1))
+    covariance = _solved((normal - information) / (factor * excess) + information, np.eye(PARAMETERS))
     if covariance is None:
         return None
-    scaled = np.minimum(np.abs(residuals / sigma), _BEYOND)
-    loss = float(np.sum(np.where(scaled < _HUBER, scaled**2, _HUBER * (2.0 * scaled - _HUBER))))
     misfit = Misfit(loss, factor, float(moved @ information @ moved))
     return FittedLimb(view, covariance, residuals, used, misfit)
+
+
+def _huber_loss(scaled: FloatArray) -> float:
+    """Return the sum of Huber's loss over absolute residuals (n,), in standard deviations."""
+    return float(np.sum(np.where(scaled < _HUBER, scaled**2, _HUBER * (2.0 * scaled - _HUBER))))
 
 
 def shared_error(

@@ -330,4 +330,7 @@ def attitude_by(
     pixels = np.sqrt(0.5 * np.trace(covariance[fit.agree], axis1=1, axis2=2))
     # At an angle a from the boresight, a pixel is smaller by cos^2 a along the radius and by cos a across it.
     sigma = pixels * fit.scale / camera.focal_length * seen[:, 2] ** 1.5
-    return solver(seen, reference[fit.agree], sigma)
+    fix = solver(seen, reference[fit.agree], sigma)
+    # The loss of a solver is half of the sum of the stars' chi-squares.
+    squares = np.full(len(seen), 2.0 * fix.loss / len(seen))
+    return replace(fix, covariance=fix.covariance * inflation(squares, 3))

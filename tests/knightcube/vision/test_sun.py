@@ -165,6 +165,20 @@ def _disc_frame(radius: float, x: float = 256.0, y: float = 200.0) -> Image:
     return np.asarray((20 + 235 * inside).astype(np.uint8))
 
 
+def test_a_ragged_rim_increases_the_covariance() -> None:
+    """The radius of a disc varies five times around the rim, by 0 and by 0.3 px."""
+    y, x = np.mgrid[0:512, 0:512] - np.array([200.0, 256.0])[:, None, None]
+    around = np.sin(5.0 * np.arctan2(y, x))
+    sizes = []
+    for amplitude in (0.0, 0.3):
+        inside = np.clip(4.5 + amplitude * around + 0.5 - np.hypot(x, y), 0.0, 1.0)
+        sun = find_sun((20 + 235 * inside).astype(np.uint8), CAMERA, SunSettings()).sun
+        assert sun is not None
+        sizes.append((sun.residual, np.trace(sun.tangent_covariance)))
+    assert sizes[1][0] > 1.5 * sizes[0][0]
+    assert sizes[1][1] > 3.0 * sizes[0][1]
+
+
 def test_patches_that_are_too_small_too_large_or_not_round_are_refused_with_a_reason() -> None:
     for radius in (1.0, 9.0, 60.0):
         solution = find_sun(_disc_frame(radius), CAMERA, SunSettings())

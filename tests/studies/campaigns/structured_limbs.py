@@ -83,16 +83,25 @@ def _corners(generator: np.random.Generator) -> FloatArray:
     return np.asarray(1.0 - turned if generator.random() < 0.5 else turned)
 
 
-def covered(frame: Image, mask: BoolArray, look: tuple[str, int], noise: float) -> Image:
-    """Return the frame with a structure of the kind `look`, which is a name and the seed of its surface."""
-    kind, seed = look
-    low, high = (float(each) for each in np.quantile(frame, [0.02, 0.98]))
+def levels_of(frame: Image) -> tuple[float, float]:
+    """Return the counts of dark and of bright pixels of a frame."""
+    low, high = np.quantile(frame, [0.02, 0.98])
+    return float(low), float(high)
+
+
+def covered(frame: Image, mask: BoolArray, look: tuple[str, int], levels: tuple[float, float]) -> Image:
+    """Return the frame with a structure whose light does not change.
+
+    `look` is the kind of the structure and the seed of its surface, `levels` the counts of dark and of bright
+    pixels.
+    """
+    (kind, seed), (low, high) = look, levels
     generator = np.random.default_rng(seed)
     level = {"dark": 0.0, "grey": generator.uniform(0.1, 0.5), "lit": generator.uniform(0.5, 1.2)}[kind]
     texture = 0.0 if kind == "dark" else 0.1 * spectral_noise(frame.shape, 1.2, generator)
     light = low + (high - low) * level * (1.0 + texture)
     draw = np.random.default_rng(zlib.crc32(frame.tobytes()))
-    light = light + noise * draw.standard_normal(frame.shape)
+    light = light + draw.standard_normal(frame.shape)
     top = np.iinfo(frame.dtype).max
     return np.where(mask, np.clip(np.rint(light), 0, top).astype(frame.dtype), frame)
 
@@ -117,12 +126,14 @@ def _rendered(kind: str, generator: np.random.Generator) -> Result:
     scene = random_scene(generator, model, "sunlit", accept=accepted)
     scene = replace(scene, atmosphere=random_air(generator))
     look = str(generator.choice(["dark", "grey", "lit"])), int(generator.integers(1 << 30))
-    frame = covered(render(model, scene, generator), mask, look, 1.0)
+    bare = render(model, scene, generator)
+    levels = levels_of(bare)
+    frame = covered(bare, mask, look, levels)
     hidden, hit = (mask if kind == "configured" else None), None
     if kind == "learned":
         learned = StructureMap.of(np.zeros_like(mask))
         for earlier in _earlier_frames():
-            learned = learned.after(covered(earlier, mask, look, 1.0))
+            learned = learned.after(covered(earlier, mask, look, levels))
         hidden = learned.after(frame).mask
         found = np.zeros_like(mask) if hidden is None else hidden
         hit = [float(np.mean(found[mask])), float(np.mean(found[~mask]))]
@@ -171,7 +182,7 @@ def _photograph(_: str, generator: np.random.Generator) -> Result:
             break
     look = str(generator.choice(["dark", "grey", "lit"])), int(generator.integers(1 << 30))
     wrong = lens.rescaled(float(np.exp(FIELD_SIGMA * generator.standard_normal())))
-    found = _search(covered(frame, mask, look, 1.0), wrong, knowledge, HorizonSettings(), mask)
+    found = _search(covered(frame, mask, look, levels_of(frame)), wrong, knowledge, HorizonSettings(), mask)
     answers = [_answer("altitude", found, whole.nadir.direction)]
     return {"look": look[0], "share": float(np.mean(mask)), "hit": None, "answers": answers}
 

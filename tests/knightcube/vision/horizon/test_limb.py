@@ -184,3 +184,24 @@ def test_points_with_correlated_errors_get_a_smaller_weight() -> None:
         assert fitted is not None
         sizes.append(np.trace(fitted.nadir_covariance))
     assert sizes[1] > 2.0 * sizes[0]
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_residuals_beyond_the_sigmas_increase_the_covariance(share: float) -> None:
+    """A part of the points, or all points, have four times the errors that their sigmas state."""
+    generator = np.random.default_rng(12)
+    view = _view(generator)
+    prior, sizes = Prior(1.0, 10.0, 10.0), []
+    for factor in (1.0, 4.0):
+        size = 0.0
+        for _ in range(20):
+            rays = limb_rays(view, 120)[:60]
+            outward = normalise(rays * (rays @ view.nadir)[:, None] - view.nadir)
+            spread = np.where(generator.random(60) < share, factor, 1.0)
+            errors = 1e-4 * spread * generator.standard_normal(60)
+            moved = normalise(rays + errors[:, None] * outward)
+            fitted = fit_limb(view, moved, np.full(60, 1e-4), prior)
+            assert fitted is not None
+            size += float(np.trace(fitted.nadir_covariance))
+        sizes.append(size)
+    assert sizes[1] > (1.2 if share < 1.0 else 8.0) * sizes[0]

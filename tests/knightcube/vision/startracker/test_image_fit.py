@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.solvers import solve
 from knightcube.astro.attitude.wahba import AttitudeError
 from knightcube.astro.quaternion import (
     attitude_matrix,
@@ -15,7 +16,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, fit_in_image
+from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, attitude_by, fit_in_image
 from tests.knightcube.vision.startracker.unknown_lenses import drawn
 
 _CAMERA = Pinhole.from_field_of_view(1024, 1024, float(np.deg2rad(12.0)))
@@ -97,6 +98,20 @@ def test_excess_scatter_of_the_stars_increases_the_covariance() -> None:
     ratio = np.trace(wider.fix.covariance) / np.trace(sound.fix.covariance)
     assert ratio == pytest.approx(float(wider.squares.sum()) / (2 * 12 - 3) / 25.0, rel=1e-3)
     assert ratio > 0.3
+
+
+def test_a_solver_of_wahbas_problem_gets_the_scatter_of_the_stars_too() -> None:
+    rng = np.random.default_rng(3)
+    points = _streaks(rng, 12)[0]
+    reference, noise = _reference(points), 0.5 * rng.standard_normal((12, 2))
+    sizes = []
+    for sigma in (0.5, 0.05):
+        covariance = np.tile(sigma**2 * np.eye(2), (12, 1, 1))
+        fit = _fit(points + noise, covariance, reference)
+        stars = points + noise, covariance, reference
+        fix = attitude_by(solve, *stars, _CAMERA, fit, np.zeros((0, 2)))
+        sizes.append(np.trace(fix.covariance))
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.6)
 
 
 def test_stars_that_disagree_are_rejected_and_the_covariance_stays_correct() -> None:

@@ -134,6 +134,22 @@ def test_an_uncertain_camera_widens_the_covariance_and_keeps_the_rate() -> None:
     assert np.trace(doubted) > 10.0 * np.trace(exact)
 
 
+@pytest.mark.parametrize("measure", ["disagreement", "contradiction"])
+def test_scatter_of_the_stars_beyond_their_noise_increases_the_rates_covariance(
+    measure: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Differences between the stars of five times their noise increase all variances from noise by 25."""
+    scene = real_sky(12, np.radians(70.0), 102.0, 0.2)
+    settings = LikelihoodSettings(saturation=SATURATION, knowledge=EXACT)
+    sizes = []
+    for scatter in (0.5, 25.0):
+        monkeypatch.setattr(f"{correct.__module__}.{measure}", lambda *_, scatter=scatter: scatter)
+        found = estimate_motion(scene.pixels, CAMERA.pinhole, 0.2, settings, scene.rate, 0.0)
+        assert found.covariance is not None
+        sizes.append(np.trace(found.covariance))
+    assert 10.0 < sizes[1] / sizes[0] < 26.0
+
+
 def test_short_streaks_of_another_point_spread_are_rejected_with_a_reason() -> None:
     scene = real_sky(12, np.radians(70.0), 12.0, 0.2, replace(CAMERA, psf_sigma=1.5))
     settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0)
