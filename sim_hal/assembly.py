@@ -16,18 +16,15 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from flight.schema.devices import (
-    Camera,
-    UnitCalibration,
-    WideCamera,
-)
+from flight.schema.devices import Camera, UnitCalibration, WideCamera
+from flight.schema.devices import camera_model as lens_of
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
-from knightcube.vision.camera.lens import Lens, Pinhole
+from knightcube.vision.camera.lens import Lens
 from sim_hal.clock import FaultTimeline, TimedSimulation
 from sim_hal.description_errors import NO_ERRORS, description_errors
 from sim_hal.emulation import ORBIT_STREAM, EmulatedWires, Emulation, emulated
@@ -402,14 +399,8 @@ def wide_model(camera: WideCamera, seed: int = 0) -> EarthCameraModel:
     """Return the model of a horizon camera's optics and detector."""
     from sim_hal.earth_camera import EarthCameraModel  # noqa: PLC0415 - see above
 
-    known = camera.lens
-    if known is None:
-        field = math.radians(camera.field_of_view_deg)
-        lens = Lens.of(Pinhole.from_field_of_view(camera.columns, camera.rows, field))
-    else:
-        lens = Lens(camera.columns, camera.rows, known.focal_length, known.centre, known.k1, known.k2)
     return EarthCameraModel(
-        lens=lens,
+        lens=Lens.of(lens_of(camera)),
         rows=camera.rows,
         columns=camera.columns,
         bits=camera.bits,

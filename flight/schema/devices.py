@@ -269,13 +269,18 @@ class CameraLens(Section, frozen=True, kw_only=True):
     """The lens parameters that `knightcube calibrate` reports.
 
     The focal length `focal_length` is in px, `centre` is the pixel (x, y) on the optical axis, and `k1` and
-    `k2` are the coefficients of radial distortion.
+    `k2` are the coefficients of radial distortion. The values `aspect` and `shear` describe pixels that are
+    not square, and `p1` and `p2` are the coefficients of tangential distortion.
     """
 
     focal_length: Positive
     centre: tuple[float, float]
     k1: float = 0.0
     k2: float = 0.0
+    aspect: float = 0.0
+    shear: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
 
 
 class CameraAccuracy(Section, frozen=True, kw_only=True):
@@ -487,7 +492,8 @@ def camera_model(camera: Camera | WideCamera) -> CameraModel:
     if camera.lens is None:
         return Pinhole.from_field_of_view(camera.columns, camera.rows, math.radians(camera.field_of_view_deg))
     lens = camera.lens
-    return Lens(camera.columns, camera.rows, lens.focal_length, lens.centre, lens.k1, lens.k2)
+    shape = lens.aspect, lens.shear, lens.p1, lens.p2
+    return Lens(camera.columns, camera.rows, lens.focal_length, lens.centre, lens.k1, lens.k2, *shape)
 
 
 def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:

@@ -15,6 +15,7 @@ from ground.commands.options import check_size, positive, write_new
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import read_image
+from knightcube.vision.camera.lens import SHAPE_TERMS
 from knightcube.vision.lens_calibration import (
     MIN_STARS,
     PARAMETERS,
@@ -30,10 +31,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube calibrate` to the parser."""
     parser.description = (
         "Calibrate a camera from pictures of the night sky: focal length, optical axis and radial "
-        "distortion, with their errors. All pictures must be of one camera at one focus; pictures that do "
-        "not fit are excluded and named. Ten pictures with stars in the corners are worth more than a "
-        "hundred without. A term that the stars do not determine is left out of the lens and named. The "
-        f"camera file states the accuracy of the lens (`accuracy`); it needs at least {MIN_STARS} stars."
+        "distortion, with their errors, and aspect, shear and tangential distortion if the stars show them. "
+        "All pictures must be of one camera at one focus; pictures that do not fit are excluded and named. "
+        "Ten pictures with stars in the corners are worth more than a hundred without. A term that the stars "
+        "do not determine is left out of the lens and named. The camera file states the accuracy of the lens "
+        f"(`accuracy`); it needs at least {MIN_STARS} stars."
     )
     parser.epilog = "example: knightcube calibrate night*.tiff --fov 11.4 --out camera.yaml"
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
@@ -135,8 +137,8 @@ def _text(lens: DeterminedLens, pictures: Sequence[tuple[Path, CalibrationImage]
     ]
     lines.append(f"pictures:     {len(used)} of {len(pictures)} used, {stars} stars")
     for name, value in zip(PARAMETERS, parameters_of(found.lens), strict=True):
-        digits = 5 if name in ("k1", "k2") else 2
-        if name.partition("_")[0] not in lens.omitted:
+        digits = 2 if name in PARAMETERS[:3] else 5
+        if name in found.sigma and name.partition("_")[0] not in lens.omitted:
             lines.append(f"{name + ':':13s} {value:.{digits}f} +- {found.sigma[name]:.{digits}f}")
     lines += [_omitted(name, term) for name, term in lens.omitted.items()]
     accuracy = [
@@ -192,6 +194,7 @@ def _camera_section(terms: DeterminedLens) -> str:
         f"    focal_length: {lens.focal_length:.4f}",
         f"    centre: [{lens.centre[0]:.4f}, {lens.centre[1]:.4f}]{assumed}",
         *(f"    {name}: {getattr(lens, name):.8f}" for name in ("k1", "k2") if name not in omitted),
+        *(f"    {name}: {value:.8f}" for name in SHAPE_TERMS if (value := getattr(lens, name)) != 0.0),
         "  accuracy:                   # standard deviations: relative, and px for the centre",
         *(f"    {name}: {value:.3g}" for name, value in terms.accuracy.items()),
     ]

@@ -26,7 +26,7 @@ from knightcube.astro.attitude.solvers import solve
 from knightcube.astro.attitude.wahba import AttitudeError
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from knightcube.errors import FlightError, UsageError
-from knightcube.vision.camera.lens import CameraModel, Lens, LensError
+from knightcube.vision.camera.lens import SHAPE_TERMS, CameraModel, Lens, LensError
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.star_tracker import camera_of_field
 from knightcube.vision.startracker.index.build import default_index
@@ -34,7 +34,7 @@ from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import FrameSolution, SolveSettings
 
-PARAMETERS = ("focal_length", "centre_x", "centre_y", "k1", "k2")
+PARAMETERS = ("focal_length", "centre_x", "centre_y", "k1", "k2", *SHAPE_TERMS)
 MIN_STARS = 24
 """Minimum number of accepted matches of stars: three per parameter of the lens and of one attitude."""
 _ROBUST_STEPS = 20
@@ -62,6 +62,12 @@ _MIN_COSINE = 0.05
 """Minimum cosine of the angle between a star in the image and the optical axis."""
 _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
 """Prior standard deviations that fix omitted lens terms (px for the centre), in the order of omission."""
+NONE = 1e-7
+"""Prior standard deviation of a lens term that is held at zero."""
+_USUAL_SHAPE = 0.02
+"""Prior standard deviation of aspect, of shear, and of the tangential displacement of an image corner."""
+_SHOWN = 18.4
+"""Chi-square (2 degrees of freedom, probability 1e-4) above which the stars show a pair of lens terms."""
 _ROUNDS = 3
 """Number of passes over the images, in each of which the stars are identified with the latest lens.
 
@@ -99,7 +105,7 @@ class MatchedFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensFit:
-    """Lens parameters (5,) and attitudes (m, 4) of the frames, from reference axes to camera axes."""
+    """Lens parameters (9,) and attitudes (m, 4) of the frames, from reference axes to camera axes."""
 
     parameters: FloatArray
     attitudes: FloatArray
@@ -112,7 +118,7 @@ class FitStep:
     Attributes:
         fit: lens parameters and attitudes after the step.
         decrease: decrease of chi-square that the linear model predicts.
-        information: information matrix (5, 5) of the lens parameters from the stars, after elimination of the
+        information: information matrix (9, 9) of the lens parameters from the stars, after elimination of the
             attitudes.
     """
 
@@ -122,8 +128,9 @@ class FitStep:
 
 
 def parameters_of(lens: Lens) -> FloatArray:
-    """Return the parameters (5,) of a lens in the order of PARAMETERS."""
-    return np.array([lens.focal_length, *lens.centre, lens.k1, lens.k2])
+    """Return the parameters (9,) of a lens in the order of PARAMETERS."""
+    shape = [getattr(lens, name) for name in SHAPE_TERMS]
+    return np.array([lens.focal_length, *lens.centre, lens.k1, lens.k2, *shape])
 
 
 def residuals(frame: MatchedFrame, fit: LensFit, number: int) -> FloatArray:
@@ -131,13 +138,28 @@ def residuals(frame: MatchedFrame, fit: LensFit, number: int) -> FloatArray:
 
     The residual of a star beside or behind the camera is infinite.
     """
-    focal_length, x, y, k1, k2 = fit.parameters
+    focal_length, x, y, k1, k2 = fit.parameters[:5]
     in_camera = frame.directions @ attitude_matrix(fit.attitudes[number]).T
     ahead = in_camera[:, 2:] > _MIN_COSINE
     tangent = in_camera[:, :2] / np.where(ahead, in_camera[:, 2:], 1.0)
     square = np.sum(tangent**2, axis=1, keepdims=True)
-    predicted = focal_length * tangent * (1.0 + square * (k1 + square * k2)) + np.array([x, y])
+    distorted = tangent * (1.0 + square * (k1 + square * k2))
+    distorted = distorted + _tangential_slopes(tangent) @ fit.parameters[7:]
+    predicted = focal_length * distorted @ _pixels(fit) + np.array([x, y])
     return np.where(ahead, (frame.points - predicted) / frame.sigma[:, None], np.inf)
+
+
+def _pixels(fit: LensFit) -> FloatArray:
+    """Return the symmetric matrix (2, 2) of aspect and shear by which distorted tangents are multiplied."""
+    aspect, shear = fit.parameters[5:7]
+    return np.array([[1.0 + aspect, shear], [shear, 1.0 - aspect]])
+
+
+def _tangential_slopes(tangent: FloatArray) -> FloatArray:
+    """Return the derivatives (n, 2, 2) of distorted tangents by the coefficients p1 and p2."""
+    x, y = tangent.T
+    cross, square = 2.0 * x * y, x * x + y * y
+    return np.stack([np.stack([cross, square + 2.0 * y * y]), np.stack([square + 2.0 * x * x, cross])]).T
 
 
 def step(
@@ -153,8 +175,8 @@ def step(
         frames: the frames.
         fit: lens parameters and attitudes before the step.
         weights: weights (n,) of the squared residuals of the stars, for each frame.
-        prior: prior information (5,) on each lens parameter, as inverse variances.
-        expected: prior means (5,) of the lens parameters.
+        prior: prior information (9,) on each lens parameter, as inverse variances.
+        expected: prior means (9,) of the lens parameters.
 
     Raises CalibrationError if a frame does not determine its attitude, or if the data do not determine the
     lens.
@@ -193,27 +215,36 @@ def step(
 def _linearised(
     frame: MatchedFrame, fit: LensFit, number: int, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return weighted derivatives by lens parameters (2n, 5) and rotation (2n, 3), and residuals (2n,).
+    """Return weighted derivatives by lens parameters (2n, 9) and rotation (2n, 3), and residuals (2n,).
 
-    A direction with the tangents u is imaged at f u s(|u|^2) from the optical axis, with the distortion s. A
-    small rotation moves a direction v by v x rotation.
+    The lens is that of `Lens`. A small rotation moves a direction v by v x rotation.
     """
     misfit = residuals(frame, fit, number)
     usable = (weight > 0.0) & np.isfinite(misfit[:, 0])
-    focal_length, _, _, k1, k2 = fit.parameters
+    focal_length, _, _, k1, k2, _, _, p1, p2 = fit.parameters
     v = frame.directions[usable] @ attitude_matrix(fit.attitudes[number]).T
     u = v[:, :2] / v[:, 2:]
     square = np.sum(u**2, axis=1)
     stretch, slope = 1.0 + square * (k1 + square * k2), k1 + 2.0 * square * k2
     lens = np.zeros((len(u), 2, len(PARAMETERS)))
-    lens[:, :, 0] = u * stretch[:, None]
-    lens[:, 0, 1] = lens[:, 1, 2] = 1.0
-    lens[:, :, 3] = focal_length * u * square[:, None]
-    lens[:, :, 4] = lens[:, :, 3] * square[:, None]
-    by_tangent = focal_length * (
-        stretch[:, None, None] * np.eye(2) + 2.0 * slope[:, None, None] * u[:, :, None] * u[:, None, :]
-    )
     x, y = u.T
+    tangential = _tangential_slopes(u)
+    distorted, pixels = u * stretch[:, None] + tangential @ np.array([p1, p2]), focal_length * _pixels(fit)
+    lens[:, :, 0] = distorted @ pixels / focal_length
+    lens[:, 0, 1] = lens[:, 1, 2] = 1.0
+    lens[:, :, 3] = u * square[:, None] @ pixels
+    lens[:, :, 4] = lens[:, :, 3] * square[:, None]
+    lens[:, :, 5] = focal_length * distorted * np.array([1.0, -1.0])
+    lens[:, :, 6] = focal_length * distorted[:, ::-1]
+    lens[:, :, 7:] = pixels @ tangential
+    bend = 2.0 * np.array(
+        [[p1 * y + 3.0 * p2 * x, p1 * x + p2 * y], [p1 * x + p2 * y, 3.0 * p1 * y + p2 * x]]
+    )
+    by_tangent = pixels @ (
+        stretch[:, None, None] * np.eye(2)
+        + 2.0 * slope[:, None, None] * u[:, :, None] * u[:, None, :]
+        + bend.transpose(2, 0, 1)
+    )
     one = np.ones_like(x)
     by_turn = np.array([[x * y, -one - x * x, y], [one + y * y, -x * y, -x]])
     turn = np.einsum("nij,jkn->nik", by_tangent, by_turn)
@@ -237,19 +268,26 @@ class LensPrior:
             that was positioned by hand.
         k1, k2: errors of the radial distortion coefficients. The default `k1` and `k2` allow any lens except
             a fisheye.
+        pixels: errors of aspect and shear. The default `pixels` means square pixels.
+        tangential: errors of the tangential distortion coefficients p1 and p2. The default `tangential` means
+            no tangential distortion.
     """
 
     focal_length: float = 0.1
     centre: float = 50.0
     k1: float = 1.0
     k2: float = 3.0
+    pixels: float = NONE
+    tangential: float = NONE
 
     def information(self, lens: Lens) -> FloatArray:
-        """Return the prior information (5,) on PARAMETERS, as inverse variances.
+        """Return the prior information (9,) on PARAMETERS, as inverse variances.
 
         Raises CalibrationError unless all standard deviations are positive.
         """
-        sigma = np.array([self.focal_length * lens.focal_length, self.centre, self.centre, self.k1, self.k2])
+        pairs = [self.pixels] * 2 + [self.tangential] * 2
+        focal_length = self.focal_length * lens.focal_length
+        sigma = np.array([focal_length, self.centre, self.centre, self.k1, self.k2, *pairs])
         if not np.all(sigma > 0.0):
             raise CalibrationError(f"{self}: standard deviations must be positive")
         return np.asarray(sigma**-2.0)
@@ -261,7 +299,7 @@ class Calibration:
 
     Attributes:
         lens: calibrated camera model.
-        covariance: covariance (5, 5) of PARAMETERS, including the prior. If the residuals exceed their
+        covariance: covariance (9, 9) of PARAMETERS, including the prior. If the residuals exceed their
             standard deviations significantly, the covariance is multiplied by chi-square per degree of
             freedom.
         undetermined: names of the PARAMETERS that are determined by the prior instead of the stars.
@@ -285,8 +323,9 @@ class Calibration:
 
     @property
     def sigma(self) -> dict[str, float]:
-        """The standard deviations of the five lens parameters, in px for the first three."""
-        return dict(zip(PARAMETERS, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+        """The standard deviations of the fitted lens parameters, in px for the first three."""
+        sigmas = zip(PARAMETERS, np.sqrt(np.diag(self.covariance)).tolist(), strict=True)
+        return {name: sigma for name, sigma in sigmas if name not in SHAPE_TERMS or sigma > 2.0 * NONE}
 
     @property
     def stars(self) -> int:
@@ -414,9 +453,11 @@ def _result(
     expected: FloatArray,
 ) -> Calibration:
     """Return the calibration from the last step of the fit."""
-    focal_length, x, y, k1, k2 = last.fit.parameters.tolist()
+    focal_length, x, y, k1, k2, *shape = last.fit.parameters.tolist()
+    # Terms that the prior holds at zero are exactly zero in the lens.
+    shape = [value if known < NONE**-2 / 4.0 else 0.0 for value, known in zip(shape, prior[5:], strict=True)]
     try:
-        lens = Lens(begun.columns, begun.rows, focal_length, (x, y), k1, k2)
+        lens = Lens(begun.columns, begun.rows, focal_length, (x, y), k1, k2, *shape)
     except LensError as error:
         raise CalibrationError(f"the fitted parameters are not those of a lens: {error}") from error
     offset = last.fit.parameters - expected
@@ -429,7 +470,9 @@ def _result(
     covariance = np.asarray(np.linalg.inv(last.information + np.diag(prior)), dtype=np.float64)
     usual = LensPrior().information(begun)
     poor = np.diag(covariance) * np.where(prior > 0.0, prior, usual) > _DETERMINED**2
-    undetermined = tuple(name for name, is_poor in zip(PARAMETERS, poor, strict=True) if is_poor)
+    held = prior > NONE**-2 / 4.0
+    held[:5] = False
+    undetermined = tuple(np.array(PARAMETERS)[poor & ~held].tolist())
     if np.any(poor & (prior == 0.0)):
         raise CalibrationError(f"the matches do not determine {', '.join(undetermined)}: give a prior")
     excess = chi_square / degrees
@@ -493,7 +536,7 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
     coefficient is smaller than its standard deviation. The remaining terms are fitted again after each
     omission. Raises CalibrationError.
     """
-    prior = LensPrior()
+    prior = _shape_prior(frames, initial)
     whole = found = calibrate(frames, initial, prior)
     omitted: dict[str, OmittedTerm] = {}
     while (term := _next_omitted(found, omitted)) is not None:
@@ -510,6 +553,24 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
         }
         found = calibrate(frames, replace(lens, **assumed), prior)
     return DeterminedLens(found, omitted, lens_accuracy(whole, found, omitted))
+
+
+def _shape_prior(frames: Sequence[MatchedFrame], initial: CameraModel) -> LensPrior:
+    """Return the prior in which those of aspect, shear and tangential terms are free that the stars show."""
+    corner = math.hypot(*initial.ideal.centre) / initial.focal_length
+    free = LensPrior(pixels=_USUAL_SHAPE, tangential=_USUAL_SHAPE / corner)
+    try:
+        found = calibrate(frames, initial, free)
+    except CalibrationError:
+        return LensPrior()
+    values = parameters_of(found.lens)
+    shown = {}
+    for name, terms in (("pixels", slice(5, 7)), ("tangential", slice(7, 9))):
+        size = values[terms] @ np.linalg.solve(found.covariance[terms, terms], values[terms])
+        names = PARAMETERS[terms]
+        if float(size) > _SHOWN and not set(names) & set(found.undetermined):
+            shown[name] = getattr(free, name)
+    return replace(LensPrior(), **shown)
 
 
 def _next_omitted(found: Calibration, omitted: dict[str, OmittedTerm]) -> str | None:
@@ -541,7 +602,7 @@ def lens_accuracy(
     if "centre" not in omitted:
         accuracy["centre"] = math.hypot(sigma["centre_x"], sigma["centre_y"]) / math.sqrt(2.0)
     square = (math.hypot(*lens.ideal.centre) / lens.focal_length) ** 2
-    by_terms = np.array([1.0 / lens.focal_length, 0.0, 0.0, square, square**2])
+    by_terms = np.array([1.0 / lens.focal_length, 0.0, 0.0, square, square**2, 0.0, 0.0, 0.0, 0.0])
     variance = float(by_terms @ whole.covariance @ by_terms)
     difference = float(by_terms @ (parameters_of(whole.lens) - parameters_of(lens)))
     distortion, assumed = math.hypot(math.sqrt(variance), difference), LensPrior()
@@ -635,7 +696,7 @@ def calibrate_lens(
     fov_deg: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> LensCalibration:
-    """Return the lens of a camera from images of the night sky: focal length, axis and radial distortion.
+    """Return the lens of a camera from images of the night sky: focal length, axis, distortion and pixels.
 
     All images must be taken by one camera at one focus setting. Images that do not fit the lens of the other
     images are excluded. Ten images with stars in the corners give a better calibration than a hundred
@@ -698,8 +759,10 @@ def _mirrored_back(found: LensCalibration) -> LensCalibration:
     determined = found.determined
     calibration = determined.calibration
     last = calibration.lens.columns - 1.0
-    lens = replace(calibration.lens, centre=(last - calibration.lens.centre[0], calibration.lens.centre[1]))
-    sign = np.array([-1.0 if name == "centre_x" else 1.0 for name in PARAMETERS])
+    lens = calibration.lens
+    centre = last - lens.centre[0], lens.centre[1]
+    lens = replace(lens, centre=centre, shear=-lens.shear, p2=-lens.p2)
+    sign = np.array([-1.0 if name in ("centre_x", "shear", "p2") else 1.0 for name in PARAMETERS])
     covariance = calibration.covariance * np.outer(sign, sign)
     omitted = dict(determined.omitted)
     if "centre" in omitted:

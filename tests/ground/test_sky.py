@@ -42,6 +42,10 @@ def test_a_picture_of_the_conjunction_shows_both_planets_and_no_other() -> None:
     found = bodies_in(SkyMap(camera, attitude), _CONJUNCTION)
     assert [body.name for body in found] == ["Jupiter", "Saturn"]
     assert found[0].point == pytest.approx(camera.centre, abs=0.1)
+    # In the mirrored picture, Saturn is on the other side of Jupiter.
+    back = bodies_in(SkyMap(camera, attitude, mirrored=True), _CONJUNCTION)
+    assert [body.name for body in back] == ["Jupiter", "Saturn"]
+    assert back[1].point == pytest.approx([639.0 - found[1].point[0], found[1].point[1]], abs=1e-6)
 
 
 fits = pytest.importorskip("astropy.io.fits", reason="astropy is of the extra `test`")

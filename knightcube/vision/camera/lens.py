@@ -1,11 +1,13 @@
-"""Camera models: pinhole, lens with radial distortion, mounted camera, and the uncertainties of a camera.
+"""Camera models: pinhole, lens with distortion, mounted camera, and the uncertainties of a camera.
 
 In the camera frame, the boresight is +z, x points right along the rows and y down along the columns; pixel
 (0, 0) is the centre of the top-left pixel. The pinhole camera follows Sease, eq. (2.1) to (2.4), except that
 stars behind the camera are dropped and pixel coordinates start at 0.
 
-The lens maps a direction with tangents u = (x/z, y/z) to the pixel f u (1 + k1 |u|^2 + k2 |u|^4) + centre
-(Brown 1966, radial terms). Beyond the field angle at which the distorted radius stops growing, the distortion
+The lens maps a direction with tangents u = (x/z, y/z) to the pixel f A d + centre with the distorted tangents
+d = u (1 + k1 |u|^2 + k2 |u|^4) + (2 p1 u_x u_y + p2 (|u|^2 + 2 u_x^2), p1 (|u|^2 + 2 u_y^2) + 2 p2 u_x u_y)
+(Brown 1966, radial and tangential terms). The matrix A = ((1 + aspect, shear), (shear, 1 - aspect)) describes
+pixels that are not square. Beyond the field angle at which the distorted radius stops growing, the distortion
 polynomial folds back on itself. A `Lens` images no direction beyond the fold of its distortion, and raises
 LensError if the fold lies within the detector.
 
@@ -87,6 +89,14 @@ _NO_FOLD = 1e-12
 """Minimum denominator in the formula for the distortion's fold; folds at tangents above 1e6 are ignored."""
 
 
+SHAPE_TERMS = ("aspect", "shear", "p1", "p2")
+"""Names of the lens terms without symmetry about the optical axis."""
+_MOST_SHAPE = 0.3
+"""Largest magnitude of aspect and shear."""
+_MOST_TANGENTIAL, _TANGENTIAL_STEPS = 0.5, 40
+"""Largest slope of the tangential distortion at a corner, and maximum number of steps that invert it."""
+
+
 class LensError(FlightError):
     """Error raised for a lens whose size is not positive or whose distortion cannot be inverted."""
 
@@ -133,12 +143,14 @@ class CameraModel(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A camera of `columns` x `rows` pixels with radial distortion.
+    """A camera of `columns` x `rows` pixels with distortion and pixels that need not be square.
 
     Attributes:
         focal_length: focal length on the axis, px.
         centre: pixel (x, y) of the optical axis.
         k1, k2: radial distortion coefficients of the second and the fourth power of the undistorted tangent.
+        aspect, shear: relative stretching along the columns against the rows, and shear of the pixels.
+        p1, p2: tangential distortion coefficients along y and along x.
         reach: largest undistorted tangent of the field angle that is imaged; infinite if the distortion never
             folds back.
 
@@ -152,6 +164,10 @@ class Lens:
     centre: tuple[float, float]
     k1: float = 0.0
     k2: float = 0.0
+    aspect: float = 0.0
+    shear: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
     reach: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -161,6 +177,11 @@ class Lens:
             )
         if not np.all(np.isfinite([*self.centre, self.k1, self.k2])):
             raise LensError(f"centre {self.centre}, k1 {self.k1}, k2 {self.k2}: must be finite")
+        if not (abs(self.aspect) < _MOST_SHAPE and abs(self.shear) < _MOST_SHAPE):
+            text = f"aspect {self.aspect}, shear {self.shear}"
+            raise LensError(f"{text}: must be between -{_MOST_SHAPE} and {_MOST_SHAPE}")
+        if not np.all(np.isfinite([self.p1, self.p2])):
+            raise LensError(f"p1 {self.p1}, p2 {self.p2}: must be finite")
         object.__setattr__(self, "reach", _reach(self.k1, self.k2))
         corner = float(np.max(np.hypot(*(self._corners() - self.centre).T))) / self.focal_length
         if corner >= self._limit():
@@ -169,6 +190,8 @@ class Lens:
                 f" {self._limit() * self.focal_length:.0f} px from the axis, but the detector extends to"
                 f" {corner * self.focal_length:.0f} px"
             )
+        if 6.0 * np.hypot(self.p1, self.p2) * corner > _MOST_TANGENTIAL:
+            raise LensError(f"p1 {self.p1}, p2 {self.p2}: the distortion cannot be inverted at the corners")
 
     @classmethod
     def of(cls, camera: CameraModel) -> Lens:
@@ -186,6 +209,7 @@ class Lens:
             "centre": [float(x) for x in self.centre],
             "k1": float(self.k1),
             "k2": float(self.k2),
+            **{name: float(value) for name in SHAPE_TERMS if (value := getattr(self, name)) != 0.0},
         }
 
     @property
@@ -205,6 +229,10 @@ class Lens:
         square = np.sum(tangent**2, axis=-1, keepdims=True)
         square = np.where(square <= self.reach**2, square, np.nan)
         stretched = tangent * (1.0 + square * (self.k1 + square * self.k2))
+        if self.p1 != 0.0 or self.p2 != 0.0:
+            stretched = stretched + self._tangential(tangent)
+        if self.aspect != 0.0 or self.shear != 0.0:
+            stretched = stretched @ self._pixels()
         return np.asarray(self.focal_length * stretched + np.array(self.centre))
 
     def unit_vectors(self, points: FloatArray) -> FloatArray:
@@ -213,6 +241,34 @@ class Lens:
         A pixel beyond the fold of the distortion gives NaN.
         """
         stretched = (np.asarray(points, dtype=float) - np.array(self.centre)) / self.focal_length
+        if self.aspect != 0.0 or self.shear != 0.0:
+            stretched = stretched @ np.linalg.inv(self._pixels())
+        if self.p1 == self.p2 == 0.0:
+            return self._radial_rays(stretched)
+        rays = self._radial_rays(stretched)
+        # Each step reduces the remaining error at least by the slope of the tangential distortion.
+        for _ in range(_TANGENTIAL_STEPS):
+            before, rays = (
+                rays,
+                self._radial_rays(stretched - self._tangential(rays[..., :2] / rays[..., 2:])),
+            )
+            if not np.any(np.abs(rays - before) > _LAST_STEP**2):
+                break
+        return rays
+
+    def _tangential(self, tangent: FloatArray) -> FloatArray:
+        """Return the tangential distortion (..., 2) of undistorted tangents (..., 2)."""
+        x, y = tangent[..., 0], tangent[..., 1]
+        cross, square = 2.0 * x * y, x * x + y * y
+        right = self.p1 * cross + self.p2 * (square + 2.0 * x * x)
+        return np.stack([right, self.p1 * (square + 2.0 * y * y) + self.p2 * cross], axis=-1)
+
+    def _pixels(self) -> FloatArray:
+        """Return the symmetric matrix (2, 2) that converts distorted tangents to those of square pixels."""
+        return np.array([[1.0 + self.aspect, self.shear], [self.shear, 1.0 - self.aspect]])
+
+    def _radial_rays(self, stretched: FloatArray) -> FloatArray:
+        """Return unit vectors (..., 3) of tangents (..., 2) with radial distortion only."""
         radius = np.hypot(stretched[..., :1], stretched[..., 1:])
         square = self._undistorted(radius) ** 2
         v = np.empty((*stretched.shape[:-1], 3))

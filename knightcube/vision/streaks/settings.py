@@ -105,5 +105,11 @@ def knowledge_of_pinhole(knowledge: CameraKnowledge, lens: Lens) -> CameraKnowle
     return replace(
         knowledge,
         centre=math.hypot(knowledge.centre, math.dist(lens.centre, middle)),
-        distortion=math.hypot(knowledge.distortion, square * (lens.k1 + square * lens.k2)),
+        distortion=math.hypot(
+            knowledge.distortion,
+            square * (lens.k1 + square * lens.k2),
+            lens.aspect,
+            lens.shear,
+            3.0 * math.sqrt(square) * math.hypot(lens.p1, lens.p2),
+        ),
     )

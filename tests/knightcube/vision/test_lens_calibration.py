@@ -17,9 +17,11 @@ from knightcube.vision.lens_calibration import (
     Calibration,
     CalibrationError,
     DeterminedLens,
+    LensCalibration,
     LensFit,
     LensPrior,
     MatchedFrame,
+    _mirrored_back,
     calibrate,
     calibrate_determined,
     lens_accuracy,
@@ -180,17 +182,50 @@ def test_standard_deviations_that_are_too_small_increase_the_covariance() -> Non
 def test_the_derivatives_are_those_of_the_projection() -> None:
     """A step from nearby reaches the truth with a quadratic error if all derivatives are correct."""
     rng = np.random.default_rng(89)
-    truth = Lens(1024, 1024, 1500.0, (500.0, 530.0), -0.2, 0.3)
+    truth = Lens(1024, 1024, 1500.0, (500.0, 530.0), -0.2, 0.3, 0.02, -0.03, 0.04, 0.05)
     frames, attitudes = _frames(rng, truth, 2, 20, noise=1e-9)
     exact = parameters_of(truth)
-    none = np.zeros(5)
+    none = np.zeros(9)
+    size = np.array([100.0, 50.0, 50.0, 0.3, 0.3, 0.1, 0.1, 0.1, 0.1])
     for scale in (1e-3, 1e-4):
-        start = exact + scale * np.array([100.0, 50.0, -50.0, 0.3, 0.3])
+        start = exact + scale * size * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0])
         turned = normalise(attitudes + scale * 0.1 * rng.normal(size=attitudes.shape))
         after = step(frames, LensFit(start, turned), [np.ones(20)] * 2, none, none).fit
-        left = np.abs(after.parameters - exact) / np.array([100.0, 50.0, 50.0, 0.3, 0.3])
+        left = np.abs(after.parameters - exact) / size
         assert np.max(left) < 20.0 * scale**2
         assert np.max(np.abs(residuals(frames[0], LensFit(exact, attitudes), 0))) < 6.0
+
+
+@pytest.mark.parametrize("shape", [
+    {"aspect": 0.01}, {"aspect": -0.02, "shear": 0.01}, {"p1": 0.02},
+    {"p1": -0.01, "p2": 0.03, "shear": 0.005}, {},
+])  # fmt: skip
+def test_the_terms_that_the_stars_show_are_fitted_and_others_stay_zero(shape: dict[str, float]) -> None:
+    rng = np.random.default_rng(93)
+    for _ in range(4):
+        truth = replace(_lens(rng, _begun()), **shape)  # type: ignore[arg-type]  # of numbers
+        frames, _ = _frames(rng, truth, 6, 30, 0.1)
+        lens = calibrate_determined(frames, _begun())
+        found, sigma = lens.calibration.lens, lens.calibration.sigma
+        for pair in (("aspect", "shear"), ("p1", "p2")):
+            fitted = bool(set(pair) & set(shape))
+            for name in pair:
+                assert (name in sigma) is fitted
+                off = getattr(found, name) - getattr(truth, name)
+                assert abs(off) < (4.5 * sigma[name] if fitted else 1e-12)
+        assert lens.calibration.rms_after < 0.3
+
+
+def test_the_lens_of_mirrored_images_is_that_of_the_images_as_they_are() -> None:
+    """Left and right are exchanged in the image and in the sky."""
+    lens = Lens(1000, 800, 1500.0, (490.0, 410.0), -0.1, 0.02, 0.01, 0.02, 0.05, -0.04)
+    unused = (np.ones(9, dtype=bool),)
+    found = Calibration(lens, np.eye(9), (), np.zeros((1, 4)), unused, 1.0, 1, 0.2, 0.1)
+    back = _mirrored_back(LensCalibration(DeterminedLens(found, {}, {}), ())).lens
+    assert back is not None
+    rays = lens.unit_vectors(np.random.default_rng(2).uniform([0.0, 0.0], [999.0, 799.0], (50, 2)))
+    expected = np.array([999.0, 0.0]) + np.array([-1.0, 1.0]) * lens.project(rays)
+    assert back.project(rays * np.array([-1.0, 1.0, 1.0])) == pytest.approx(expected, abs=1e-9)
 
 
 def test_malformed_frames_are_refused() -> None:
@@ -229,7 +264,8 @@ def test_mostly_wrong_matches_are_refused_or_have_a_large_chi_square() -> None:
 def test_each_standard_deviation_has_the_name_of_its_parameter() -> None:
     rng = np.random.default_rng(92)
     found = calibrate(_frames(rng, _lens(rng, _begun()), 4, 20)[0], _begun())
-    assert tuple(found.sigma) == PARAMETERS
+    assert tuple(found.sigma) == PARAMETERS[:5]
+    assert [getattr(found.lens, name) for name in PARAMETERS[5:]] == [0.0] * 4
     assert found.sigma["k2"] == pytest.approx(np.sqrt(found.covariance[4, 4]))
 
 
@@ -302,7 +338,7 @@ def test_the_distortion_is_stated_if_it_is_below_half_of_the_prior(share: float,
     """The expected displacement of a corner is that by k1 = 1 and k2 = 3 at a squared tangent of 0.25."""
     lens = Lens(1024, 1024, 2.0 * math.hypot(511.5, 511.5), (511.5, 511.5), 0.0, 0.0)
     corner = math.hypot(1.0 * 0.25, 3.0 * 0.25**2)
-    covariance = np.diag([0.0, 4.0, 4.0, (share * corner / 0.25) ** 2, 0.0])
+    covariance = np.diag([0.0, 4.0, 4.0, (share * corner / 0.25) ** 2, *[0.0] * 5])
     whole = Calibration(lens, covariance, (), np.zeros((1, 4)), (np.ones(9, bool),), 1.0, 1, 0.2, 0.1)
     accuracy = lens_accuracy(whole, whole, {})
     assert accuracy["focal_length"] == 0.0

@@ -89,6 +89,40 @@ def test_a_direction_beyond_the_fold_is_not_imaged() -> None:
     assert np.isnan(lens.unit_vectors(np.array([[99.5 + 545.0, 99.5]]))).all()
 
 
+@pytest.mark.parametrize("shape", [(0.02, 0.0, 0.0, 0.0), (0.0, -0.03, 0.0, 0.0), (0.01, 0.02, 0.05, -0.04)])
+def test_pixels_and_directions_agree_with_aspect_shear_and_tangential_terms(
+    shape: tuple[float, float, float, float],
+) -> None:
+    """The positions are those of Brown (1966), then stretched and sheared about the axis."""
+    aspect, shear, p1, p2 = shape
+    lens = Lens(1000, 800, 1000.0, (490.0, 410.0), -0.1, 0.02, *shape)
+    points = np.random.default_rng(2).uniform([-0.5, -0.5], [999.5, 799.5], (200, 2))
+    vectors = lens.unit_vectors(points)
+    x, y = vectors[:, 0] / vectors[:, 2], vectors[:, 1] / vectors[:, 2]
+    square = x * x + y * y
+    radial = 1.0 - 0.1 * square + 0.02 * square**2
+    right = x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+    down = y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
+    column = 490.0 + 1000.0 * ((1.0 + aspect) * right + shear * down)
+    row = 410.0 + 1000.0 * (shear * right + (1.0 - aspect) * down)
+    assert np.stack([column, row], axis=1) == pytest.approx(points, abs=1e-6)
+    assert lens.project(vectors) == pytest.approx(points, abs=1e-6)
+    assert Lens(**{**lens.to_mapping(), "centre": lens.centre}) == lens  # type: ignore[arg-type]  # of numbers
+
+
+@pytest.mark.parametrize(
+    ("terms", "complaint"),
+    [
+        ({"aspect": 0.4}, "aspect 0.4, shear 0.0: must be between"),
+        ({"p1": np.nan}, "must be finite"),
+        ({"p2": 2.0}, "cannot be inverted at the corners"),
+    ],
+)
+def test_terms_that_no_lens_has_are_refused(terms: dict[str, float], complaint: str) -> None:
+    with pytest.raises(LensError, match=complaint):
+        Lens(1000, 800, 1000.0, (499.5, 399.5), **terms)
+
+
 def test_an_invalid_pixel_does_not_affect_the_others() -> None:
     lens = Lens(1024, 768, 1000.0, (511.5, 383.5), 0.2, 0.1)
     vectors = lens.unit_vectors(np.array([[np.nan, 5.0], [1000.0, 700.0]]))
