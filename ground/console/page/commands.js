@@ -11,6 +11,12 @@ export async function ask(path, body) {
 }
 export function say(place, words, kind = "") { place.textContent = words; place.className = kind; }
 const make = (kind, properties, ...children) => { const element = Object.assign(document.createElement(kind), properties); element.append(...children); return element; };
+// Labels the cells of a line by the heads of its columns, which a narrow page does not show.
+export function labelled(line) {
+  const heads = line.closest("table").tHead.rows[0].cells;
+  for (const cell of line.cells) if (cell.tagName === "TD") cell.dataset.label = heads[cell.cellIndex].textContent;
+  return line;
+}
 const plain = (value) => Number(value.toPrecision(12));
 
 // One input of a form, in the unit of the page. `read` returns the value in the unit of the table.
@@ -187,6 +193,7 @@ export class Parameters {
       const line = body.insertRow();
       line.append(make("th", { textContent: key, scope: "row" }));
       for (const cell of [input.element, input.unit, input.range.map((bound) => Number(bound.toPrecision(4))).join(" to "), meaning]) line.insertCell().append(cell);
+      labelled(line);
       return { input, field: one.field };
     });
     for (const button of this.form.querySelectorAll("button")) button.hidden = !table.commanding;

@@ -1,5 +1,5 @@
 // Lists that grow: events with filters, frames with the results of vision, commands and their answers.
-import { beyond, label } from "/page/values.js";
+import { beyond, bitsOf, label } from "/page/values.js";
 
 const MOST_ROWS = 500;
 const MOST_ITEMS = 200; // events kept of one line
@@ -23,16 +23,29 @@ class Rows {
 // Events of one cause as one line with begin and end. An event that ends a condition closes the line of its begin, and
 // an event that recurs within GAP_S extends its line.
 export class Events extends Rows {
-  constructor(table, severity, filter, field, endings) {
+  constructor(table, severity, filter, field, endings, facts) {
     super(table);
-    Object.assign(this, { severity, filter, field, endings, begins: new Set(Object.values(endings).flat()), open: new Map() });
+    Object.assign(this, { severity, filter, field, endings, facts, begins: new Set(Object.values(endings).flat()), open: new Map() });
     severity.onchange = filter.oninput = () => { for (const episode of this.kept) this.hide(episode); };
   }
 
-  show(_, __, listed, again) {
+  show(newest, _, listed, again) {
     if (again) { this.clear(); this.open.clear(); }
     const touched = new Set((listed.event ?? []).map((event) => this.take(event)));
+    if (newest.health) for (const episode of this.endedBy(newest.health)) touched.add(episode);
     for (const episode of touched) this.draw(episode);
+  }
+
+  // The rate limit may suppress the event that ends a condition. The health packet then shows that it is over.
+  endedBy(health) {
+    const holding = new Set(bitsOf(health.facts, this.facts).map(([, name]) => name));
+    const over = [...this.open.values()].filter(({ name, end }) => this.begins.has(name) && end < health.time_ns
+      && this.facts.bits.some(([, fact]) => fact === name) && !holding.has(name));
+    for (const episode of over) {
+      Object.assign(episode, { end: health.time_ns, ended: true });
+      this.open.delete(episode.key);
+    }
+    return over;
   }
 
   take(event) {
@@ -71,7 +84,7 @@ export class Events extends Rows {
     const { name, count, events, begin, end, ended, severity } = episode;
     const open = !ended && this.begins.has(name);
     const last = events.at(-1);
-    const title = `${name}${count > 1 ? ` × ${count}` : ""}: ${ended ? `${events[0].text}; ${last.name}: ${last.text}` : last.text}`;
+    const title = `${name}${count > 1 ? ` × ${count}` : ""}: ${ended && last.name !== name ? `${events[0].text}; ${last.name}: ${last.text}` : last.text}`;
     const cells = [seconds({ time_ns: begin }), open ? "open" : end > begin || ended ? seconds({ time_ns: end }) : "", label(severity, this.field), title];
     if (!episode.line) {
       episode.line = row(cells, beyond(severity, this.field));

@@ -30,7 +30,7 @@ const views = [
   new Attitude(byId("attitude"), byId("legend"), table),
   new Health(byId("health"), table),
   new Packets(byId("packets"), byId("all"), table),
-  new Events(byId("events"), byId("severity"), byId("filter"), fieldOf(table, "event", "severity"), table.endings),
+  new Events(byId("events"), byId("severity"), byId("filter"), fieldOf(table, "event", "severity"), table.endings, fieldOf(table, "health", "facts")),
   new Frames(byId("frames")),
   new KeptFrame(byId("frame"), byId("frames")),
   new History(byId("commands"), fieldOf(table, "verification", "stage")),

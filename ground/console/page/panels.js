@@ -1,5 +1,5 @@
 // Panels below the plots: passes over ground stations, and the files of the satellite.
-import { say } from "/page/commands.js";
+import { labelled, say } from "/page/commands.js";
 
 const make = (kind, properties, ...children) => { const element = Object.assign(document.createElement(kind), properties); element.append(...children); return element; };
 const clock = (utc) => utc.slice(0, 19).replace("T", " ");
@@ -42,6 +42,7 @@ export class Passes {
       if (this.schedules) entry.append(" ", make("button", { type: "button", textContent: "schedule ...", onclick: () => this.commander.send("schedule", { at, words }, this.status) }));
       schedule.append(entry);
     }
+    labelled(line);
   }
 }
 
@@ -80,6 +81,7 @@ export class Files {
         line.insertCell().textContent = name;
         line.insertCell().textContent = bytes;
         line.insertCell().append(make("button", { type: "button", textContent: "get", ariaLabel: `get ${name}`, onclick: () => this.get(name) }));
+        labelled(line);
       }
     });
   }

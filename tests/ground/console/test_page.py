@@ -26,6 +26,7 @@ from tests.support.browser import Page, another_origin, audit, browsing, missing
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing() or "-")]
 ROOT = Path(__file__).parents[3]
 SIZES = ((1600, 900), (1024, 768), (390, 844))
+FACTS_BIT = {name: 1 << bit for bit, name in FACTS}
 
 _FRAME = """(url) => new Promise((done) => {
   const frame = Object.assign(document.createElement("iframe"), { src: url, onload: done });
@@ -40,8 +41,6 @@ _ASK = """async (url) => {
   });
   return [asked, await live];
 }"""
-
-FACTS_BIT = {name: 1 << bit for bit, name in FACTS}
 
 
 _RED = """(() => {
@@ -81,7 +80,10 @@ def orbit_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Packer().pack(PARAMETERS, 10**9, {**plain_contents(PARAMETERS), **table, "crc": crc_of(values)}),
         _event(events.IMU_SILENT, 2.0, "no byte for 0.12 s"),
         *(_event(events.CAMERA_SATURATED, 2.1 + 0.01 * k, f"frame {k} is saturated") for k in range(105)),
+        _event(events.CAMERA_LATE, 3.0, "frame 7 is overdue"),
+        _event(events.CAMERA_LOST, 3.0, "no frame for 9 s"),
         _event(events.IMU_RECOVERED, 5.0, "bytes come again"),
+        Packer().pack(HEALTH, 6 * 10**9, {**plain_contents(HEALTH), "facts": FACTS_BIT["camera-lost"]}),
     ]
     with (run / "flight-0001.ccsds").open("ab") as file:
         file.write(b"".join(packets))
@@ -300,6 +302,10 @@ def test_events_of_one_cause_are_one_line_with_begin_and_end(satellite: Page) ->
     (silent,) = [row for row in texts if "imu-silent" in row[3]]
     assert silent[:2] == ["2.0", "5.0"]
     assert "imu-recovered: bytes come again" in silent[3]
+    (late,) = [row for row in texts if "camera-late" in row[3]]
+    assert late[:2] == ["3.0", "6.0"], "its end was suppressed, and the health packet shows that it is over"
+    (lost,) = [row for row in texts if "camera-lost" in row[3]]
+    assert lost[:2] == ["3.0", "open"]
     satellite.page.fill("#filter", "frame 17 is")
     assert rows.filter(visible=True).count() == 1
     satellite.page.fill("#filter", "")

@@ -35,8 +35,8 @@ CONFIG = Path("config/step_demo.yaml")
 class Figures:
     """What was measured: lag s, memory MiB, share of a core, s from the last telemetry to the red light.
 
-    `weight_kb` is the size of all files of the page, and `violations` names what axe-core finds and each size
-    at which the page scrolls sideways.
+    `weight_kb` is the size of all files of the page. `violations` names what axe-core finds and each size at
+    which the page scrolls sideways. `filed` is what failed as the page put, listed and got a file.
     """
 
     weight_kb: float
@@ -49,6 +49,7 @@ class Figures:
     commanded: str
     red_s: float
     violations: list[str]
+    filed: str
 
 
 ASKED = {"weight_kb": 250.0, "lag_s": 0.5, "memory_mib": 120.0, "processor": 0.15, "red_s": 3.0}
@@ -86,7 +87,7 @@ def missed(figures: Figures, by_link: bool) -> list[str]:
     By a link packets of one instant may come in two frames: who looked between them saw the first one's.
     """
     wrong = [name for name, bound in ASKED.items() if not getattr(figures, name) <= bound]
-    wrong += [name for name in ("complaints", "strangers", "violations") if getattr(figures, name)]
+    wrong += [name for name in ("complaints", "strangers", "violations", "filed") if getattr(figures, name)]
     wrong += [] if figures.replay_equal or by_link else ["replay_equal"]
     return wrong + ([] if figures.commanded.startswith("obeyed") else ["commanded"])
 
@@ -111,8 +112,28 @@ def measure(
             _picture(page, pictures, "replay")
             equal, red = replayed == (live, values), _red(page, source)
             wrong = _looked_at(page, looks)
-            told = (page.complaints, page.strangers, equal, commanded, red, wrong)
+            filed = _filed(page, Path(place)) if by_link else ""
+            told = (page.complaints, page.strangers, equal, commanded, red, wrong, filed)
             return Figures(_weight_kb(), lag, memory, share, *told)
+
+
+def _filed(page: Page, place: Path) -> str:
+    """Put a file on the satellite by the page, list and get it; return what failed, or an empty text."""
+    sent, got = place / "tle.txt", place / "got.txt"
+    sent.write_bytes(bytes(range(256)) * 40)
+    page.page.evaluate("document.getElementById('files').open = true")
+    page.page.set_input_files("#files [name=file]", str(sent))
+    page.page.select_option("#files [name=kind]", "elements")
+    page.page.click("#files button[type=submit]")
+    page.wait("/on board|refused|no /.test(document.querySelector('#files p').textContent)", 60.0)
+    if "on board" not in page.text("#files p"):
+        return page.text("#files p")
+    page.page.click("#files [name=list]")
+    page.wait("document.querySelectorAll('#files tbody tr').length > 0", 60.0)
+    with page.page.expect_download() as download:
+        page.page.get_by_label("get received/elements/tle.txt").click()
+    download.value.save_as(got)
+    return "" if got.read_bytes() == sent.read_bytes() else "another content came down"
 
 
 def _weight_kb() -> float:
