@@ -657,4 +657,4 @@ class _FileWork:
             self._shown_s = now_ns * 1e-9
             for one in self._session.entity.transfers():
                 part = f"{one.done} of {one.size} bytes" if one.size else "started"
-                sys.stderr.write(f"knightcube: {one.name or name}: {part}\n")
+                sys.stderr.write(f"knightcube: {shown(one.name or name)}: {part}\n")

@@ -421,6 +421,22 @@ def ending(name: str, number: int = 5, condition: int = 0) -> Any:
 
 
 @pytest.mark.usefixtures("quiet")
+def test_the_name_that_a_satellite_gives_a_file_does_not_control_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The metadata of a refused file keep their name until the transfer is closed."""
+    (tmp_path / "up").write_bytes(b"x")
+    session = Session(tmp_path, ([], []), ([], [ending("elements/up")]))
+    named = SimpleNamespace(name="\x1b]0;x\x07", done=0, size=9)
+    session.entity.transfers = lambda: [named]
+    options = cast(Any, SimpleNamespace(what="put", path=tmp_path / "up", kind="elements", replace=False))
+    work(session).obey(options)
+    said = capsys.readouterr().err
+    assert said.count("0 of 9 bytes") == 1
+    assert "\x1b" not in said
+
+
+@pytest.mark.usefixtures("quiet")
 def test_files_are_got_put_and_listed(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"abc")
     session = Session(tmp_path, ([report(Stage.STARTED)], []), ([], [ending("b"), ending("a")]))

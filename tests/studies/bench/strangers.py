@@ -28,7 +28,7 @@ from typing import Any
 
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
-from ground.link.commanding import obeyed
+from ground.link.commanding import failed, obeyed
 from ground.link.terminal import make_keys, open_terminal
 from knightcube.errors import FlightError
 from tests.flight.app.cli.linked_board import free_ports
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
                 facts = measure(Path(place), options.commands, attacked=name == "attacked")
             late.append(facts["lateness_ms"]["p99"])
-            missing += options.commands - facts["obeyed"]
+            missing += len(facts["failures"])
             sys.stdout.write(json.dumps({"flight": name, **facts}) + "\n")
             sys.stdout.flush()
     ratio = median(p99["attacked"]) / median(p99["quiet"])
@@ -69,23 +69,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def measure(place: Path, commands: int, *, attacked: bool) -> dict[str, Any]:
     """Fly once; return the commands that were obeyed, the lateness in ms and the strangers' rates."""
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
-    seconds = _START_S + (_PAUSE_S + 0.5) * commands
     with ExitStack() as stack:
         config, run = _config(place, udp, tcp), place / "run"
-        flight = stack.enter_context(
-            process("run", config, "--realtime", "--out", run, "--duration", seconds)
-        )
+        flight = stack.enter_context(process("run", config, "--realtime", "--out", run))
         wait_for(run / "flight-0001.ccsds")
         link = stack.enter_context(process("link", config, "--log", run))
         wait_for(place / "commands")
         _wait_for_port(tcp)
         rates = stack.enter_context(_strangers(udp, tcp)) if attacked else dict
         time.sleep(_START_S / 2.0)
-        done = _command(commands, udp, tcp, place / "keys" / "ground")
+        failures = _command(commands, udp, tcp, place / "keys" / "ground")
         found = rates()
+        assert (flight.poll(), link.poll()) == (None, None), "the flight or the link has ended by itself"
+        flight.terminate()
         flight.wait()
-        assert link.poll() is None, "the link has ended by itself"
-    return {"obeyed": done, "commands": commands, **found, **lateness(run)}
+    done = commands - len(failures)
+    return {"obeyed": done, "commands": commands, "failures": failures, **found, **lateness(run)}
 
 
 def _wait_for_port(tcp: int) -> None:
@@ -99,24 +98,29 @@ def _wait_for_port(tcp: int) -> None:
     raise TimeoutError(f"no link listens on port {tcp}")
 
 
-def _command(count: int, udp: int, tcp: int, keys: Path) -> int:
-    """Send commands in turn by three lines; return how many were obeyed."""
-    packer, done = CommandPacker(), 0
+def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
+    """Send commands in turn by three lines; return number and reason of each that was not obeyed."""
+    packer, failures = CommandPacker(), list[str]()
     ways = (f"127.0.0.1:{udp}", f"tcp:127.0.0.1:{tcp}", f"tcp:127.0.0.1:{tcp}")
     with ExitStack() as stack:
         lasting = [stack.enter_context(contextlib.closing(open_terminal(way, keys))) for way in ways[:2]]
         for terminal in lasting:  # as gateway and console do; strangers displace a connection without a frame
             terminal.send(packer.pack(Ping(), utc_ns()))
         for number in range(count):
-            with ExitStack() as fresh, contextlib.suppress(FlightError):
-                if (turn := number % len(ways)) < len(lasting):
-                    terminal = lasting[turn]
-                else:
-                    terminal = fresh.enter_context(contextlib.closing(open_terminal(ways[turn], keys)))
-                counter = terminal.send(packer.pack(Ping(number), utc_ns()))
-                done += obeyed(list(terminal.follow(counter, 1, _ANSWER_S)))
+            try:
+                with ExitStack() as fresh:
+                    if (turn := number % len(ways)) < len(lasting):
+                        terminal = lasting[turn]
+                    else:
+                        terminal = fresh.enter_context(contextlib.closing(open_terminal(ways[turn], keys)))
+                    counter = terminal.send(packer.pack(Ping(number), utc_ns()))
+                    reports = list(terminal.follow(counter, 1, _ANSWER_S))
+                    if not obeyed(reports):
+                        failures.append(f"{number}: {failed(reports) or 'no answer'}")
+            except FlightError as error:
+                failures.append(f"{number}: {error}")
             time.sleep(_PAUSE_S)
-    return done
+    return failures
 
 
 @contextmanager

@@ -3,8 +3,9 @@
 `python -m tests.studies.interop.files FOLDER [--megabytes M] [--loss P ...] [--seed S]` opens link, gateway
 and Yamcs, each a process of its own, with a relay between link and gateway that loses frames of both
 directions. A file is commanded down and another is sent up by Yamcs. One JSON line of each loss: whether both
-came whole by SHA-256 and were closed at both ends, and seconds. Exit status 1 where not. Skips loudly without
-Java or the bundle.
+came whole by SHA-256 and were closed at both ends, and seconds. With `--endings` transfers are cancelled
+instead, each way and by each side, and one is suspended on board and resumed: one JSON line each. Exit status
+1 where not all is as it must be. Skips loudly without Java or the bundle.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ _LONGEST_S = 1800.0
 _ASK_S = 10.0
 _RUN = "run-000001"
 _NAME = "dump.bin"
+_TRANSFERS = f"/filetransfer/{INSTANCE}/{CFDP}/transfers"
 
 
 def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
@@ -52,7 +54,74 @@ def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
             states = sorted(one["state"] for one in _transfers(server))
     left = sorted(path.name for path in (place / "keys" / "files" / "transfers").glob("*-*.json"))
     closed = states == ["COMPLETED", "COMPLETED"] and not left
-    return {"loss": loss, "bytes": size, **down, **up, "closed": closed, "states": states, "open": left}
+    sound = down["down_whole"] and up["up_whole"] and closed
+    facts = {"loss": loss, "bytes": size, **down, **up, "closed": closed, "sound": sound}
+    return {**facts, "states": states, "open": left}
+
+
+def endings(place: Path, size: int, loss: float, seed: int) -> Iterator[dict[str, Any]]:
+    """Cancel a transfer each way by each side, and suspend one; yield what came of each."""
+    (place / "runs" / _RUN).mkdir(parents=True)
+    (place / "runs" / _RUN / _NAME).write_bytes(np.random.default_rng(seed).bytes(size))
+    http = free_port()
+    with _opened(place, loss, seed) as gateway:
+        folder = place / "yamcs"
+        write(folder, gateway, http, keys=place / "keys" / "ground")
+        (folder / UP_BUCKET / "release.whl").write_bytes(np.random.default_rng(seed).bytes(size))
+        with serving(folder, http) as server:
+            _until(server.link_up, 60.0)
+            for way in ("down", "up"):
+                for by in ("yamcs", "satellite"):
+                    one = _begun(server, way)
+                    if by == "yamcs":
+                        server.ask(f"{_TRANSFERS}/{one['id']}:cancel", {})
+                    else:
+                        server.command("cancel-file", _number(one))
+                    yield {"way": way, "cancelled_by": by, **_ended(server, place, one["id"], "FAILED")}
+            one = _begun(server, "down")
+            server.command("suspend-file", _number(one))
+            time.sleep(_ASK_S)
+            before = _transfer(server, one["id"])["sizeTransferred"]
+            time.sleep(_ASK_S)
+            rested = _transfer(server, one["id"])["sizeTransferred"] == before != str(size)
+            server.command("resume-file", _number(one))
+            yield {"suspended": rested, **_ended(server, place, one["id"], "COMPLETED")}
+
+
+def _begun(server: Yamcs, way: str) -> dict[str, Any]:
+    """Begin a transfer; return it once data have come."""
+    known = {one["id"] for one in _transfers(server)}
+    if way == "up":
+        _send_up(server)
+    begun: list[dict[str, Any]] = []
+    until = time.monotonic() + _LONGEST_S
+    asked = 0.0
+    while not begun and time.monotonic() < until:
+        if way == "down" and time.monotonic() - asked > _ASK_S:
+            asked = time.monotonic()
+            server.command("send-file", {"entity": "another-ground-station", "name": f"log/{_RUN}/{_NAME}"})
+        begun = [one for one in _transfers(server) if one["id"] not in known and int(one["sizeTransferred"])]
+        time.sleep(0.3)
+    return begun[0]
+
+
+def _ended(server: Yamcs, place: Path, transfer: str, wanted: str) -> dict[str, Any]:
+    """Wait until a transfer is closed at both ends; return its state and what the satellite has open."""
+    stored = place / "keys" / "files" / "transfers"
+    _until(lambda: _transfer(server, transfer)["state"] in {"COMPLETED", "FAILED"}, _LONGEST_S)
+    _until(lambda: not list(stored.glob("*-*.json")), 120.0)
+    state, left = _transfer(server, transfer)["state"], sorted(path.name for path in stored.glob("*-*.json"))
+    return {"state": state, "open": left, "sound": state == wanted and not left}
+
+
+def _transfer(server: Yamcs, transfer: str) -> dict[str, Any]:
+    return next(one for one in _transfers(server) if one["id"] == transfer)
+
+
+def _number(one: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments that name a transfer to the satellite."""
+    identifier = one["transactionId"]
+    return {"source": identifier["initiatorEntity"], "number": identifier["sequenceNumber"]}
 
 
 def _down(server: Yamcs, place: Path, wanted: bytes) -> dict[str, Any]:
@@ -73,9 +142,7 @@ def _up(server: Yamcs, place: Path, data: bytes) -> dict[str, Any]:
     """Have Yamcs send a file up; return whether and when it is there."""
     begun = time.monotonic()
     (place / "yamcs" / UP_BUCKET / "release.whl").write_bytes(data)
-    request = {"direction": "UPLOAD", "bucket": UP_BUCKET, "objectName": "release.whl"}
-    request |= {"remotePath": "release/release.whl", "source": "ground", "destination": "satellite"}
-    server.ask(f"/filetransfer/{INSTANCE}/{CFDP}/transfers", {**request, "options": {"reliable": True}})
+    _send_up(server)
     _until(lambda: all(one["state"] in {"COMPLETED", "FAILED"} for one in _transfers(server)), _LONGEST_S)
     arrived = place / "keys" / "files" / "received" / "release" / "release.whl"
     whole = arrived.exists() and arrived.read_bytes() == data
@@ -83,8 +150,14 @@ def _up(server: Yamcs, place: Path, data: bytes) -> dict[str, Any]:
     return {"up_whole": whole, "up_seconds": round(time.monotonic() - begun, 1)}
 
 
+def _send_up(server: Yamcs) -> None:
+    request = {"direction": "UPLOAD", "bucket": UP_BUCKET, "objectName": "release.whl"}
+    request |= {"remotePath": "release/release.whl", "source": "ground", "destination": "satellite"}
+    server.ask(_TRANSFERS, {**request, "options": {"reliable": True}})
+
+
 def _transfers(server: Yamcs) -> list[dict[str, Any]]:
-    found = server.ask(f"/filetransfer/{INSTANCE}/{CFDP}/transfers")
+    found = server.ask(_TRANSFERS)
     return list(found.get("transfers", []))
 
 
@@ -123,6 +196,7 @@ def main() -> int:
     parser.add_argument("--megabytes", type=float, default=10.0, metavar="M", help="of each file")
     parser.add_argument("--loss", type=float, nargs="+", default=[0.0, 0.1, 0.3], metavar="P")
     parser.add_argument("--seed", type=int, default=1, metavar="S")
+    parser.add_argument("--endings", action="store_true", help="cancel and suspend transfers instead")
     options = parser.parse_args()
     if problem := missing():
         sys.stdout.write(f"SKIPPED: {problem}\n")
@@ -131,10 +205,15 @@ def main() -> int:
     for loss in options.loss:
         place = options.folder.absolute() / f"loss-{loss:g}"
         place.mkdir(parents=True)
-        facts = transfer(place, round(options.megabytes * 1e6), loss, options.seed)
-        sys.stdout.write(json.dumps(facts) + "\n")
-        sys.stdout.flush()
-        sound &= facts["down_whole"] and facts["up_whole"] and facts["closed"]
+        size = round(options.megabytes * 1e6)
+        if options.endings:
+            found = endings(place, size, loss, options.seed)
+        else:
+            found = iter([transfer(place, size, loss, options.seed)])
+        for facts in found:
+            sys.stdout.write(json.dumps(facts) + "\n")
+            sys.stdout.flush()
+            sound &= facts["sound"]
     return 0 if sound else 1
 
 
