@@ -74,7 +74,7 @@ def endings(place: Path, size: int, loss: float, seed: int) -> Iterator[dict[str
                 for by in ("yamcs", "satellite"):
                     one = _begun(server, way)
                     if by == "yamcs":
-                        server.ask(f"{_TRANSFERS}/{one['id']}:cancel", {})
+                        server.raw(f"{_TRANSFERS}/{one['id']}:cancel", {})
                     else:
                         server.command("cancel-file", _number(one))
                     yield {"way": way, "cancelled_by": by, **_ended(server, place, one["id"], "FAILED")}
