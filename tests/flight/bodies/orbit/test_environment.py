@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from sim_hal.clock import SimClock
 from tests.support.flights import CONFIG
 
+INPUT = Path(__file__).resolve().parents[5] / "shared/data/inputs/tle-bstar0-drag.txt"
 UTC_NS = round(datetime.fromisoformat("2026-03-20T12:00:00Z").timestamp()) * SECOND_NS
 
 
@@ -175,6 +177,24 @@ def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(
     assert off < 4.0 * sigma < 100.0
     assert not any(flight.fly(30, lambda: flight.reading(np.array([0.0, 4e4, 0.0]))))
     assert all(flight.fly(30, flight.reading))
+
+
+@pytest.mark.skipif(not INPUT.is_file(), reason="../shared/data/inputs/tle-bstar0-drag.txt is missing")
+@pytest.mark.parametrize("age", [4, 6, 30])
+def test_the_elements_of_the_report_do_not_outvote_good_fixes(age: int) -> None:
+    """The file has B* 0; the satellite has B* 5e-4 and is 226 km off after 6 days, 5,514 km after 30 days."""
+    first, second = INPUT.read_text(encoding="ascii").splitlines()
+    true = TwoLineElements(summed(first[:53] + " 50000-3" + first[61:]), second)
+    flight = Flight(TwoLineElements(first, second), true, age)
+    flight.days_ns = round((true.epoch - UNIX_EPOCH) * DAY) * SECOND_NS - UTC_NS + age * DAYS_NS
+    flight.environment = EstimatedEnvironment(
+        TwoLineElements(first, second), SimClock(UTC_NS + flight.days_ns)
+    )
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma
+    assert any(flight.fly(600, flight.reading))
+    off, sigma = flight.off()
+    assert off < 4.0 * sigma < 100.0
 
 
 @pytest.mark.parametrize("degrees", [1.0, 15.0, -120.0])

@@ -23,7 +23,13 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Knowledge
-from knightcube.gnc.estimation.free_filter import FilterEnvironment, FreeFilterSettings
+from knightcube.gnc.estimation.free_filter import (
+    GYRO,
+    SLOW,
+    FilterEnvironment,
+    FreeFilterSettings,
+    SlowStates,
+)
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.gnc.estimation.rigid_body import BodyErrors
 
@@ -44,7 +50,9 @@ def around(_: int) -> FilterEnvironment:
 class Flown:
     """A body under its coils, a few steps of Euler's equation a reading, and its filter."""
 
-    def __init__(self, pulses: bool = False, errors: BodyErrors | None = None) -> None:
+    def __init__(
+        self, pulses: bool = False, errors: BodyErrors | None = None, slow: SlowStates | None = None
+    ) -> None:
         self.filter = OrbitFilter(
             OrbitFilterSettings(
                 inertia=INERTIA,
@@ -54,6 +62,7 @@ class Flown:
                 unknown_psd=1e-8,
                 settle_ns=100_000_000,
                 history_ns=12 * SECOND_NS,
+                slow=slow,
                 free=FreeFilterSettings(errors=errors or BodyErrors()),
             ),
             around,
@@ -196,6 +205,24 @@ def test_after_some_attitudes_that_contradict_it_the_filter_begins_again() -> No
         assert not flown.see(10 * PERIOD_NS, off)
     assert flown.filter.restarts == 1
     assert flown.error() == pytest.approx(0.1, abs=5e-3)
+
+
+@pytest.mark.parametrize("wrong", [-2e-3, 1.5e-3])
+def test_stars_replace_a_wrong_bias_of_an_earlier_boot_within_half_a_minute(wrong: float) -> None:
+    """The stored bias claims 1e-5 rad/s; the stars contradict it and begin the filter again."""
+    prior = FreeFilterSettings().error_state(INERTIA).prior[SLOW, SLOW].copy()
+    values, bias = np.zeros(len(prior)), slice(GYRO.start - SLOW.start, GYRO.stop - SLOW.start)
+    values[bias], prior[bias, bias] = wrong, 1e-10 * np.eye(3)
+    flown = Flown(slow=SlowStates(values, prior))
+    flown.fly(3.0)
+    assert flown.filter.begin(flown.stars(flown.time_ns - 24 * PERIOD_NS))
+    for _ in range(6):
+        flown.fly(5.0)
+        flown.see(52 * PERIOD_NS)
+    assert flown.filter.restarts > 0
+    found = flown.filter.at(flown.time_ns)
+    assert found.bias == pytest.approx(BIAS, abs=1e-4)
+    assert flown.error() < 1e-3
 
 
 def test_attitudes_that_are_not_finite_never_restart_the_filter() -> None:
