@@ -10,7 +10,9 @@ The receiver loses its configuration at a power loss. The driver therefore reque
 start, and again whenever none has arrived for three seconds. Receivers with protocol version 27 or later (M9,
 M10, F9) are configured by CFG-VALSET (u-blox F9 interface description, UBX-22008968). Older receivers (u-blox
 7 and 8) are configured by CFG-PRT, CFG-RATE and CFG-MSG. The receiver reports its version in MON-VER. If the
-receiver refuses CFG-VALSET (ACK-NAK), the driver uses the older commands, and vice versa. No call blocks.
+receiver refuses CFG-VALSET (ACK-NAK), the driver uses the older commands, and vice versa. No call blocks. If
+bytes arrive but nothing can be decoded for ten seconds, the driver listens at other baud rates, and sets a
+receiver that it finds to the configured baud rate.
 Consumer receivers stop working above 18 km or 515 m/s, so that a satellite needs a firmware without this
 limit.
 """
@@ -265,6 +267,12 @@ class UbxParser:
 
 DEVICE = "gps"
 SILENCE_NS = 3 * SECOND_NS
+BAUD_RATES = 9600, 38400, 115200, 57600, 230400, 460800
+"""Baud rates at which the driver listens; the first two are factory settings."""
+UNDECODED_NS = 10 * SECOND_NS
+"""Time (ns) for which bytes arrive without a frame or sentence until other baud rates are tried."""
+_RETURN_NS = SECOND_NS // 2
+"""Time (ns) from the command of a new baud rate until the port changes to this rate."""
 _BITS = 10
 _SEMI_MAJOR_AXIS, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84, NGA.STND.0036
 _FASTEST = 12_000.0
@@ -313,6 +321,11 @@ class UbloxReceiver:
         self._fix_arrival_ns = now_ns
         self._arrivals_ns = {"frame": -1, "sentence": -1}
         self._last_byte_ns = -1
+        self._own_rate = port.baud_rate
+        self._others = [rate for rate in BAUD_RATES if rate != port.baud_rate]
+        self._rate_ns = now_ns  # time of the last change of the baud rate
+        self._return_ns: int | None = None  # time at which the port returns to the configured baud rate
+        self._found_rate = 0
         self._refused = self._out_of_range = self._unresolved = self._no_fix = self._rolled_over = 0
 
     def poll(self) -> list[GpsReading]:
@@ -330,7 +343,9 @@ class UbloxReceiver:
                     readings.append(reading)
             if parser.sentences > sentences:
                 self._arrivals_ns["sentence"] = arrival_ns
-        self._set_up()
+        self._search_rate()
+        if self._port.baud_rate == self._own_rate:
+            self._set_up()
         return readings
 
     def link(self) -> GpsLink:
@@ -370,9 +385,14 @@ class UbloxReceiver:
                 "NMEA sentences but no UBX frame: check the wire from the host's TX to the receiver's RX, "
                 "and that the receiver is a u-blox 7 or newer"
             )
+        if self._last_byte_ns >= since_ns and self._found_rate:
+            return (
+                f"the receiver sends at {self._found_rate} baud and does not change to {self._own_rate} "
+                f"baud: set `gps.baud_rate: {self._found_rate}`, and check that it is a u-blox 7 or newer"
+            )
         if self._last_byte_ns >= since_ns:
             return (
-                f"bytes but neither UBX frames nor NMEA sentences at {self._port.baud_rate} baud: check "
+                f"bytes but neither UBX frames nor NMEA sentences at {self._own_rate} baud: check "
                 "`gps.baud_rate` (factory settings: 9600 for u-blox 7 and 8, 38400 for M9, M10 and F9)"
             )
         return "no byte received: check power, the cable, and the port's name"
@@ -386,6 +406,8 @@ class UbloxReceiver:
         if kind != NAV_PVT or len(payload) not in {PVT_LENGTH, OLD_PVT_LENGTH}:
             return None
         self._fix_arrival_ns = self._clock.now_ns()
+        if self._port.baud_rate == self._own_rate:
+            self._found_rate = 0
         pvt = unpack_pvt(payload)
         try:
             reading = reading_of(pvt, arrival_ns, self._port.baud_rate, self._earliest_ns, len(payload))
@@ -424,6 +446,30 @@ class UbloxReceiver:
         self._is_due = self._is_due or wanted > self._uses_valset
         self._uses_valset = wanted
 
+    def _search_rate(self) -> None:
+        """Listen at other baud rates while nothing can be decoded, and command the configured baud rate."""
+        now_ns, port = self._clock.now_ns(), self._port
+        decoded_ns = max(*self._arrivals_ns.values(), self._rate_ns)
+        if self._return_ns is not None:
+            if now_ns >= self._return_ns:
+                self._return_ns, self._is_due = None, True
+                self._change_rate(self._own_rate)
+        elif port.baud_rate == self._own_rate:
+            if now_ns - decoded_ns >= UNDECODED_NS and self._last_byte_ns > decoded_ns:
+                self._change_rate(self._others[0])
+                self._others.append(self._others.pop(0))
+        elif decoded_ns > self._rate_ns:
+            self._found_rate, self._return_ns = port.baud_rate, now_ns + _RETURN_NS
+            values = b"\x00\x01\x00\x00" + UART1_BAUDRATE.to_bytes(4, "little")
+            rate = self._own_rate.to_bytes(4, "little")
+            port.send(port_set_up(self._own_rate) + frame(CFG_VALSET, values + rate))
+        elif now_ns - self._rate_ns >= self._silence_ns:
+            self._change_rate(self._own_rate)
+
+    def _change_rate(self, baud_rate: int) -> None:
+        self._port.set_baud_rate(baud_rate)
+        self._rate_ns = self._clock.now_ns()
+
     def _set_up(self) -> None:
         """Configure the receiver to send only NAV-PVT.
 
@@ -447,9 +493,13 @@ class UbloxReceiver:
 def legacy_set_up(baud_rate: int, period_ns: int) -> bytes:
     """Return the frames that configure u-blox 7 and 8: only UBX on UART 1, one NAV-PVT per period (ns)."""
     rate = (period_ns // 1_000_000).to_bytes(2, "little") + b"\x01\x00\x01\x00"  # time system GPS
-    # Port 1 is UART 1, configured as 8N1 with UBX in both directions and without NMEA.
+    return port_set_up(baud_rate) + frame(CFG_RATE, rate) + frame(CFG_MSG, bytes((*NAV_PVT, 1)))
+
+
+def port_set_up(baud_rate: int) -> bytes:
+    """Return the CFG-PRT frame that configures UART 1 as 8N1 with UBX in both directions, without NMEA."""
     port = b"\x01\x00\x00\x00\xd0\x08\x00\x00" + baud_rate.to_bytes(4, "little") + b"\x01\x00" * 2
-    return frame(CFG_PRT, port + b"\x00" * 4) + frame(CFG_RATE, rate) + frame(CFG_MSG, bytes((*NAV_PVT, 1)))
+    return frame(CFG_PRT, port + b"\x00" * 4)
 
 
 def valset(baud_rate: int, period_ns: int) -> bytes:

@@ -28,6 +28,7 @@ from hal.drivers.ublox import (
     PVT_ON_UART1,
     RATE_MEASUREMENT,
     THREE_DIMENSIONS,
+    UART1_BAUDRATE,
     UNKNOWN_ACCURACY,
     VALSET_PROTOCOL,
     VALUE_SIZES,
@@ -159,6 +160,8 @@ class EmulatedGps:
             self._set_values(payload[4:])
         if known and kind == CFG_MSG and payload[:2] == bytes(NAV_PVT):
             self._enabled = payload[-1] > 0
+        if known and kind == CFG_PRT:
+            self._line.baud_rate = int.from_bytes(payload[8:12], "little")
         if known and kind == CFG_RATE:
             self._period_ns = max(100, int.from_bytes(payload[:2], "little")) * 1_000_000
         self._line.write(frame(ACK_ACK if known else ACK_NAK, bytes(kind)), now_ns)
@@ -172,6 +175,8 @@ class EmulatedGps:
             pairs = pairs[4 + size :]
             if key == PVT_ON_UART1:
                 self._enabled = value > 0
+            if key == UART1_BAUDRATE:
+                self._line.baud_rate = value
             if key == RATE_MEASUREMENT:
                 self._period_ns = max(100, value) * 1_000_000
 

@@ -277,6 +277,42 @@ def test_a_receiver_that_does_not_obey_is_named_on_the_wire() -> None:
     assert "NMEA sentences but no UBX frame" in gps.driver.link().condition
 
 
+@pytest.mark.parametrize("protocol", [18.0, 32.0])
+@pytest.mark.parametrize("factory", [9600, 38400])
+def test_a_receiver_at_its_factory_baud_rate_is_found_and_set_to_the_configured_one(
+    protocol: float, factory: int
+) -> None:
+    gps = bench()
+    gps.gps.protocol, gps.line.device.baud_rate = protocol, factory
+    gps.fly(9.0)
+    assert "neither UBX frames nor NMEA sentences at 115200 baud" in gps.driver.link().condition
+    gps.fly(30.0)
+    assert (gps.line.device.baud_rate, gps.line.host.baud_rate) == (115200, 115200)
+    assert sum(reading.valid for reading in gps.fly(5.0)) >= 4
+    assert gps.driver.link().condition == ""
+
+
+def test_a_receiver_that_does_not_obey_is_named_with_its_baud_rate() -> None:
+    gps = bench()
+    gps.gps.obeys, gps.line.device.baud_rate = False, 9600
+    gps.fly(12.5)
+    assert gps.driver.link().sentences > 0
+    gps.fly(8.0)
+    assert "the receiver sends at 9600 baud and does not change to 115200 baud" in gps.driver.link().condition
+
+
+def test_noise_on_the_line_does_not_lose_the_receiver() -> None:
+    gps = bench()
+    assert gps.fly(4.0)[-1].valid
+    faults = gps.line.to_host.faults
+    gps.line.to_host.faults = replace(faults, garbage=True)
+    gps.fly(47.0)
+    gps.line.to_host.faults = faults
+    gps.fly(8.0)
+    assert sum(reading.valid for reading in gps.fly(5.0)) >= 4
+    assert gps.line.host.baud_rate == gps.line.device.baud_rate == 115200
+
+
 @given(st.binary(min_size=84, max_size=92).filter(lambda data: len(data) in {84, 92}))
 def test_any_solution_is_read_or_refused_by_name(payload: bytes) -> None:
     readings, driver, _ = received([frame(NAV_PVT, payload)])
