@@ -80,9 +80,9 @@ class Trial:
         new: name of the new configuration or release; empty until a release is built.
         stage: stage of the trial: `install`, `fly` or `revert`.
         left_s: time (s) with power within which the ground must confirm.
-        despite_faults: whether the trial continues after the flight has changed to SAFE.
+        despite_faults: whether the trial continues after the flight has reported a fault.
         before: release to which the link `previous` pointed before the trial.
-        session: identifier of the link process at the installation; its reports of SAFE are ignored.
+        session: identifier of the link process at the installation; faults that it noted are ignored.
         down_s: time (s) since the flight and the link process were last both active.
         tries: number of attempts to install.
         problem: reason for the return to the previous version.
@@ -432,7 +432,7 @@ class Renewal:
                 "session": str(contact["session"]),
                 "frames": str(contact["frames"]),
                 "limit_s": float(contact["limit_s"]),
-                "safe": str(contact["safe"]),
+                "fault": str(contact["fault"]),
             }
         return {}
 
@@ -711,8 +711,8 @@ class Renewal:
             self._begin_revert(f"flight or link were not up for {DOWN_S:.0f} s")
         elif others:
             self._begin_revert(f"flight or link run release {others[0]} instead")
-        elif contact.get("safe") and contact["session"] != trial.session and not trial.despite_faults:
-            self._begin_revert(f"the flight went to SAFE: {contact['safe']}")
+        elif contact.get("fault") and contact["session"] != trial.session and not trial.despite_faults:
+            self._begin_revert(f"the flight reported a fault: {contact['fault']}")
         elif trial.left_s <= 0.0:
             self._begin_revert("the ground did not confirm it")
 

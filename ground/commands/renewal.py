@@ -91,7 +91,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
             placed.add_argument("path", type=Path, metavar="BUNDLE", help="local copy of the bundle")
             text = "time with power within which the ground must confirm (default %(default)g h)"
             placed.add_argument("--hours", type=float, default=24.0, metavar="H", help=text)
-            text = "a reaction to SAFE does not end the trial"
+            text = "a fault that the flight reports does not end the trial"
             placed.add_argument("--despite-faults", action="store_true", help=text)
     parser.set_defaults(command=run)
 

@@ -119,9 +119,9 @@ class RenewedBoard:
         values = {"name": bundle.name, "sum": self.put(bundle, kind), "hours": hours, "despite_faults": False}
         return self.request("activate", kind, **values | changes)
 
-    def contact(self, frames: int, session: str = "a", limit_s: float = 0.0, safe: str = "") -> None:
+    def contact(self, frames: int, session: str = "a", limit_s: float = 0.0, fault: str = "") -> None:
         """Leave the link's record of its contact."""
-        values = {"session": session, "frames": str(frames), "limit_s": limit_s, "safe": safe}
+        values = {"session": session, "frames": str(frames), "limit_s": limit_s, "fault": fault}
         (self.link / "renewal/contact").write_bytes(encoded(values))
 
     def changed(self, name: str) -> Path:

@@ -135,19 +135,19 @@ def test_a_board_in_its_safe_state_can_be_renewed(board: RenewedBoard) -> None:
     assert board.flown() == "second"
 
 
-def test_a_reaction_to_safe_ends_the_trial_unless_it_was_permitted(board: RenewedBoard) -> None:
+def test_a_fault_ends_the_trial_unless_it_was_permitted(board: RenewedBoard) -> None:
     before = board.flown()
-    board.contact(1, "a", safe="an old one")
+    board.contact(1, "a", fault="an old one")
     activated(board)
     board.step()
     assert board.flown() == "second", "the link of before reported it"
-    board.contact(0, "b", safe="coil 2 is open")
+    board.contact(0, "b", fault="coil 2 is open")
     board.step()
     assert board.flown() == before
     bundle = board.bundle("configuration", board.changed("third"), 2)
     board.activate(bundle, despite_faults=True)
     board.step()
-    board.contact(0, "c", safe="coil 2 is open")
+    board.contact(0, "c", fault="coil 2 is open")
     board.step()
     assert board.flown() == "third"
 

@@ -76,7 +76,7 @@ ACTIVATE = telecommand(
     _NAME,
     Field("sum", "u1", "-", "SHA-256 of the bundle", SUM_BYTES),
     Field("hours", "f4", "h", "time with power within which the ground must confirm"),
-    Field("despite_faults", "u1", "-", "1 if a reaction to SAFE does not end the trial"),
+    Field("despite_faults", "u1", "-", "1 if a fault that the flight reports does not end the trial"),
     hazard="restarts flight and link with another configuration or release",
 )
 CONFIRM = telecommand("confirm", 0x2B1, "End the trial of an artefact, which stays", _KIND)
@@ -199,7 +199,7 @@ class Activate:
         name: name of the bundle in the list of files.
         sum: SHA-256 of the bundle.
         hours: time with power within which the ground must confirm the artefact, h.
-        despite_faults: 1 if a reaction to SAFE does not end the trial.
+        despite_faults: 1 if a fault that the flight reports does not end the trial.
     """
 
     name: str

@@ -12,11 +12,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from flight.link.events import Severity
 from flight.link.modes import Mode
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import KINDS, PARTS, Activate, Privileged, Restart
 from flight.link.regular_files import line_of, overwrite, read_regular, to_record
-from flight.link.telemetry.definitions import MODE
+from flight.link.telemetry.definitions import EVENT, MODE
 from flight.link.telemetry.packets import LAYOUTS, to_text
 from hal.interfaces.wires import SECOND_NS
 
@@ -25,6 +26,7 @@ CONTACT_NS = 10 * SECOND_NS
 """Minimum time (ns) between two records of the contact with the ground."""
 _LARGEST = 1 << 16
 _REACTION = "reaction safe"  # trigger in the mode packet after an event (flight.loop.modes)
+_MODE_LAYOUT, _EVENT_LAYOUT = LAYOUTS[MODE.name], LAYOUTS[EVENT.name]
 _STAGES = {"started": Stage.STARTED, "completed": Stage.COMPLETED, "failed": Stage.FAILED}
 _DAMAGED = (ValueError, TypeError, AttributeError, LookupError, RecursionError)
 
@@ -51,7 +53,7 @@ class Renewal:
         self._status = status
         self._limit = command_loss
         self._session = os.urandom(8).hex()
-        self._safe = ""
+        self._fault = ""
         self._recorded = ("", "")
         self._due_ns = 0
         self._modified_ns = 0
@@ -74,12 +76,15 @@ class Renewal:
         return "" if self._write(name, encoded(values)) else "the request could not be stored"
 
     def followed(self, packet: bytes) -> None:
-        """Note a reaction to SAFE in a packet of live telemetry."""
-        layout = LAYOUTS[MODE.name]
-        if packet[:2] == layout.identifier.to_bytes(2, "big"):
-            (row,) = layout.array(packet)
+        """Note a fault, or a reaction to SAFE, in a packet of live telemetry."""
+        if packet[:2] == _MODE_LAYOUT.identifier.to_bytes(2, "big"):
+            (row,) = _MODE_LAYOUT.array(packet)
             if row["mode"] == Mode.SAFE and to_text(row["trigger"]) == _REACTION:
-                self._safe = to_text(row["reason"])[:64] or _REACTION
+                self._fault = to_text(row["reason"])[:64] or _REACTION
+        elif packet[:2] == _EVENT_LAYOUT.identifier.to_bytes(2, "big"):
+            (row,) = _EVENT_LAYOUT.array(packet)
+            if row["severity"] == Severity.FAULT and not self._fault:
+                self._fault = f"{to_text(row['name'])}: {to_text(row['text'])}"[:64]
 
     def turn(self, admitted: int, now_ns: int) -> list[Report]:
         """Record the contact with the ground, and return new reports of the privileged part.
@@ -88,10 +93,10 @@ class Renewal:
             admitted: number of authentic frames since the start of the link.
             now_ns: current time of the monotonic clock, ns.
         """
-        contact = (str(admitted), self._safe)
+        contact = (str(admitted), self._fault)
         if contact != self._recorded and now_ns >= self._due_ns and self._status.parent.exists():
             self._due_ns = now_ns + CONTACT_NS
-            values = {"session": self._session, "frames": contact[0], "safe": contact[1]}
+            values = {"session": self._session, "frames": contact[0], "fault": contact[1]}
             if self._write("contact", encoded(values | {"limit_s": self._limit})):
                 self._recorded = contact
         with suppress(OSError, *_DAMAGED):

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from flight.link import events
 from flight.link.modes import Mode
 from flight.link.process.directives import Activate, Confirm, Listing, Withdraw
 from flight.link.process.renewal import Renewal, decoded, encoded
+from flight.link.telemetry.definitions import EVENT
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.process.filed_ends import FiledEnds
 
@@ -121,19 +123,29 @@ def test_the_contact_counts_authentic_frames_and_reactions_to_safe(ends: Ends) -
         return found
 
     ends.turn(2.0)
-    assert (contact()["frames"], contact()["safe"], contact()["limit_s"]) == ("0", "", 0.0)
+    assert (contact()["frames"], contact()["fault"], contact()["limit_s"]) == ("0", "", 0.0)
     ends.wire.up.append(bytes(64))
     ends.record(ends.mode_packet(Mode.SAFE, "commanded safe"), ends.mode_packet(Mode.HOLD, "reaction hold"))
     ends.turn(12.0)
-    assert (contact()["frames"], contact()["safe"]) == ("0", "")
+    assert (contact()["frames"], contact()["fault"]) == ("0", "")
     ends.ask(Confirm(0))
     ends.record(ends.mode_packet(Mode.SAFE, "reaction safe"))
     ends.turn(12.0)
-    assert (contact()["frames"], contact()["safe"]) == ("1", "reaction safe")
+    assert (contact()["frames"], contact()["fault"]) == ("1", "reaction safe")
     session = contact()["session"]
     ends.restart()
     ends.turn(2.0)
     assert contact()["session"] != session
+
+
+@pytest.mark.parametrize("kind", [events.IMU_SILENT, events.COIL_BROKEN, events.DISK_LOW, events.MODE])
+def test_the_contact_has_the_first_event_of_severity_fault(ends: Ends, kind: events.EventKind) -> None:
+    for text in ("first", "second"):
+        fields = {"code": kind.code, "severity": int(kind.severity), "suppressed": 0, "name": kind.name}
+        ends.record(ends.packer.pack(EVENT, ends.clock.now_ns(), fields | {"text": text}))
+        ends.turn(11.0)
+    fault = decoded((ends.place / "keys/renewal/contact").read_bytes())["fault"]
+    assert fault == (f"{kind.name}: first" if kind.severity is events.Severity.FAULT else "")
 
 
 def test_a_disk_that_cannot_be_written_is_reported_and_ends_nothing(tmp_path: Path) -> None:
