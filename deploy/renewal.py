@@ -339,14 +339,24 @@ class Board:
         replace_file(self.own / RESTART, " ".join(parts or ("flight", "link")).encode())
 
     def restart_parts(self) -> None:
-        """Restart the parts whose restart a run has requested. Raises OSError."""
+        """Restart the parts whose restart a run has requested; a damaged request restarts flight and link.
+
+        The request is deleted last, so that a kill does not lose it. Only a restart of the board is deleted
+        first, because it would otherwise be repeated after each boot. Raises OSError.
+        """
         path = self.own / RESTART
-        parts = path.read_text(encoding="ascii").split() if path.exists() else []
-        path.unlink(missing_ok=True)
-        if parts:
-            self.run(["systemctl", "daemon-reload"], 60.0)
-        for words in (words for part in parts for words in RESTARTS.get(part, ())):
+        if not path.exists():
+            return
+        parts = path.read_text(encoding="ascii", errors="replace").split()
+        if not parts or not set(parts) <= set(RESTARTS):
+            parts = ["flight", "link"]
+        if "board" in parts:
+            path.unlink()
+            sync_folder(self.own)
+        self.run(["systemctl", "daemon-reload"], 60.0)
+        for words in (words for part in parts for words in RESTARTS[part]):
             self.run(["systemctl", *words], 60.0)
+        path.unlink(missing_ok=True)
 
     def active(self, unit: str) -> bool:
         """Return whether a systemd unit is active."""

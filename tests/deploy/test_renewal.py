@@ -119,6 +119,46 @@ def test_a_part_is_restarted_once_by_command(board: RenewedBoard, part: str, cal
     assert [report[1:4] for report in reports] == [[name, "completed", "restart"]]
 
 
+@pytest.mark.parametrize(
+    ("part", "unit"), [("flight", "knightcube.service"), ("link", "knightcube-link.service")]
+)
+def test_a_killed_restart_is_repeated(board: RenewedBoard, part: str, unit: str) -> None:
+    _kill_the_next_restart(board, part)
+    board.run("--restart")
+    calls = (board.place / "calls").read_text(encoding="ascii").splitlines()
+    assert calls.count(f"--no-block restart {unit}") == 1
+
+
+def test_a_killed_reboot_is_not_repeated_after_the_boot(board: RenewedBoard) -> None:
+    _kill_the_next_restart(board, "board")
+    board.run("--restart")
+    assert not (board.place / "calls").exists()
+
+
+def _kill_the_next_restart(board: RenewedBoard, part: str) -> None:
+    """Request a restart, and kill the program at its first call of systemctl."""
+    board.request("restart", part=part)
+    board.step()
+    systemctl = board.place / "bin/systemctl"
+    text = systemctl.read_text(encoding="ascii")
+    systemctl.write_text("#!/bin/sh\nkill -9 $PPID\n", encoding="ascii")
+    done = subprocess.run([*board.words(), "--restart"], env=board.environment(), check=False)
+    assert done.returncode == -9
+    systemctl.write_text(text, encoding="ascii")
+
+
+@pytest.mark.parametrize("content", [b"", b"flighu link", b"\xe6light link", b"\0" * 11])
+def test_a_damaged_request_restarts_flight_and_link(board: RenewedBoard, content: bytes) -> None:
+    (board.own / "restart").write_bytes(content)
+    board.run("--restart")
+    calls = (board.place / "calls").read_text(encoding="ascii").splitlines()
+    assert [call for call in calls if "--no-block" in call] == [
+        "--no-block restart knightcube.service",
+        "--no-block restart knightcube-link.service",
+    ]
+    assert not board.restarted()
+
+
 @pytest.mark.parametrize("part", ["", "knightcube.service", "--root=/", "Board"])
 def test_an_unknown_part_is_not_restarted(board: RenewedBoard, part: str) -> None:
     board.request("restart", part=part)
