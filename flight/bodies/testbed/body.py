@@ -325,6 +325,7 @@ def planning_settings(config: TestbedConfig) -> PlanningSettings:
     section = config.guidance
     return PlanningSettings(
         horizon=section.horizon,
+        replan_period=section.replan_period,
         late_after_ns=round(section.late_after * SECOND_NS),
         nodes=section.nodes or NODES,
         strategy=Strategy(section.strategy),

@@ -2,10 +2,10 @@
 
 Paths are planned by one of three strategies. The strategy GOAL plans the whole step when a target is set, and
 every few seconds plans the remaining part again from the newest estimate: each new plan is the optimal
-continuation of the step. Near the goal time, the last path is followed to its end, and the attitude at its
-end is held; a body displaced from its path gets a new plan. The strategy RECEDING is that of the thesis: each
-plan reaches the target a whole horizon later (Sease, chapter 5, Optimal Path Planning). The strategy STEP
-makes no plan, so that the controller tracks the target itself.
+continuation of the step. Near the goal time, the last path is followed to its end. From then on each plan
+holds the target for one replanning period. A body displaced from its path gets a new plan. The strategy
+RECEDING is that of the thesis: each plan reaches the target a whole horizon later (Sease, chapter 5, Optimal
+Path Planning). The strategy STEP makes no plan, so that the controller tracks the target itself.
 
 The control laws are B-dot detumbling and a controller of the rotation about the thread. In a Helmholtz cage,
 the magnetic field is that of an orbit, which the flight software predicts. The cage produces the field that a
@@ -174,6 +174,8 @@ def law_of(target: Target) -> ThreadLaw:
 
 
 _AGAIN_NS = 1_000_000_000
+_ARRIVED_NS = 100_000_000
+"""Longest time (ns) to the goal time at which a new plan holds the target."""
 _MAX_HORIZON = 60.0
 """Longest planning horizon (s) of a path."""
 
@@ -192,6 +194,7 @@ class PlanningSettings:
 
     Attributes:
         horizon: duration (s) requested for a new path; an initial guess if `time_price` is set.
+        replan_period: time (s) between two plans, and duration of the paths that hold a reached target.
         late_after_ns: planning time (ns) after which a plan is reported as late.
         nodes: number of interpolation nodes of a path.
         strategy: see the module.
@@ -203,6 +206,7 @@ class PlanningSettings:
     """
 
     horizon: float
+    replan_period: float
     late_after_ns: int
     nodes: int
     strategy: Strategy
@@ -272,7 +276,7 @@ class Planning:
     def request(self, now_ns: int) -> None:
         """Request a plan, which is made once there is an estimate and the worker is free."""
         self._wanted = True
-        if self._is_near_goal(now_ns):
+        if self._is_near_goal(now_ns) or self._has_arrived(now_ns):
             self._goal_ns = None
 
     def resume(self, now_ns: int) -> None:
@@ -311,7 +315,14 @@ class Planning:
     def _job_from(self, estimate: ThreadEstimate, law: ThreadLaw, now_ns: int) -> PlanJob:
         settings, goal_ns, begun = self._settings, self._goal_ns, self._goal_ns is not None
         towards_goal = settings.strategy is Strategy.GOAL
-        horizon = (goal_ns - now_ns) * 1e-9 if goal_ns is not None else settings.horizon
+        start_q2, start_rate, horizon = estimate.q2, estimate.rate, settings.horizon
+        if self._has_arrived(now_ns):
+            # A plan from the estimate would give up the tracker's stiffness against disturbances.
+            horizon, held = settings.replan_period, self._guidance.sample(now_ns)
+            if held is not None:
+                start_q2, start_rate = q2_of(held.angle), held.rate
+        elif goal_ns is not None:
+            horizon = (goal_ns - now_ns) * 1e-9
         end_q2 = law.q2
         if towards_goal and law.rate != 0.0 and self._due_ns is not None:
             # A target with a rate has moved since it was first due.
@@ -323,8 +334,8 @@ class Planning:
             self._count + 1,
             now_ns,
             replace(self._plant, disturbance=estimate.disturbance) if towards_goal else self._plant,
-            estimate.q2,
-            estimate.rate,
+            start_q2,
+            start_rate,
             end_q2,
             law.rate,
             horizon,
@@ -339,7 +350,12 @@ class Planning:
         """Return whether the remaining time to the goal is too short for a new plan."""
         if self._settings.strategy is not Strategy.GOAL or self._goal_ns is None:
             return False
-        return self._goal_ns - now_ns < self._settings.least_horizon * 1e9
+        return _ARRIVED_NS < self._goal_ns - now_ns < self._settings.least_horizon * 1e9
+
+    def _has_arrived(self, now_ns: int) -> bool:
+        """Return whether the goal time has come, so that plans hold the target from now on."""
+        goal_ns = self._goal_ns if self._settings.strategy is Strategy.GOAL else None
+        return goal_ns is not None and goal_ns - now_ns <= _ARRIVED_NS
 
     def _is_displaced(self, angle: float, now_ns: int) -> bool:
         """Return whether the body is too far off its path to follow it; true at most once a second."""
