@@ -535,6 +535,7 @@ class Sealer:
         self._salt = secrets.randbits(_SALT_BITS) << _COUNTER_BITS
         self._next = 0
         self._end = 0
+        self._generation = 0
         self._cipher: AESGCM | None = None
 
     def replace_key(self, generation: int, key: bytes) -> bool:
@@ -560,7 +561,7 @@ class Sealer:
     def _is_overtaken(self) -> bool:
         """Return whether another process has changed the key or reserved counters after this block."""
         entry = self._vault.read(self._name)
-        return entry is not None and entry.unused != self._end
+        return entry is not None and (entry.generation, entry.unused) != (self._generation, self._end)
 
     def _reserve(self) -> None:
         with self._vault.locked():
@@ -572,7 +573,7 @@ class Sealer:
                 raise FlightError(f"the counters of SPI {self._spi} are used up: change its key")
             if self._vault.write(reserved, self._name) == 0:
                 raise FlightError(f"the counter of SPI {self._spi} cannot be stored")
-        self._next, self._end = entry.unused, reserved.unused
+        self._next, self._end, self._generation = entry.unused, reserved.unused, entry.generation
         self._cipher = entry.cipher
 
 

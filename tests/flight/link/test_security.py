@@ -25,6 +25,8 @@ from flight.link.security import (
     Vault,
     decode,
     encode,
+    new_key,
+    unprotect,
 )
 from knightcube.errors import FlightError, UsageError
 from tests.flight.link.vaults import Ground, frame_with, gate, parse, vault
@@ -275,6 +277,20 @@ def test_a_block_of_counters_ends_when_another_sender_has_reserved_counters(grou
     order = [blocks, blocks, single, blocks, single, single, blocks, blocks]
     counters = [sealer.seal(bytes(5), b"x")[1] for sealer in order]
     assert counters == sorted(set(counters)), "the receiver refuses a counter below the highest"
+
+
+def test_a_block_of_counters_ends_when_the_key_was_changed(ground: Vault) -> None:
+    """Also if the counters of the new key have come to the end of the block."""
+    sealer = Sealer(ground, 1, bytes(5), 64, shared=True)
+    sealer.seal(bytes(5), b"x")
+    old = ground.read(1)
+    assert old is not None
+    ground.write(replace(old, generation=old.generation + 1, key=new_key()))
+    body, counter = sealer.seal(bytes(5), b"x")
+    changed = ground.read(1)
+    assert changed is not None
+    assert counter == old.unused
+    assert unprotect(changed.cipher, bytes(5), bytes(5), body[5:]) == b"x"
 
 
 def test_a_block_of_counters_is_used_up_without_another_reservation(ground: Vault) -> None:
