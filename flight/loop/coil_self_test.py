@@ -29,17 +29,18 @@ class SelfTestSettings:
     Attributes:
         interval_ns: longest time (ns) without evidence about a coil, after which the coil is tested.
         limits: largest currents (n,), A, of a test.
+        gyro_hz: number of gyro samples per second.
     """
 
     interval_ns: int
     limits: FloatArray
+    gyro_hz: float
 
 
 _SHOWN = 8.0
 """Gain of a healthy coil divided by the standard deviation with which a self-test measures the gain."""
 _EFFICIENCY = 0.7
 """Standard deviation of a gain without, divided by that with an estimated constant torque."""
-_GYRO_HZ = 40.0
 _SHORTEST_QUARTER, _LONGEST_QUARTER = 1.0, 4.0
 """Minimum and maximum duration (s) of each of the four quarters of a test."""
 _GAP_NS = 400_000_000
@@ -60,7 +61,7 @@ class SelfTest:
     def __init__(self, response: CoilResponse, rate_noise: float, settings: SelfTestSettings) -> None:
         """Set the standard deviation `rate_noise` (rad/s) of a gyro sample."""
         self._response, self._settings = response, settings
-        self._least = _SHOWN * rate_noise / (_EFFICIENCY * math.sqrt(4.0 * _GYRO_HZ / 3.0))
+        self._least = _SHOWN * rate_noise / (_EFFICIENCY * math.sqrt(4.0 * settings.gyro_hz / 3.0))
         self._shown_ns: list[int | None] = [None] * len(settings.limits)
         self._running: tuple[int, int, int, float] | None = None
         self._loud_ns = 0

@@ -555,7 +555,9 @@ def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
         response=response,
         slow=slow,
         tumble_rate=tumble,
-        self_test=SelfTestSettings(interval_ns, limits) if interval_ns else None,
+        self_test=SelfTestSettings(interval_ns, limits, config.inertial_unit.rate_hz)
+        if interval_ns
+        else None,
         absent=config.coils.absent,
     )
     return CoilMonitor(settings)

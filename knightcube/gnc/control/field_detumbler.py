@@ -304,11 +304,11 @@ class FieldDetumblerSettings:
     """
 
     limit: float | FloatArray
-    horizon: float = 1500.0
-    replan: float = 5.0
-    gentle: float = 0.052
-    spin_up: float = 3.0
-    slow: float = 8.7e-3
+    horizon: float
+    replan: float
+    gentle: float
+    spin_up: float
+    slow: float
 
     def __post_init__(self) -> None:
         """Raise UsageError for settings that are not finite and positive."""

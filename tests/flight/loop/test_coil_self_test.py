@@ -20,11 +20,11 @@ STRONG: FloatArray = np.array([0.02, 0.03, 0.01])
 ALL: BoolArray = np.ones(3, dtype=bool)
 
 
-def _test(strength: FloatArray = STRONG, healthy: tuple[int, ...] = ()) -> SelfTest:
+def _test(strength: FloatArray = STRONG, healthy: tuple[int, ...] = (), gyro_hz: float = 40.0) -> SelfTest:
     response = SimpleNamespace(
         strength=strength, is_healthy=lambda axis: axis in healthy, text=lambda axis: f"seen {axis}"
     )
-    settings = SelfTestSettings(round(INTERVAL * 1e9), np.full(3, LIMIT))
+    settings = SelfTestSettings(round(INTERVAL * 1e9), np.full(3, LIMIT), gyro_hz)
     return SelfTest(cast(CoilResponse, response), 4e-4, settings)
 
 
@@ -47,6 +47,13 @@ def _fly(
 def _driven(flown: FloatArray) -> list[int]:
     """Return the coils in the order in which they were driven."""
     return list(dict.fromkeys(int(np.abs(one).argmax()) for one in np.nan_to_num(flown) if one.any()))
+
+
+def test_a_gyro_with_more_samples_needs_a_smaller_impulse() -> None:
+    slow, fast = (
+        np.abs(np.nan_to_num(_fly(_test(gyro_hz=rate), INTERVAL + 30.0))).sum() for rate in (40.0, 160.0)
+    )
+    assert 0.0 < fast < 0.8 * slow
 
 
 def test_each_coil_is_tested_alone_once_in_each_interval_without_a_lasting_effect() -> None:

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from flight.schema.orbit import FieldDetumble
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
@@ -281,7 +282,15 @@ class _Law:
         noise = FieldRateSettings(
             inertia=flight.inertia, field_sigma=FIELD_SIGMA, torque_walk=TORQUE_WALK[craft]
         )
-        braking = FieldDetumblerSettings(limit=flight.limit, horizon=HORIZON[craft])
+        section = FieldDetumble()
+        braking = FieldDetumblerSettings(
+            limit=flight.limit,
+            horizon=HORIZON[craft],
+            replan=section.replan,
+            gentle=section.gentle,
+            spin_up=section.spin_up,
+            slow=SLOW,
+        )
         self._instants = braking.instants
         self._field = FieldAhead()
         self._law = FieldDetumbler(SCHEDULE, braking, noise, self._expected)

@@ -64,10 +64,16 @@ def unlike(described: FloatArray, limit: float, seed: int) -> Body:
     return Body(described, principal @ np.diag(drawn) @ principal.T, limit)
 
 
+def braking(limit: float) -> FieldDetumblerSettings:
+    return FieldDetumblerSettings(
+        limit=limit, horizon=1500.0, replan=5.0, gentle=0.052, spin_up=3.0, slow=8.7e-3
+    )
+
+
 def detumbler(body: Body | None = None) -> FieldDetumbler:
     described, limit = (INERTIA, LIMIT) if body is None else (body.described, body.limit)
     noise = FieldRateSettings(inertia=described, field_sigma=2e-7, torque_walk=1e-4 if body is None else 1e-5)
-    return FieldDetumbler(SCHEDULE, FieldDetumblerSettings(limit=limit), noise)
+    return FieldDetumbler(SCHEDULE, braking(limit), noise)
 
 
 def fly(
@@ -241,7 +247,7 @@ LONG = WindowSchedule(100_000_000, 100_000_000, 3_800_000_000)
 def driven(gyro: bool) -> tuple[FieldDetumbler, list[float]]:
     """Return a detumbler of a body that rotates steadily, and the durations (s) of its driven phases."""
     noise = FieldRateSettings(inertia=INERTIA, field_sigma=2e-7, torque_walk=1e-4)
-    law = FieldDetumbler(LONG, FieldDetumblerSettings(limit=LIMIT), noise)
+    law = FieldDetumbler(LONG, braking(LIMIT), noise)
     rate, rng = np.array([0.1, 0.05, 0.14]), np.random.default_rng(1)
     law.begin(0)
     begun_ns, found, before = 0, [], False
@@ -289,7 +295,7 @@ def test_a_sample_taken_while_the_coils_act_or_settle_is_ignored() -> None:
 
 def test_constants_that_do_not_brake_are_refused() -> None:
     with pytest.raises(UsageError, match="limit"):
-        FieldDetumblerSettings(limit=0.0)
+        braking(0.0)
 
 
 STEP, DIPOLE_LIMIT, REST = 5.0, 0.1, 1e-5
@@ -367,7 +373,7 @@ def test_the_field_ahead_begins_as_it_is_measured() -> None:
 
 def test_a_field_along_the_orbit_is_known_from_its_direction_and_its_change() -> None:
     """The direction of the field near the equator oscillates; the prediction is in other axes."""
-    times = FieldDetumblerSettings(limit=LIMIT).instants
+    times = braking(LIMIT).instants
     angle = 0.3 * np.sin(1.1e-3 * times)
     true = 3e-5 * np.stack([np.sin(angle), 0.2 * np.cos(angle) ** 2, np.cos(angle)], axis=1)
     turned = attitude_matrix(from_rotation_vector(np.array([0.4, -1.1, 2.0])))
@@ -391,11 +397,11 @@ def test_a_prediction_of_a_wrong_orbit_is_not_used(strength: float, used: bool) 
         return FieldPrediction(ahead, False)
 
     noise = FieldRateSettings(inertia=INERTIA, field_sigma=2e-7, torque_walk=1e-4)
-    braking = FieldDetumblerSettings(limit=LIMIT)
-    instants = braking.instants
+    settings = braking(LIMIT)
+    instants = settings.instants
     costates = []
     for source in (expected, lambda _: None):
-        law = FieldDetumbler(SCHEDULE, braking, noise, source)
+        law = FieldDetumbler(SCHEDULE, settings, noise, source)
         law.begin(0)
         for cycle in range(60):
             turned = attitude_matrix(from_rotation_vector(0.1 * cycle * np.array([0.02, 0.08, 0.05])))
