@@ -577,7 +577,7 @@ class Renewal:
             for left in ("unpacked", "set"):
                 shutil.rmtree(staging / left, ignore_errors=True)
             words = [program, board.own / "trusted", root, staging / "bundle", kind, staging]
-            done = board.run([board.python(release), "-I", *words, board.configuration(), kept], 600.0)
+            done = board.run([board.python(release), "-I", "-B", *words, board.configuration(), kept], 600.0)
             if done.returncode == 0:
                 facts: dict[str, Any] = json.loads(done.stdout)
                 return facts
@@ -668,7 +668,7 @@ class Renewal:
             raise Refused((done.stderr.strip().splitlines() or ["the build failed"])[-1])
         name = done.stdout.split()[-1]
         dropin = Path(__file__).resolve().with_name("board_dropin.py")
-        checked = board.run([board.python(name), "-I", dropin, board.configuration()], 120.0)
+        checked = board.run([board.python(name), "-I", "-B", dropin, board.configuration()], 120.0)
         if checked.returncode != 0:
             raise Refused(f"it does not accept the present configuration: {checked.stderr.strip()[-60:]}")
         return name

@@ -38,6 +38,7 @@ case "$*" in
     *"-m flight run "* | *"-m flight link "*) echo "flies $(cat "$packages/flight/label")" ;;
     *)  # an isolated Python would not find the modules of this folder
         [ "$1" != -I ] || shift
+        [ "$1" != -B ] || shift
         PYTHONPATH={ROOT} exec {sys.executable} "$@" ;;
 esac
 """

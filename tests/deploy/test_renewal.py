@@ -332,6 +332,22 @@ def test_a_release_is_not_built_from_damaged_packages(board: RenewedBoard) -> No
     assert (result, "add the folder wheels, because venv/lib" in text) == ("failed", True), text
 
 
+def test_a_release_replaces_one_whose_own_files_or_bytecode_are_damaged(board: RenewedBoard) -> None:
+    current = board.files.prefix / "current"
+    (site,) = current.glob("venv/lib/python3*/site-packages")
+    cache = site / "__pycache__/numpy.cpython-311.pyc"
+    cache.parent.mkdir()
+    cache.write_bytes(b"bytecode")
+    manifest = script("releases").manifest_text(current.resolve())
+    (current / "manifest").write_text(manifest, encoding="utf-8")
+    cache.write_bytes(b"other bytes")
+    (site / "flight/label").write_text("OLD", encoding="ascii")
+    request = board.activate(board.bundle("release", board.source("new"), 1), "release")
+    board.step()
+    assert board.release() == "new", board.reports(request)
+    assert not list((board.files.prefix / "current").glob("venv/lib/python3*/site-packages/__pycache__"))
+
+
 def test_a_trial_ends_although_its_reports_cannot_be_written(board: RenewedBoard) -> None:
     before = board.flown()
     activated(board)
