@@ -40,7 +40,7 @@ from knightcube.errors import FlightError, UsageError
 PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1
 NO_ACCESS = "open the newest address that `knightcube console` printed: the page needs the token in it"
-_READ_S = 0.05
+_READ_S = 0.03
 """Time (s) between two reads of new packets."""
 _MAX_POINTS = 4000
 _MOST_EXPORTED = 1_000_000
