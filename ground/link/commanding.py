@@ -245,7 +245,12 @@ class FileSession:
         self._credit, self._credit_ns = 0.0, now_ns
 
     def ask(self, directive: Directive, now_ns: int) -> None:
-        """Send a command, and repeat it until the satellite answers."""
+        """Send a command, and repeat it until the satellite answers; ignore late reports on earlier ones."""
+        self._counters.clear()
+        self._reports.clear()
+        self._send(directive, now_ns)
+
+    def _send(self, directive: Directive, now_ns: int) -> None:
         self._asked = (directive, now_ns + _REPEAT_NS)
         if isinstance(directive, SendFile):
             self._wanted.add(directive.name)
@@ -278,7 +283,7 @@ class FileSession:
     def transmit(self, now_ns: int) -> None:
         """Send the commands and PDUs that are due, within the rate limit. Raises FlightError."""
         if self._asked is not None and now_ns >= self._asked[1]:
-            self.ask(self._asked[0], now_ns)
+            self._send(self._asked[0], now_ns)
         self._credit += self._rate * (now_ns - self._credit_ns) * 1e-9
         self._credit = min(self._credit, max(self._rate * _BURST_S, 2.0 * LONGEST_FRAME))
         self._credit_ns = now_ns

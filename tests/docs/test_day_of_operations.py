@@ -92,4 +92,6 @@ def test_the_commands_of_the_page_operate_a_simulated_satellite(tmp_path: Path) 
     assert all("started" in text for text in shown)
     watched = [text for line, text in printed.items() if "watch" in line]
     assert watched
+    listed = next(text for line, text in printed.items() if "list-schedule" in line)
+    assert "2026-03-20T13:30:00Z point ground" in listed
     assert "Berlin" in next(text for line, text in printed.items() if "passes" in line)

@@ -196,6 +196,16 @@ def test_an_unanswered_directive_is_repeated_every_five_seconds(tmp_path: Path) 
     assert files.received_ns == 11 * S
 
 
+def test_a_late_report_on_an_earlier_directive_does_not_complete_the_next(tmp_path: Path) -> None:
+    files = session(tmp_path, terminal())
+    files.ask(SendFile("a"), 0)
+    files.ask(SendFile("b"), S)
+    files.take([(0, verification(1, Stage.COMPLETED))], 2 * S)
+    assert files.reports() == []
+    files.take([(0, verification(2, Stage.COMPLETED))], 3 * S)
+    assert [one.counter for one in files.reports()] == [2]
+
+
 def test_units_are_sent_within_the_rate(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(bytes(200_000))
     line = terminal()
