@@ -59,12 +59,6 @@ def test_an_extension_changes_few_files(name: str, most: int) -> None:
     assert 1 <= len(files_of(name)) <= most
 
 
-def test_a_device_is_read_through_its_driver_and_fails_with_a_reason() -> None:
-    printed = run([str(EXAMPLES / "device.py")], ROOT).stdout.splitlines()
-    assert printed[:2] == ["+21.5000 degree C", "-25.0625 degree C"]
-    assert "tmp102 at 0x48: no acknowledge" in printed[2]
-
-
 def test_the_star_tracker_solves_the_image_of_its_example(tmp_path: Path) -> None:
     """Alnilam, HIP 26311, V 1.69, stands near the middle of the field that the script draws."""
     script = str(EXAMPLES / "star_tracker.py")

@@ -1,0 +1,100 @@
+"""The page "Add a device" builds a driver from an empty file, and flies it by its own commands."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from flight.__main__ import main
+from flight.schema import reader
+from flight.schema.document import MODULES, ConfigError
+from tests.docs.blocks import ROOT, blocks_of
+
+PAGE = (ROOT / "docs" / "extending" / "device.md").read_text(encoding="utf-8")
+EXAMPLES = ROOT / "docs" / "examples"
+
+
+def snippet(name: str) -> str:
+    """Return what the page shows for an inclusion: a marked part of a file, or the file."""
+    path, _, part = name.partition(":")
+    text = (ROOT / "docs" / path).read_text(encoding="utf-8")
+    if not part:
+        return text
+    begin, end = (f"# --8<-- [{word}:{part}]\n" for word in ("start", "end"))
+    return text.partition(begin)[2].partition(end)[0]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder with the files as a reader writes them who has only the page."""
+    blocks = [block for block in blocks_of(PAGE) if "--8<--" in block.text]
+    shown = {language: "" for language in ("python", "yaml")}
+    for block in blocks:
+        shown[block.language] += "".join(snippet(name) for name in re.findall(r'--8<-- "(.+)"', block.text))
+    (tmp_path / "ina226.py").write_text(shown["python"], encoding="utf-8")
+    (tmp_path / "ina226.yaml").write_text(shown["yaml"], encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "ina226", raising=False)
+    return tmp_path
+
+
+def test_the_driver_of_the_page_flies_by_the_commands_of_the_page(folder: Path) -> None:
+    block = next(block for block in blocks_of(PAGE) if block.reason == "tests/docs/test_add_a_device.py")
+    first, *commands = block.commands
+    assert first == "export PYTHONPATH=."
+    for line in commands:
+        program, *words = line.split()
+        assert program == "knightcube"
+        assert main(words) == 0, line
+    with (folder / "run" / "csv" / "housekeeping.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [round(float(row["coil_voltage"]), 2) for row in rows[1:]] == [5.0] * 4
+    assert max(float(row["coil_current"]) for row in rows[1:]) > 0.01, "the coils draw current"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("averages: 64", "averages: many", r"ina226.yaml:6: `power_monitor.averages` is 'many'"),
+        ("averages: 64", "average: 64", "is an unknown key, did you mean `averages`"),
+        ("ina226:INA226", "ina226:INA227", "cannot be imported"),
+        ("ina226:INA226", "ina226:Ina226", "not a Driver"),
+    ],
+)
+def test_a_mistake_in_the_section_is_named_with_its_line(
+    folder: Path, old: str, new: str, complaint: str
+) -> None:
+    text = (folder / "ina226.yaml").read_text(encoding="utf-8").replace(old, new)
+    with pytest.raises(ConfigError, match=complaint):
+        reader.parse(text, "ina226.yaml")
+
+
+def test_a_value_that_the_device_does_not_accept_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / "ina226.yaml"
+    path.write_text(
+        path.read_text(encoding="utf-8").replace("averages: 64", "averages: 65"), encoding="utf-8"
+    )
+    assert main(["check", "ina226.yaml"]) == 2
+    assert "`power_monitor.averages` is 65: must be 1 to 1024" in capsys.readouterr().err
+
+
+def test_a_board_imports_the_driver_only_if_root_permits_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed = folder / "modules"
+    listed.write_text("", encoding="utf-8")
+    monkeypatch.setenv(MODULES, str(listed))
+    with pytest.raises(ConfigError, match="add it as a line to"):
+        reader.load(folder / "ina226.yaml")
+    assert "ina226" not in sys.modules
+    if os.getuid() == 0:
+        listed.write_text("ina226:INA226\n", encoding="utf-8")
+        assert reader.load(folder / "ina226.yaml").power_monitor is not None
