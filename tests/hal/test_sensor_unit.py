@@ -1,0 +1,181 @@
+"""Inertial units of separate sensors: starts, failures, attitude, and the SPI device of Linux."""
+
+from __future__ import annotations
+
+import errno
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flight.schema.drivers import axis_matrix
+from hal.buses import linux_wires
+from hal.buses.linux_wires import LinuxSpiDevice
+from hal.drivers.adis16470 import Adis16470
+from hal.drivers.sensor_unit import SensorPart, SensorUnit, SensorUnitSettings, level_attitude, quaternion_of
+from hal.interfaces.errors import NotResponding, Refused
+from knightcube.astro import quaternion
+from sim_hal.clock import SimClock
+from sim_hal.emulators.sensors import EmulatedAdis16470, Measurements
+from sim_hal.worlds.world import BodyMotion, about_thread
+
+SETTINGS = SensorUnitSettings(
+    mounting=np.eye(3),
+    gyro_matrix=np.eye(3),
+    field_matrix=np.eye(3),
+    field_bias=np.array([1e-5, 0.0, 0.0]),
+    rate_hz=50,
+    field_range=6e-4,
+)
+AXES = axis_matrix(("-y", "z", "x"))
+
+
+class Sensor:
+    """A sensor that counts its readings, and fails while `failing` is true."""
+
+    def __init__(self) -> None:
+        self.readings = 0
+        self.failing = False
+        self.field = (0.0, 0.0, -450.0)
+
+    @property
+    def gyro(self) -> tuple[float, float, float]:
+        if self.failing:
+            raise OSError(errno.EREMOTEIO, "no acknowledge")
+        self.readings += 1
+        return (0.1, 0.2, 0.3 + 1e-6 * self.readings)
+
+    @property
+    def magnetic(self) -> tuple[float, float, float]:
+        return self.field
+
+
+class Bench:
+    """A unit with one sensor; `starts` counts the starts of the sensor."""
+
+    def __init__(self) -> None:
+        self.clock, self.sensor, self.starts = SimClock(), Sensor(), 0
+        part = SensorPart("one", self._make, {"gyro": AXES, "magnetic": np.eye(3)})
+        self.unit = SensorUnit(self.clock, [part], SETTINGS)
+
+    def _make(self) -> Sensor:
+        self.starts += 1
+        if self.sensor.failing:
+            raise RuntimeError("Failed to find the sensor - check your wiring!")
+        return self.sensor
+
+    def wait(self, seconds: float) -> None:
+        self.clock.sleep_until_ns(self.clock.now_ns() + round(seconds * 1e9))
+
+
+def test_readings_come_at_the_rate_in_body_axes_with_the_bias_removed() -> None:
+    bench = Bench()
+    bench.unit.configure()
+    bench.wait(1.0)
+    readings = bench.unit.poll()
+    assert len(readings) == 50
+    assert bench.unit.poll() == []
+    np.testing.assert_allclose(readings[-1].rate, [-0.2, 0.3, 0.1], atol=1e-3)
+    np.testing.assert_allclose(readings[-1].field, [-1e-5, 0.0, -450e-6])
+    assert readings[-1].quaternion.tolist() == [0.0, 0.0, 0.0, 1.0], "no accelerometer, no attitude"
+    assert bench.unit.link().packets == 50
+
+
+def test_a_sensor_that_fails_is_reported_started_again_and_read_again() -> None:
+    bench = Bench()
+    bench.unit.configure()
+    bench.wait(0.1)
+    assert bench.unit.poll()
+    bench.sensor.failing = True
+    bench.wait(0.1)
+    with pytest.raises(NotResponding, match="check your wiring"):
+        bench.unit.poll()
+    bench.sensor.failing = False
+    bench.wait(0.1)
+    assert bench.unit.poll()
+    assert bench.starts > 2, "the settings are written again"
+
+
+def test_a_sensor_that_is_missing_at_the_start_is_named() -> None:
+    bench = Bench()
+    bench.sensor.failing = True
+    with pytest.raises(NotResponding, match="one: Failed to find the sensor"):
+        bench.unit.configure()
+
+
+@pytest.mark.parametrize(
+    ("field", "counter"),
+    [((0.0, np.nan, 0.0), "not_finite"), ((700.0, 0.0, 0.0), "out_of_range")],
+)
+def test_implausible_samples_are_counted_and_not_returned(
+    field: tuple[float, float, float], counter: str
+) -> None:
+    bench = Bench()
+    bench.unit.configure()
+    bench.sensor.field = field
+    bench.wait(0.2)
+    assert bench.unit.poll() == []
+    assert getattr(bench.unit.link(), counter) == 10
+    assert "magnetic" in bench.unit.link().rejection
+
+
+@pytest.mark.parametrize("angle", [-3.0, -0.4, 0.0, 0.7, 2.5])
+def test_the_attitude_on_the_thread_follows_from_gravity_and_field(angle: float) -> None:
+    motion = about_thread(0, angle, 0.0, 4.5e-4)
+    measured = level_attitude(motion.field_body, motion.specific_force_body)
+    assert abs(measured @ motion.quaternion) == pytest.approx(1.0)
+
+
+def test_the_quaternion_of_a_matrix_is_that_of_the_library() -> None:
+    for vector in np.random.default_rng(3).uniform(-3.1, 3.1, (40, 3)):
+        q = quaternion.from_rotation_vector(vector)
+        assert abs(quaternion_of(quaternion.attitude_matrix(q)) @ q) == pytest.approx(1.0)
+
+
+def test_an_adis16470_measures_negative_rates_and_averages() -> None:
+    motion = BodyMotion(0, np.zeros(4), np.array([-0.3, 0.002, 2.0]), np.zeros(3), np.array([0.0, -9.8, 3.0]))
+    clock, axes = SimClock(), {"gyro": np.eye(3)}
+    part = EmulatedAdis16470(0, Measurements(lambda _: motion, axes, np.random.default_rng(1), clock.now_ns))
+    sensor = Adis16470(part)
+    assert sensor.decimation == 24
+    sensor.decimation = 1999
+    clock.sleep_until_ns(2_000_000_000)
+    np.testing.assert_allclose(sensor.gyro, motion.rate, atol=5e-4)
+    np.testing.assert_allclose(sensor.acceleration, motion.specific_force_body, atol=5e-3)
+
+
+@pytest.mark.parametrize(("answer", "error"), [(b"\xff\xff", NotResponding), (b"\x12\x34", Refused)])
+def test_another_or_no_part_on_the_spi_bus_is_refused(answer: bytes, error: type[Exception]) -> None:
+    class Part:
+        def transfer(self, data: bytes) -> bytes:
+            return answer
+
+    with pytest.raises(error):
+        Adis16470(Part())
+
+
+def test_the_spi_device_makes_the_calls_of_the_kernels_interface(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+) -> None:
+    """The numbers and the 32 bytes of struct spi_ioc_transfer are those of linux/spi/spidev.h."""
+    device = tmp_path / "spidev0.0"
+    device.touch()
+    calls: list[tuple[int, bytes]] = []
+    record: Callable[..., int] = lambda _, request, data: calls.append((request, bytes(data))) or 0  # noqa: E731
+    monkeypatch.setattr(linux_wires.fcntl, "ioctl", record)
+    opened = LinuxSpiDevice(str(device), 1_000_000, 3)
+    assert opened.transfer(b"\x72\x00") == b"\0\0"
+    opened.close()
+    assert calls[:2] == [(0x40016B01, b"\x03"), (0x40046B04, struct.pack("=I", 1_000_000))]
+    request, data = calls[2]
+    assert (request, len(data)) == (0x40206B00, 32)
+    sent, received, length, speed, _, bits = struct.unpack_from("=QQIIHB", data)
+    assert (length, speed, bits) == (2, 1_000_000, 8)
+    assert 0 not in {sent, received}
+
+
+def test_an_spi_device_that_is_missing_is_named_with_the_cure() -> None:
+    with pytest.raises(NotResponding, match="is the SPI bus enabled"):
+        LinuxSpiDevice("/nowhere/spidev9.9", 1_000_000, 0)
