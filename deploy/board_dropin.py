@@ -15,17 +15,24 @@ import sys
 from collections.abc import Sequence
 from ipaddress import IPv4Network
 from pathlib import Path
+from typing import Any
 
-from flight.schema.devices import V4l2Device
+from flight.app.cli.check import check_values
+from flight.app.flight import placing
+from flight.schema.devices import AravisDevice
 from flight.schema.document import ConfigError, read_document, read_text
+from flight.schema.drivers import DRIVERS, driver_of
 from flight.schema.reader import LOOPBACK, load, peer_networks
 from flight.schema.sections import Config
 from hal.buses.i2c_bus import device_file
+from hal.interfaces.guardian import CoilReach
 from knightcube.errors import UsageError
 
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
 """Driver classes of serial lines, video devices and I2C buses that may be plugged in after the start of the
 service."""
+_CLASSES = {"inertial_unit": SERIAL, "gps": SERIAL, "camera": VIDEO}
+"""Driver classes by the kind of a device."""
 
 
 def dropin(config: Config) -> str:
@@ -119,22 +126,33 @@ def _text(lines: list[str]) -> str:
     return "\n".join([first, *lines]) + "\n"
 
 
+def _devices_of(config: Config) -> list[tuple[str, Any]]:
+    """Return the kind and the section of each configured device, beginning with the coils."""
+    named = [(kind, getattr(config, kind)) for kind in ("coils", *DRIVERS) if kind != "camera"]
+    named += [("camera", camera) for camera in (config.camera, *config.wide_cameras)]
+    return [(kind, section) for kind, section in named if section is not None]
+
+
 def _nodes(config: Config) -> list[tuple[str, tuple[str, ...]]]:
     """Return the files of the configured devices, each with the driver classes of such a device."""
-    nodes = [(device_file(config.coils.bus), I2C), (config.inertial_unit.device, SERIAL)]
-    camera = config.camera.device if config.camera is not None else None
-    return [*nodes, (camera.path, VIDEO)] if isinstance(camera, V4l2Device) else nodes
+    nodes: dict[str, tuple[str, ...]] = {}
+    for kind, section in _devices_of(config):
+        driver = driver_of(kind, section.device if kind == "camera" else section)
+        for file in driver.files(section):
+            nodes.setdefault(file, _CLASSES.get(kind, ()))
+    return list(nodes.items())
 
 
 def _devices(config: Config) -> list[str]:
     """Return the settings that allow access to the real devices, empty for a simulation."""
     if config.simulation is not None:
         return []
-    lines = _bus(config)
-    for path, plugged in _nodes(config)[1:]:
-        lines += allowed(path, plugged)
-    camera = config.camera.device if config.camera is not None else None
-    if camera is not None and not isinstance(camera, V4l2Device):
+    lines, (coils, _) = _bus(config), _nodes(config)[0]
+    for path, plugged in _nodes(config):
+        lines += allowed(path, plugged) if path != coils else []
+    if any(
+        isinstance(camera.device, AravisDevice) for kind, camera in _devices_of(config) if kind == "camera"
+    ):
         # Aravis accesses USB3 Vision cameras through libusb, which finds the cameras through udev.
         lines += ["DeviceAllow=char-usb_device rw", "RestrictAddressFamilies=AF_NETLINK"]
     return lines
@@ -142,9 +160,11 @@ def _devices(config: Config) -> list[str]:
 
 def _bus(config: Config) -> list[str]:
     """Return the settings that allow access to the I2C bus of the coils."""
-    i2c = device_file(config.coils.bus)
+    i2c, writes = device_file(config.coils.bus), tuple(driver_of("coils", config.coils).off(config.coils))
+    words = " ".join(CoilReach("", i2c, writes).words)
+    pwm = f"KNIGHTCUBE_PWM={words.removesuffix(' 0xfd 0x10')}"  # `coils-off` completes a PCA9685's address
     return [
-        f"Environment=KNIGHTCUBE_I2C={i2c} KNIGHTCUBE_PWM=0x{config.coils.address:02x}",
+        f"Environment=KNIGHTCUBE_I2C={i2c} {pwm if ' ' not in pwm else chr(34) + pwm + chr(34)}",
         *allowed(i2c, I2C),
     ]
 
@@ -162,7 +182,10 @@ def main(words: list[str]) -> int:
     try:
         path = Path(words[-1])
         check_single(path)
-        sys.stdout.write(make(load(path)))
+        config = load(path)
+        with placing(read_text(path), str(path)):
+            check_values(config)
+        sys.stdout.write(make(config))
     except UsageError as error:
         sys.stderr.write(f"install: {error}\n")
         return 2

@@ -10,7 +10,7 @@ usage: install.sh [--config FILE] [--wheels DIR | --venv DIR] [--python PYTHON] 
        install.sh --uninstall [--purge] [--dry-run]
 
   --config FILE   configuration to fly; stored as /etc/knightcube/flight.yaml with its
-                  checksum and never overwritten (default: config/testbed.yaml)
+                  checksum and never overwritten (default: config/board_testbed.yaml)
   --wheels DIR    install without a network, from the wheels in DIR
   --venv DIR      use this virtual environment, unchanged, instead of making one
   --python PYTHON make the virtual environment with this Python (default python3)
@@ -125,7 +125,7 @@ check_inputs() {
     fi
     [ -n "$venv" ] || "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
         fail "--python $python: Python 3.11 or newer is wanted"
-    flown=${config:-$source/config/testbed.yaml}
+    flown=${config:-$source/config/board_testbed.yaml}
     { [ -f "$flown" ] && [ -r "$flown" ]; } || fail "--config $flown: cannot be read"
     [ -e "$settings/flight.yaml" ] || return 0
     [ -z "$config" ] || cmp -s "$config" "$settings/flight.yaml" ||

@@ -42,6 +42,10 @@ from knightcube.errors import UsageError
 if TYPE_CHECKING:
     from sim_hal.rig import PosedCamera, SimulationRequest
 
+NO_CAMERA = (
+    "real devices are flown: give `{driver: v4l2, path: ...}` or `{driver: aravis, name: ...}`, or "
+    "give `camera: none`"
+)
 _BEFORE_ELEMENTS = 365.0
 """Maximum time (days) by which a GPS date may precede the epoch of the two-line elements."""
 
@@ -225,11 +229,7 @@ def open_camera(
     Raises ConfigError without a camera, and DeviceError for missing hardware unless the flight is `patient`.
     """
     if camera.device is None:
-        raise ConfigError(
-            "camera.device",
-            "real devices are flown: give `{driver: v4l2, path: ...}` or `{driver: aravis, name: ...}`, or "
-            "give `camera: none`",
-        )
+        raise ConfigError("camera.device", NO_CAMERA)
     device: CameraDevice = driver_of("camera", camera.device, "camera.device.driver").open(rig, camera)
     source = ServedCamera(device, rig.clock, patient=patient)
     stack.callback(source.close)

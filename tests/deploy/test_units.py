@@ -341,7 +341,7 @@ def test_every_udev_rule_is_of_matches_and_assignments() -> None:
     lines = [line for line in rules if line and not line.startswith("# ")]
     assert any("ef0500" in line and 'GROUP="video"' in line for line in lines), "USB3 Vision"
     assert {name for line in lines for name in re.findall(r"knightcube-\w+", line)} == {
-        "knightcube-imu", "knightcube-i2c", "knightcube-camera"
+        "knightcube-imu", "knightcube-i2c", "knightcube-camera", "knightcube-gps", "knightcube-wide"
     }  # fmt: skip
     for line in lines:
         assert all(term.fullmatch(part) for part in line.removeprefix("#").split(", ")), line

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flight.app.cli.run import counts_text, summary_facts
-from flight.app.devices import open_camera, real_rig
+from flight.app.devices import NO_CAMERA, open_camera, real_rig
 from flight.app.run import RunRequest, RunResult
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera, structure_mask
@@ -56,8 +56,6 @@ def probe(config: Config) -> list[Probed]:
 def _probed(config: Config, name: str, section: Any) -> Probed:
     """Ask one device for a sign of life, with connections of its own."""
     camera = isinstance(section, Camera | WideCamera)
-    if camera and section.device is None:
-        return Probed(name, "", False, "names no device: give `device`, or no camera")
     kind = "camera" if camera else name
     driver = driver_of(kind, section.device if camera else section)
     place = ", ".join(driver.files(section) or driver_of("coils", config.coils).files(config.coils))
@@ -127,8 +125,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def check(options: argparse.Namespace) -> int:
     """Check a configuration, print the result, and return 1 if it is not ready to fly."""
     from flight.app.cli.check import probe  # noqa: PLC0415
-    from flight.app.devices import check_settings, check_simulated_elements  # noqa: PLC0415
-    from flight.app.flight import body_kind, placing  # noqa: PLC0415
+    from flight.app.devices import check_simulated_elements  # noqa: PLC0415
+    from flight.app.flight import placing  # noqa: PLC0415
     from flight.app.service import accepted_config  # noqa: PLC0415
 
     chosen = accepted_config(options.config, os.environ)
@@ -139,9 +137,7 @@ def check(options: argparse.Namespace) -> int:
     if options.merged is not None:
         _write(options.merged, merged_text(chosen.text, str(path)))
     with placing(chosen.text, str(path)):
-        body_kind(config)
-        check_settings(config)
-        _check_position(config)
+        check_values(config)
         if config.simulation is None:
             verdict.devices = probe(config)
             verdict.problems += [f"{item.name}: missing" for item in verdict.devices if not item.found]
@@ -152,11 +148,22 @@ def check(options: argparse.Namespace) -> int:
     return 1 if verdict.problems else 0
 
 
-def _check_position(config: Config) -> None:
-    """Raise ConfigError for targets of a satellite whose position is never known.
+def check_values(config: Config) -> None:
+    """Raise ConfigError for a configuration that cannot be flown, whatever devices answer.
 
-    Every target needs the position, because plans predict the magnetic field along the orbit.
+    Among others, a satellite needs its position for every target, because plans predict the magnetic field
+    along the orbit.
     """
+    from flight.app.devices import check_settings  # noqa: PLC0415
+    from flight.app.flight import body_kind  # noqa: PLC0415
+
+    body_kind(config)
+    check_settings(config)
+    cameras: dict[str, Camera | WideCamera | None] = {"camera": config.camera}
+    cameras |= {f"wide_cameras[{number}]": camera for number, camera in enumerate(config.wide_cameras)}
+    for name, camera in cameras.items():
+        if config.simulation is None and camera is not None and camera.device is None:
+            raise ConfigError(f"{name}.device", f"is missing: {NO_CAMERA}")
     if isinstance(config, OrbitConfig) and config.gps is None and config.elements is None:
         target = config.targets[0].point
         cure = "add `gps`, or `elements`, which `knightcube elements` makes"
