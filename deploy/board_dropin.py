@@ -19,9 +19,8 @@ from typing import Any
 
 from flight.app.cli.check import check_values
 from flight.app.flight import placing
-from flight.schema.devices import AravisDevice
+from flight.schema.devices import DRIVERS, AravisDevice, driver_of
 from flight.schema.document import ConfigError, read_document, read_text
-from flight.schema.drivers import DRIVERS, driver_of
 from flight.schema.reader import LOOPBACK, load, peer_networks
 from flight.schema.sections import Config
 from hal.buses.i2c_bus import device_file

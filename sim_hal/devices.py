@@ -1,4 +1,4 @@
-"""The functions that connect our emulated devices to the emulated wires (`flight.schema.drivers`)."""
+"""The functions that connect our emulated devices to the emulated wires (`flight.schema.devices`)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flight.schema.devices import (
+    SENSOR_PARTS,
     Coils,
     Gps,
     InertialUnitSection,
@@ -17,9 +18,9 @@ from flight.schema.devices import (
     Sensor,
     SensorsSection,
     SolarStringsSection,
+    axis_matrix,
 )
 from flight.schema.document import ConfigError, imported
-from flight.schema.drivers import SENSOR_PARTS, axis_matrix
 from hal.drivers.ads1115 import StringWiring
 from hal.drivers.coils import CoilSettings, wirings
 from knightcube.astro.arrays import FloatArray

@@ -1,6 +1,6 @@
 """The far ends of the wires: emulated buses and lines by name, and what an emulator of a device is given.
 
-A driver's registration (`hal.interfaces.driver`) names the function that connects its emulated device here.
+A driver's registration (`flight.schema.devices`) names the function that connects its emulated device here.
 In lock-step the host's ends are in memory, and in real time the lines are pseudo-terminals.
 """
 
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flight.schema.devices import driver_of
 from flight.schema.document import ConfigError
-from flight.schema.drivers import driver_of
 from flight.schema.sections import Config
 from hal.buses.i2c_bus import device_file
 from hal.interfaces.errors import NotResponding

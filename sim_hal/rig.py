@@ -23,8 +23,8 @@ import numpy as np
 
 from flight.link.telemetry.log import FlightLog
 from flight.schema import reader as configuration
+from flight.schema.devices import driver_of
 from flight.schema.document import ConfigError
-from flight.schema.drivers import driver_of
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock

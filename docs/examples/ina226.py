@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from flight.schema.devices import PowerMonitorSection
+from flight.schema.devices import Driver, PowerMonitorSection
 from hal.interfaces.devices import PowerReading
-from hal.interfaces.driver import Driver
 from hal.interfaces.errors import DeviceError, OutOfRange, Refused, answering
 from hal.interfaces.wires import Clock, I2cBus, Rig
 

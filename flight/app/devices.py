@@ -7,22 +7,53 @@ a simulated flight.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from flight.app.run import RunRequest
 from flight.loop.state import state_folder
-from flight.schema.devices import Camera, WideCamera
-from flight.schema.document import ConfigError
-from flight.schema.drivers import DRIVERS, driver_of
+from flight.schema.devices import (
+    DRIVERS,
+    SENSOR_PARTS,
+    AravisDevice,
+    Camera,
+    Coils,
+    Gps,
+    InertialUnitSection,
+    PowerMonitorSection,
+    Sensor,
+    SensorsSection,
+    SolarStringsSection,
+    V4l2Device,
+    WideCamera,
+    axis_matrix,
+    driver_of,
+)
+from flight.schema.document import ConfigError, imported
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import device_file
 from hal.buses.linux_wires import LinuxWires
+from hal.drivers import ads1115, drv8830, ina219
+from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
+from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.camera import CameraDevice, ServedCamera
+from hal.drivers.coils import CoilSettings, PwmTorqueCoils, wirings
+from hal.drivers.drv8830 import Drv8830Bridges, Drv8830Coils
+from hal.drivers.ina219 import Ina219
+from hal.drivers.nmea import NmeaReceiver
+from hal.drivers.pca9685 import ALL_LED_OFF_H, FULL, MODE1, Pca9685
+from hal.drivers.sensor_unit import CircuitPythonI2c, SensorPart, SensorUnit, SensorUnitSettings
+from hal.drivers.ublox import EARLIEST_NS, UbloxReceiver
+from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
+from hal.drivers.vn100.driver import Vn100, Vn100Settings
 from hal.interfaces.devices import (
     FrameSource,
     GpsReceiver,
@@ -37,6 +68,7 @@ from hal.interfaces.wires import SECOND_NS, I2cBus, Rig
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
+from knightcube.astro.quaternion import NED_TO_TESTBED, attitude_map, attitude_matrix
 from knightcube.errors import UsageError
 
 if TYPE_CHECKING:
@@ -234,3 +266,271 @@ def open_camera(
     source = ServedCamera(device, rig.clock, patient=patient)
     stack.callback(source.close)
     return source
+
+
+# The functions of our own drivers, which their registrations name (`flight.schema.devices`).
+
+_CHIP_CURE = "check power, wiring and address; `i2cdetect -y` lists the chips that answer"
+_LISTENED_NS = 2_500_000_000
+_LOOK_NS = 20_000_000
+
+
+def unit_settings(unit: InertialUnitSection) -> Vn100Settings:
+    """Return the settings of the VN-100's driver, whose readings are in the testbed frame."""
+    mounting, known = np.array(unit.mounting), unit.calibration
+    return Vn100Settings(
+        attitude_map=attitude_map(mounting, NED_TO_TESTBED),
+        mounting=attitude_matrix(mounting),
+        gyro_matrix=np.array(known.gyro_matrix),
+        field_matrix=np.array(known.field_matrix),
+        field_bias=np.array(known.field_bias),
+        rate_hz=unit.rate_hz,
+        output=unit.output,
+        field_range=unit.field_range,
+    )
+
+
+def open_vn100(rig: Rig, unit: InertialUnitSection) -> Vn100:
+    """Return the driver of a VN-100."""
+    return Vn100(rig.wires.serial(unit.device, unit.baud_rate), rig.clock, unit_settings(unit))
+
+
+def probe_vn100(rig: Rig, unit: InertialUnitSection) -> str:
+    """Ask a VN-100 for its model number. Raises DeviceError."""
+    return f"answers: {open_vn100(rig, unit).model()}"
+
+
+def files_vn100(unit: InertialUnitSection) -> Sequence[str]:
+    """Return the serial device."""
+    return (unit.device,)
+
+
+def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
+    """Return the driver of an inertial unit of separate sensors. Raises ConfigError for an unknown sensor."""
+    parts, measured = [], set[str]()
+    for number, sensor in enumerate(unit.sensors):
+        key = f"inertial_unit.sensors[{number}]"
+        part = imported(f"{key}.part", sensor.part, SENSOR_PARTS, os.environ)
+        if (sensor.spi is not None) != hasattr(part, "SPEED_HZ"):
+            problem = (
+                "goes with a sensor on an SPI bus" if sensor.spi else "is missing: this is an SPI device"
+            )
+            raise ConfigError(f"{key}.spi", problem)
+        axes: dict[str, FloatArray] = {
+            quantity: axis_matrix(names) for quantity, names in sensor.measures.items()
+        }
+        parts.append(SensorPart(sensor.part, partial(_started, part, rig, sensor), axes))
+        measured |= set(axes)
+    if missing := {"gyro", "magnetic"} - measured:
+        raise ConfigError("inertial_unit.sensors", f"measure no {' and no '.join(sorted(missing))}")
+    known = unit.calibration
+    settings = SensorUnitSettings(
+        mounting=attitude_matrix(np.array(unit.mounting)),
+        gyro_matrix=np.array(known.gyro_matrix),
+        field_matrix=np.array(known.field_matrix),
+        field_bias=np.array(known.field_bias),
+        rate_hz=unit.rate_hz,
+        field_range=unit.field_range,
+    )
+    return SensorUnit(rig.clock, parts, settings)
+
+
+def _started(part: Callable[..., Any], rig: Rig, sensor: Sensor) -> Any:
+    """Start a sensor, and return its driver."""
+    if sensor.spi is not None:
+        kind: Any = part
+        driver = part(rig.wires.spi(sensor.spi, kind.SPEED_HZ, kind.MODE))
+    else:
+        given = {} if sensor.address is None else {"address": sensor.address}
+        driver = part(CircuitPythonI2c(rig.wires.i2c(sensor.bus)), **given)
+    for name, value in (sensor.set or {}).items():
+        setattr(driver, name, value)
+    return driver
+
+
+def probe_sensors(rig: Rig, unit: SensorsSection) -> str:
+    """Start all sensors, which writes their settings. Raises NotResponding."""
+    opened = open_sensors(rig, unit)
+    try:
+        opened.configure()
+    finally:
+        opened.close()
+    return f"{', '.join(sensor.part for sensor in unit.sensors)}: each answers"
+
+
+def files_sensors(unit: SensorsSection) -> Sequence[str]:
+    """Return the SPI devices, and the I2C buses other than that of the coils."""
+    buses = [device_file(sensor.bus) for sensor in unit.sensors if sensor.bus is not None]
+    return list(dict.fromkeys([*buses, *(sensor.spi for sensor in unit.sensors if sensor.spi)]))
+
+
+def coil_settings(coils: Coils) -> CoilSettings:
+    """Return the settings of the coil driver."""
+    wired = wirings(coils.channels, coils.resistance, coils.signs, coils.limits)
+    return CoilSettings(wired, coils.supply_voltage, max(coils.limits), coils.stale_after)
+
+
+def open_pca9685(rig: Rig, coils: Coils) -> TorqueCoils:
+    """Return the driver of coils on a PCA9685."""
+    pca = Pca9685(rig.wires.i2c(coils.bus), coils.address, rig.clock)
+    return PwmTorqueCoils(pca, rig.clock, coil_settings(coils))
+
+
+def probe_pca9685(rig: Rig, coils: Coils) -> str:
+    """Read a register of the PWM chip. Raises NotResponding."""
+    return _read_chips(rig, coils.bus, MODE1, coils.address)
+
+
+def files_pca9685(coils: Coils) -> Sequence[str]:
+    """Return the I2C bus."""
+    return (device_file(coils.bus),)
+
+
+def off_pca9685(coils: Coils) -> Sequence[tuple[int, int, int]]:
+    """Return the write that switches all outputs off."""
+    return ((coils.address, ALL_LED_OFF_H, FULL),)
+
+
+def open_drv8830(rig: Rig, coils: Coils) -> TorqueCoils:
+    """Return the driver of coils on DRV8830 bridges."""
+    settings = coil_settings(coils)
+    bridges = Drv8830Bridges(rig.wires.i2c(coils.bus), coils.address, rig.clock, settings)
+    return Drv8830Coils(bridges, rig.clock, settings)
+
+
+def probe_drv8830(rig: Rig, coils: Coils) -> str:
+    """Read a register of each bridge. Raises NotResponding."""
+    return _read_chips(rig, coils.bus, drv8830.CONTROL, *_bridges(coils))
+
+
+def off_drv8830(coils: Coils) -> Sequence[tuple[int, int, int]]:
+    """Return the writes that switch all bridges off."""
+    return tuple((address, drv8830.CONTROL, drv8830.OFF) for address in _bridges(coils))
+
+
+def _bridges(coils: Coils) -> range:
+    return range(coils.address, coils.address + len(coils.slots))
+
+
+files_drv8830: Callable[[Coils], Sequence[str]] = files_pca9685
+
+
+def open_ina219(rig: Rig, monitor: PowerMonitorSection) -> Ina219:
+    """Return the driver of an INA219."""
+    return Ina219(rig.wires.i2c(monitor.bus), monitor.address, rig.clock, monitor.shunt)
+
+
+def probe_ina219(rig: Rig, monitor: PowerMonitorSection) -> str:
+    """Read a register of the current monitor. Raises NotResponding."""
+    return _read_chips(rig, monitor.bus, ina219.CONFIG, monitor.address)
+
+
+def files_ina219(monitor: PowerMonitorSection) -> Sequence[str]:
+    """Return the I2C bus, if it is not the bus of the coils."""
+    return () if monitor.bus is None else (device_file(monitor.bus),)
+
+
+def open_ublox(rig: Rig, gps: Gps) -> GpsReceiver:
+    """Return the driver of a u-blox receiver, which configures the receiver at its first reading."""
+    earliest_ns = max(EARLIEST_NS, rig.earliest_utc_ns)
+    port = rig.wires.serial(gps.device, gps.baud_rate)
+    return UbloxReceiver(port, rig.clock, round(gps.period * SECOND_NS), earliest_ns)
+
+
+def probe_ublox(rig: Rig, gps: Gps) -> str:
+    """Wait for bytes of the GPS receiver, which sends without a request at least once a second."""
+    port, deadline_ns = rig.wires.serial(gps.device, gps.baud_rate), rig.clock.now_ns() + _LISTENED_NS
+    while rig.clock.now_ns() < deadline_ns:
+        if port.receive():
+            return "sends"
+        rig.clock.sleep_until_ns(rig.clock.now_ns() + _LOOK_NS)
+    silence = f"opens, but no byte arrived in {_LISTENED_NS * 1e-9:g} s"
+    raise NotResponding(gps.device, f"{silence}: check power, the cable and the baud rate")
+
+
+def files_ublox(gps: Gps) -> Sequence[str]:
+    """Return the serial device."""
+    return (gps.device,)
+
+
+def open_nmea(rig: Rig, gps: Gps) -> GpsReceiver:
+    """Return the driver of a receiver that sends NMEA 0183 sentences by itself."""
+    port = rig.wires.serial(gps.device, gps.baud_rate)
+    return NmeaReceiver(port, rig.clock, max(EARLIEST_NS, rig.earliest_utc_ns))
+
+
+probe_nmea: Callable[[Rig, Gps], str] = probe_ublox
+files_nmea: Callable[[Gps], Sequence[str]] = files_ublox
+
+
+def open_ads1115(rig: Rig, section: SolarStringsSection) -> AdsSolarStrings:
+    """Return the driver of the converters of the solar cells."""
+    wired = [StringWiring(one.address, one.channel, one.volt_per_ampere) for one in section.strings]
+    bus = rig.wires.i2c(section.bus)
+    return AdsSolarStrings(bus, rig.clock, wired, round(section.period * SECOND_NS))
+
+
+def probe_ads1115(rig: Rig, section: SolarStringsSection) -> str:
+    """Read a register of each converter. Raises NotResponding."""
+    addresses = sorted({string.address for string in section.strings})
+    return _read_chips(rig, section.bus, ads1115.CONFIG, *addresses)
+
+
+def files_ads1115(section: SolarStringsSection) -> Sequence[str]:
+    """Return the I2C bus, if it is not the bus of the coils."""
+    return () if section.bus is None else (device_file(section.bus),)
+
+
+def open_v4l2(rig: Rig, camera: Camera | WideCamera) -> V4l2Camera:
+    """Return the driver of a Video for Linux camera."""
+    device = camera.device
+    assert isinstance(device, V4l2Device)
+    settings = V4l2Settings(
+        device.path,
+        camera.columns,
+        camera.rows,
+        device.pixel_format,
+        round(camera.exposure * SECOND_NS),
+        device.gain,
+        Stamp(device.stamp),
+        round(device.stamp_delay * SECOND_NS),
+    )
+    return V4l2Camera(settings, rig.clock)
+
+
+def open_aravis(rig: Rig, camera: Camera | WideCamera) -> AravisCamera:
+    """Return the driver of a GenICam camera."""
+    device = camera.device
+    assert isinstance(device, AravisDevice)
+    shape, exposure_ns = (camera.columns, camera.rows), round(camera.exposure * SECOND_NS)
+    return AravisCamera(
+        AravisSettings(device.name, *shape, device.pixel_format, exposure_ns, device.gain), rig.clock
+    )
+
+
+def probe_v4l2(rig: Rig, camera: Camera | WideCamera) -> str:
+    """Return the text about a camera that `flight.app.devices.open_camera` has opened."""
+    return "opens; `knightcube camera` shows its images"
+
+
+probe_aravis = probe_v4l2
+
+
+def files_v4l2(camera: Camera | WideCamera) -> Sequence[str]:
+    """Return the video device."""
+    return (camera.device.path,) if isinstance(camera.device, V4l2Device) else ()
+
+
+files_aravis: Callable[[Camera | WideCamera], Sequence[str]] = files_v4l2
+
+
+def _read_chips(rig: Rig, bus: int | str | None, register: int, *addresses: int) -> str:
+    """Read a register of each chip on an I2C bus. Raises NotResponding with the cure."""
+    opened = rig.wires.i2c(bus)
+    for address in addresses:
+        try:
+            opened.read_i2c_block_data(address, register, 2)
+        except OSError as error:
+            raise NotResponding(f"0x{address:02x}", f"{error.strerror}: {_CHIP_CURE}") from error
+    named = ", ".join(f"0x{address:02x}" for address in addresses)
+    return f"{named} answer{'s' if len(addresses) == 1 else ''}"

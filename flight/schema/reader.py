@@ -22,9 +22,9 @@ from flight.schema.devices import (
     SolarStringsSection,
     V4l2Device,
     structure_mask,
+    with_drivers,
 )
 from flight.schema.document import ConfigError, Document, convert, read_document, read_text
-from flight.schema.drivers import with_drivers
 from flight.schema.orbit import Craft, ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed

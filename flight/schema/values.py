@@ -51,7 +51,7 @@ HostPort = Annotated[
 Sign = Literal[-1, 1]
 SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 DriverName = Annotated[str, Meta(min_length=1, max_length=200)]
-"""Name of a driver in `flight.schema.drivers`, or `module:object`."""
+"""Name of a driver in `flight.schema.devices`, or `module:object`."""
 Channel = Annotated[int, Meta(ge=0, le=15)]
 BaudRate = Literal[9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600]
 Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from flight.schema.devices import Camera
+from flight.schema.devices import Camera, Driver
 from flight.schema.values import Section
 from hal.drivers.camera import CameraCounts
 from hal.interfaces.devices import Frame
-from hal.interfaces.driver import Driver
 from hal.interfaces.wires import Clock, Rig
 
 
@@ -51,8 +52,8 @@ class FlatCamera:
 
 
 def open_flat(rig: Rig, camera: Camera) -> FlatCamera:
-    assert isinstance(camera.device, FlatSection)
-    return FlatCamera(rig.clock, (camera.rows, camera.columns), camera.device.level)
+    device: Any = camera.device
+    return FlatCamera(rig.clock, (camera.rows, camera.columns), device.level)
 
 
 FLAT = Driver("camera", FlatSection, open_flat, lambda rig, camera: "opens")

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import errno
 import struct
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flight.schema.drivers import axis_matrix
-from hal.buses import linux_wires
+from flight.schema.devices import axis_matrix
 from hal.buses.linux_wires import LinuxSpiDevice
 from hal.drivers.adis16470 import Adis16470
 from hal.drivers.sensor_unit import SensorPart, SensorUnit, SensorUnitSettings, level_attitude, quaternion_of
@@ -163,8 +161,12 @@ def test_the_spi_device_makes_the_calls_of_the_kernels_interface(
     device = tmp_path / "spidev0.0"
     device.touch()
     calls: list[tuple[int, bytes]] = []
-    record: Callable[..., int] = lambda _, request, data: calls.append((request, bytes(data))) or 0  # noqa: E731
-    monkeypatch.setattr(linux_wires.fcntl, "ioctl", record)
+
+    def record(_: int, request: int, data: bytes) -> int:
+        calls.append((request, bytes(data)))
+        return 0
+
+    monkeypatch.setattr("hal.buses.linux_wires.fcntl.ioctl", record)
     opened = LinuxSpiDevice(str(device), 1_000_000, 3)
     assert opened.transfer(b"\x72\x00") == b"\0\0"
     opened.close()

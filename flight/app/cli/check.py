@@ -23,9 +23,8 @@ from flight.app.cli.run import counts_text, summary_facts
 from flight.app.devices import NO_CAMERA, open_camera, real_rig
 from flight.app.run import RunRequest, RunResult
 from flight.schema import reader as configuration
-from flight.schema.devices import Camera, WideCamera, structure_mask
+from flight.schema.devices import DRIVERS, Camera, WideCamera, driver_of, structure_mask
 from flight.schema.document import ConfigError, config_path, merged_text, names, read_document
-from flight.schema.drivers import DRIVERS, driver_of
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 
-from flight.app.drivers import coil_settings, unit_settings
+from flight.app.devices import coil_settings, unit_settings
 from flight.app.flight import workers
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError

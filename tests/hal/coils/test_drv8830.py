@@ -7,6 +7,7 @@ import pytest
 
 from hal.drivers.coils import CoilSettings, wirings
 from hal.drivers.drv8830 import Drv8830Bridges, Drv8830Coils, control_of, volts_of
+from knightcube.astro.arrays import FloatArray
 from sim_hal.clock import SimClock
 from sim_hal.emulators.drv8830 import BridgeCircuit
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
@@ -27,7 +28,7 @@ class Bench:
         self.coils = Drv8830Coils(bridges, self.clock, SETTINGS)
         self.coils.start()
 
-    def mean(self, currents: list[float], seconds: float = 1.0) -> np.ndarray:
+    def mean(self, currents: list[float], seconds: float = 1.0) -> FloatArray:
         """Return the mean coil currents while a command is repeated at 40 Hz."""
         seen = []
         for step in range(round(seconds * 1000)):
@@ -35,7 +36,7 @@ class Bench:
                 self.coils.command(np.array(currents))
             self.clock.sleep_until_ns(self.clock.now_ns() + 1_000_000)
             seen.append(self.circuit.currents().copy())
-        return np.mean(seen, axis=0)
+        return np.asarray(np.mean(seen, axis=0))
 
 
 @pytest.mark.parametrize("currents", [[0.148, -0.148, 0.0], [0.004, -0.0115, 0.02], [0.1, 0.05, -0.0333]])

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flight.app.drivers import coil_settings, unit_settings
+from flight.app.devices import coil_settings, unit_settings
 from flight.app.flight import next_whole_second
 from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import ResponseSettings

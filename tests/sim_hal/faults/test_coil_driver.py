@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.app.drivers import coil_settings
+from flight.app.devices import coil_settings
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.pca9685 import Pca9685
 from sim_hal.clock import SimClock
