@@ -80,7 +80,8 @@ def sun_elevation(view: LimbView, rays: FloatArray, sun: FloatArray) -> FloatArr
 def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agreement:
     """Return how well an assumed view of the Earth agrees with samples of an image.
 
-    If the Sun's direction is unknown, only samples in the sky are compared.
+    If the Sun's direction is unknown, only samples in the sky outside a possible glare of the Sun are
+    compared.
     """
     rays, bright = samples.rays, samples.bright
     outside = limb_residuals(view, rays)
@@ -91,9 +92,30 @@ def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agree
         away = rays @ (view.rotation @ sun) < np.cos(GLARE)
         dark = away & (dark | ((outside < 0.0) & (elevation < -_TWILIGHT)))
         lit = (outside < -0.01) & (elevation > DAYLIGHT)
+    else:
+        dark &= _away_from_glare(rays, bright & dark)
     darks, lits = int(np.count_nonzero(dark)), int(np.count_nonzero(lit))
     stray = float(np.count_nonzero(bright & dark)) / max(darks, 1)
     return Agreement(stray, float(np.count_nonzero(lit & ~bright)) / max(lits, 1), darks, lits)
+
+
+_LEAST_GLARE, _IN_GLARE = 4, 0.8
+"""Minimum number and fraction of the bright samples in the sky that lie in the glare of an unknown Sun."""
+
+
+def _away_from_glare(rays: FloatArray, bright: BoolArray) -> BoolArray:
+    """Return which rays (n, 3) are outside the glare of a Sun whose direction is unknown.
+
+    The Sun is assumed at the mean of the samples in the sky that are `bright` (n,), if most of these samples
+    are within its glare.
+    """
+    count = np.count_nonzero(bright)
+    if count < _LEAST_GLARE:
+        return np.ones(len(rays), dtype=bool)
+    middle = rays[bright].sum(axis=0)
+    away: BoolArray = rays @ (middle / np.linalg.norm(middle)) < np.cos(GLARE)
+    compact = np.count_nonzero(bright & ~away) > _IN_GLARE * count
+    return away if compact else np.ones(len(rays), dtype=bool)
 
 
 _LEAST_SKY = 8

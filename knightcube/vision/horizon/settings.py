@@ -177,7 +177,7 @@ class HorizonSettings:
     some_edges: int = 4
     candidates: int = 4
     tries: int = 400
-    sphere_sigma: float = math.radians(0.1)
+    sphere_sigma: float = math.radians(0.08)
 
     def __post_init__(self) -> None:
         low, high = self.altitudes

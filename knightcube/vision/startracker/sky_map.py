@@ -51,6 +51,8 @@ BENDS, ASPECT = 8, 6
 # Standard deviation of the tilt of a typical lens, relative to the corner's tangent (20 px of 1024 px).
 # Standard deviations of a typical lens's two distortion terms at the image corner (3 % and 1 %).
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
+_DECENTRING = 0.004
+"""Prior standard deviation of a corner's displacement by decentring, relative to the corner's distance."""
 _ASPECT = 0.01
 """Prior standard deviation of aspect and shear; 0.01 changes the ratio of width to height by 2 %."""
 
@@ -62,7 +64,7 @@ def usual_bend(camera: CameraModel) -> FloatArray:
     """Return the reciprocal prior variances (8,) of the lens errors of a typical uncalibrated lens."""
     corner = float(np.tan(camera.half_diagonal))
     first, second = _DISTORTION
-    off = [_TILT * corner] * 2 + [_TILT * first / corner] * 2
+    off = [_TILT * corner] * 2 + [_DECENTRING / corner] * 2
     return np.array([*off, first / corner**2, second / corner**4, _ASPECT, _ASPECT]) ** -2.0
 
 

@@ -47,6 +47,7 @@ from tests.studies.campaigns.streaks import STREAKS, STREAKS_THESIS
 from tests.studies.campaigns.structured_limbs import STRUCTURED_LIMBS
 from tests.studies.campaigns.unknown_body import UNKNOWN_BODY
 from tests.studies.campaigns.unlike_inertia import UNLIKE_INERTIA
+from tests.studies.campaigns.warped_photographs import WARPED_PHOTOGRAPHS
 from tests.studies.campaigns.worlds import WORLD_COMPARISON
 
 CAMPAIGNS: dict[str, Campaign] = {
@@ -66,6 +67,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         OBJECT_PASSES,
         OBJECT_FLIGHTS,
         LOST_IN_SPACE,
+        WARPED_PHOTOGRAPHS,
         NADIR,
         FALSE_HORIZONS,
         STRUCTURED_LIMBS,

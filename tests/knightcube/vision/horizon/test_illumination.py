@@ -179,6 +179,23 @@ def test_the_surroundings_of_the_sun_are_not_compared(apart_deg: float, count: i
     assert agreement(view, None, _samples(at(2.0), True)).dark_samples == 1
 
 
+@pytest.mark.parametrize(("spread_deg", "stray"), [(6.0, False), (60.0, True)])
+def test_the_glare_of_an_unknown_sun_is_not_stray_light_but_scattered_samples_are(
+    spread_deg: float, stray: bool
+) -> None:
+    """Twelve bright samples in a dark sky of 400 samples lie close together or far apart."""
+    view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
+    draw = np.random.default_rng(4)
+    sky = normalise(at(2.2) + 0.8 * draw.standard_normal((400, 3)))
+    sky = sky[np.arccos(sky @ DOWN) > 1.5]
+    near = np.argsort(-(sky @ at(2.2)[0]))
+    apart = np.arccos(np.clip(sky[near] @ at(2.2)[0], -1.0, 1.0))
+    chosen = near[apart > math.radians(0.5 * spread_deg) if stray else apart >= 0.0][:12]
+    bright = np.isin(np.arange(len(sky)), chosen)
+    samples = Samples(sky, bright, bright.astype(float), np.zeros(len(sky)), 0.0, 0.0)
+    assert (agreement(view, None, samples).stray > 0.02) is stray
+
+
 def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> None:
     """In 800 evenly spread directions with the Sun overhead, the ground is bright and the sky is dark."""
     number = np.arange(800) + 0.5
