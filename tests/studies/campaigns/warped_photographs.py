@@ -49,7 +49,8 @@ def warped(pixels: Image, stretch: float, shear: float, tangential: tuple[float,
     right = max(stretch, 0.0) * u + shear * v + p2 * (3.0 * u * u + v * v) + 2.0 * p1 * u * v
     down = max(-stretch, 0.0) * v + shear * u + p1 * (3.0 * v * v + u * u) + 2.0 * p2 * u * v
     places = [y + half * down, x + half * right]
-    return map_coordinates(pixels.astype(float), places, order=1, mode="nearest").astype(pixels.dtype)
+    moved = map_coordinates(pixels.astype(float), places, order=1, mode="nearest")
+    return np.asarray(moved.astype(pixels.dtype))
 
 
 @lru_cache(maxsize=2)
