@@ -111,6 +111,7 @@ def test_the_claimed_error_of_the_times_grows_with_the_age_of_the_elements() -> 
 
 def test_stations_are_read_from_text_and_file(tmp_path: Path) -> None:
     assert station_of("Berlin,52.5,13.4,40") == BERLIN
+    assert station_of(BERLIN.text) == BERLIN
     file = tmp_path / "stations.yaml"
     file.write_text("stations:\n  - {name: Berlin, latitude_deg: 52.5, longitude_deg: 13.4, height: 40}\n")
     assert read_stations(file) == (BERLIN,)

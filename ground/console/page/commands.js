@@ -2,6 +2,7 @@
 import { shownUnit } from "/page/values.js";
 
 const CHECK_MS = 250;
+const PAST = "The page shows the past: press live to send commands.";
 const LAST_OF_FLIGHT = 0x21f; // APID; the link process obeys the commands above
 
 export async function ask(path, body) {
@@ -99,7 +100,12 @@ export class Commander {
     this.place.replaceChildren(...this.shown.map(({ label }) => label));
     for (const input of this.shown) if (values[input.one.field] !== undefined) input.element.value = values[input.one.field];
     this.arrange();
-    say(this.answer, command.meaning + (command.hazard ? `. Hazard: ${command.hazard}.` : "."));
+    this.describe();
+  }
+
+  describe() {
+    const { meaning, hazard } = this.commands.get(this.which.value);
+    say(this.answer, meaning + (hazard ? `. Hazard: ${hazard}.` : "."));
   }
 
   // Shows the inputs that belong to the chosen states, such as latitude and longitude of a ground target.
@@ -148,6 +154,7 @@ export class Commander {
 
   // Sends a command of another form after confirmation.
   async send(name, values, place) {
+    if (!this.live) { say(place, PAST, "error"); return; }
     const body = this.body(name, values);
     const checked = await ask("/api/words", body);
     if (checked.error) say(place, checked.error, "error"); else this.confirm(this.commands.get(name), { body, words: checked.words }, place);
@@ -174,7 +181,7 @@ export class Commander {
     if (!this.possible || state.live === this.live) return;
     this.live = state.live;
     for (const element of this.form.elements) element.disabled = !state.live;
-    if (!state.live) say(this.answer, "The page shows the past: press live to send commands."); else this.choose(this.which.value);
+    if (!state.live) say(this.answer, PAST); else this.describe();
   }
 }
 

@@ -103,6 +103,7 @@ export class Files {
 
   put() {
     const file = this.form.file.files[0];
+    if (!this.commander.live) { say(this.status, "The page shows the past: press live to put a file.", "error"); return; }
     if (!file) { say(this.status, "choose a file first", "error"); return; }
     const query = new URLSearchParams({ kind: this.form.kind.value, name: file.name });
     this.during(`putting ${file.name} ...`, () => answerOf(fetch(`/api/file?${query}`, { method: "POST", body: file })), ({ name, bytes, sha256 }) => {

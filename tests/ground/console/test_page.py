@@ -356,6 +356,7 @@ def test_keys_step_pause_and_focus_and_a_speed_does_not_start_a_paused_replay(sa
     page.evaluate("location.hash = '#at=2'")
     satellite.wait("document.getElementById('light').textContent === 'replay, paused'")
     assert page.is_disabled("#send-form"), "the past cannot be commanded"
+    assert page.is_disabled("#parameters-panel [name=dump]")
     page.select_option("#speed", "5")
     page.wait_for_timeout(500)
     assert page.evaluate("document.body.dataset.time") == "2"
