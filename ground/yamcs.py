@@ -14,7 +14,10 @@ to Yamcs.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import secrets
+import shutil
+import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,7 +29,7 @@ from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES
 from ground.link.gateway import ADDRESS, token_path
 from ground.link.terminal import DEFAULTS, FRAME_OVERHEAD_BYTES
 from ground.xtce import EPOCH, SPACE, document
-from knightcube.errors import UsageError
+from knightcube.errors import FlightError, UsageError
 
 INSTANCE = SPACE.lower()
 HTTP_PORT = 8090
@@ -255,6 +258,43 @@ def write(
             (folder / name).mkdir(exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written: {error.strerror or error}") from error
+
+
+_BUNDLE = "fprime_yamcs_bundle"
+
+
+def missing() -> str:
+    """Return what this machine lacks to run Yamcs, or an empty text."""
+    if shutil.which("java") is None:
+        return "there is no Java: apt-get install default-jre-headless"
+    if importlib.util.find_spec(_BUNDLE) is None:
+        return "there is no Yamcs: pip install 'knightcube-flight[interop]'"
+    return ""
+
+
+def class_path() -> str:
+    """Return the class path of the archives in the bundle."""
+    found = importlib.util.find_spec(_BUNDLE)
+    assert found is not None
+    assert found.submodule_search_locations
+    return str(Path(found.submodule_search_locations[0]) / "lib" / "*")
+
+
+def compile_link(folder: Path) -> None:
+    """Compile the data link of the configuration in a folder. Raises FlightError with the compiler's text."""
+    compiler = ["java", "-cp", class_path(), "-m", "jdk.compiler/com.sun.tools.javac.Main", "-proc:none"]
+    command = [*compiler, "-d", str(folder), str(folder / LINK_SOURCE)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise FlightError(f"the data link cannot be compiled:\n{done.stdout}{done.stderr}")
+
+
+def command_line(folder: Path) -> list[str]:
+    """Return the command that starts Yamcs with the configuration in a folder."""
+    places = ["--etc-dir", str(folder / "etc"), "--data-dir", str(folder / "data")]
+    flags = ["-Djava.awt.headless=true", "-Djava.net.preferIPv4Stack=true", "-XX:TieredStopAtLevel=1"]
+    java = ["java", *flags, "-cp", f"{class_path()}:{folder}"]
+    return [*java, "org.yamcs.YamcsServer", *places, "--no-color"]
 
 
 def main() -> None:

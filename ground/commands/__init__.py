@@ -15,6 +15,11 @@ COMMANDS = {
         "relay plain packets between a ground station and the link",
         "station:configure_gateway",
     ),
+    "mission-control": (
+        "operate",
+        "run the mission control system Yamcs for a satellite",
+        "mission_control:configure",
+    ),
     "watch": ("operate", "show a flight in the terminal, in progress or finished", "station:configure_watch"),
     "console": (
         "operate",

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import importlib.util
 import json
 import re
-import shutil
 import subprocess
 import time
 import urllib.error
@@ -19,46 +17,14 @@ from typing import Any
 from urllib.parse import quote
 
 from ground.xtce import SPACE
-from ground.yamcs import INSTANCE, LINK_SOURCE, USER, USERS
+from ground.yamcs import INSTANCE, USER, USERS, command_line, compile_link, missing
 
-_BUNDLE = "fprime_yamcs_bundle"
+__all__ = ["Yamcs", "basic", "credentials", "missing", "serving", "troubles"]
+
 _START_S = 120.0
 _END_S = 30.0
 _LONGEST_S = 300.0
 _TROUBLE = ("WARNING", "SEVERE", "Exception")
-
-
-def missing() -> str:
-    """Return what this machine lacks to run Yamcs, empty when nothing."""
-    if shutil.which("java") is None:
-        return "there is no Java: apt-get install default-jre-headless"
-    if importlib.util.find_spec(_BUNDLE) is None:
-        return "there is no Yamcs: pip install 'knightcube-flight[interop]'"
-    return ""
-
-
-def jars() -> Path:
-    """Return what stands for all archives of the bundle on a class path."""
-    found = importlib.util.find_spec(_BUNDLE)
-    assert found is not None
-    assert found.submodule_search_locations
-    return Path(found.submodule_search_locations[0]) / "lib" / "*"
-
-
-def compile_link(folder: Path) -> None:
-    """Compile the data link of a configuration. Raises RuntimeError with the compiler's words."""
-    compiler = ["java", "-cp", str(jars()), "-m", "jdk.compiler/com.sun.tools.javac.Main", "-proc:none"]
-    command = [*compiler, "-d", str(folder), str(folder / LINK_SOURCE)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise RuntimeError(f"the data link cannot be compiled:\n{done.stdout}{done.stderr}")
-
-
-def words(folder: Path) -> list[str]:
-    """Return the command that starts Yamcs on the configuration in a folder."""
-    places = ["--etc-dir", str(folder / "etc"), "--data-dir", str(folder / "data")]
-    flags = ["-Djava.awt.headless=true", "-Djava.net.preferIPv4Stack=true", "-XX:TieredStopAtLevel=1"]
-    return ["java", *flags, "-cp", f"{jars()}:{folder}", "org.yamcs.YamcsServer", *places, "--no-color"]
 
 
 def troubles(log: str) -> list[str]:
@@ -72,9 +38,9 @@ def serving(folder: Path, http_port: int) -> Iterator[Yamcs]:
     log = folder / "log"
     compile_link(folder)
     with log.open("w") as out:
-        process = subprocess.Popen(words(folder), stdout=out, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(command_line(folder), stdout=out, stderr=subprocess.STDOUT)
     try:
-        server = Yamcs(f"http://127.0.0.1:{http_port}/api", process, log, _credentials(folder))
+        server = Yamcs(f"http://127.0.0.1:{http_port}/api", process, log, credentials(folder))
         server.wait()
         yield server
     finally:
@@ -91,7 +57,8 @@ def basic(password: str) -> str:
     return "Basic " + base64.b64encode(f"{USER}:{password}".encode()).decode()
 
 
-def _credentials(folder: Path) -> str:
+def credentials(folder: Path) -> str:
+    """Return the header with the password in the configuration of a folder."""
     found = re.search(r'password: "(\w+)"', (folder / USERS).read_text(encoding="utf-8"))
     assert found is not None
     return basic(found[1])

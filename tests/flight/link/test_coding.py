@@ -27,7 +27,7 @@ from flight.link.coding import (
     randomised,
 )
 from flight.link.frames import SYNC, TelecommandHeader, close_frame
-from tests.support.yamcs_server import jars, missing
+from ground.yamcs import class_path, missing
 
 DEPTHS = (1, 2, 3, 4, 5)
 
@@ -208,7 +208,7 @@ def test_yamcs_makes_the_same_cltus_and_random_sequence(tmp_path: Path, length: 
     frame, source = telecommand(length, 5), tmp_path / "Probe.java"
     source.write_text(_PROBE, encoding="utf-8")
     told = subprocess.run(
-        ["java", "-cp", jars(), str(source), frame.hex()], capture_output=True, text=True, check=True
+        ["java", "-cp", class_path(), str(source), frame.hex()], capture_output=True, text=True, check=True
     ).stdout.split()
     cltus = [CommandCode(kind).encode(frame) for kind in ("plain", "randomised")]
     assert told == [one.hex() for one in (*cltus, randomised(frame, "short"))]

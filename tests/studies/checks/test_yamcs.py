@@ -6,17 +6,21 @@
 from __future__ import annotations
 
 import json
+import socket
+import time
 import urllib.error
 import urllib.request
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from ground.xtce import SPACE
 from ground.yamcs import INSTANCE, USER, files, main, write
+from tests.flight.app.cli.linked_board import free_ports, write_linked_config
 from tests.studies.interop.yamcs import PLANS, fly
-from tests.support.linked_flight import free_port
-from tests.support.yamcs_server import basic, missing, serving
+from tests.support.linked_flight import free_port, service
+from tests.support.yamcs_server import Yamcs, basic, credentials, missing, serving
 
 
 def test_the_command_writes_the_whole_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,6 +62,29 @@ def test_yamcs_does_not_obey_a_web_page_that_has_no_password(tmp_path: Path) -> 
                 error.close()
                 found.append(error.code)
     assert found == [401, 401, 200]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(missing()), reason=missing() or "-")
+def test_mission_control_commands_the_satellite_of_a_configuration(tmp_path: Path) -> None:
+    (udp,), http = free_ports([socket.SOCK_DGRAM]), free_port()
+    config, out = write_linked_config(tmp_path, udp=f"127.0.0.1:{udp}"), tmp_path / "out"
+    words = ["mission-control", config, "--keys", tmp_path / "keys" / "ground", "--out", out, "--port", http]
+    with ExitStack() as stack:
+        link = ("link", config, "--log", tmp_path / "runs")
+        stack.enter_context(service(tmp_path / "link.log", "link open", *link))
+        process = stack.enter_context(service(tmp_path / "said", "Yamcs on", *words))
+        server = Yamcs(f"http://127.0.0.1:{http}/api", process, out / "log", credentials(out))
+        server.wait()
+        until = time.monotonic() + 60.0
+        while not server.link_up() and time.monotonic() < until:
+            time.sleep(0.2)
+        identifier = server.command("list-schedule", {})
+        while "CommandComplete_Status" not in (history := server.history(identifier)):
+            assert time.monotonic() < until + 60.0, history
+            time.sleep(0.2)
+    assert history["CommandComplete_Status"] == "OK"
+    assert "connection closed" not in (tmp_path / "said").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

@@ -1,0 +1,94 @@
+"""The command `knightcube mission-control`, which runs Yamcs and the gateway for one satellite."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+from flight.app.service import EndingSignals
+from flight.schema.document import config_path
+from flight.schema.reader import load
+from ground.commands.options import count
+from ground.link.commanding import terminal_of
+from ground.link.gateway import Gateway, new_token, token_file, token_path
+from ground.xtce import EPOCH
+from ground.yamcs import HTTP_PORT, KEYS, USER, USERS, command_line, compile_link, missing, write
+from knightcube.errors import FlightError, UsageError
+
+_END_S = 30.0
+"""Longest time (s) to wait for the end of Yamcs."""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this command to the parser."""
+    parser.description = (
+        "Run the mission control system Yamcs for the satellite of a configuration. Yamcs gets the "
+        "satellite's telemetry, limits and commands from our tables, and reaches the satellite through a "
+        "gateway in this process, which holds the keys. Yamcs archives all packets, raises alarms at the "
+        "limits and transfers files. Needs Java 17 and the extra `interop`. Loopback only. Ctrl-C ends."
+    )
+    parser.add_argument("config", type=config_path, metavar="CONFIG", help="configuration that is flown")
+    text = "address of the satellite's link (default `link.udp`, or `link.tcp`, of CONFIG)"
+    parser.add_argument("--link", metavar="ADDRESS", help=text)
+    text = "keys of the ground (default %(default)s)"
+    parser.add_argument("--keys", type=Path, default=KEYS, metavar="FOLDER", help=text)
+    text = "folder of Yamcs's configuration and archive (default %(default)s)"
+    parser.add_argument("--out", type=Path, default=Path("mission-control"), metavar="FOLDER", help=text)
+    text = "port of Yamcs's page (default %(default)s)"
+    parser.add_argument("--port", type=count, default=HTTP_PORT, metavar="PORT", help=text)
+    text = "UTC of mission time zero (default %(default)s)"
+    parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=text)
+    parser.set_defaults(command=run, spacecraft=None, frame_bytes=None)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run Yamcs and the gateway until a signal arrives or Yamcs ends."""
+    if problem := missing():
+        raise FlightError(problem)
+    section = load(options.config).link
+    if section is None:
+        raise UsageError(f"{options.config}: has no section `link`")
+    default = section.udp or (f"tcp:{section.tcp}" if section.tcp else None)
+    options.link = options.link or default
+    if options.link is None:
+        raise UsageError(f"{options.config}: has neither `link.udp` nor `link.tcp`: give --link ADDRESS")
+    folder, token = options.out.absolute(), new_token()
+    with ExitStack() as stack:
+        terminal = stack.enter_context(contextlib.closing(terminal_of(options)))
+        gateway = Gateway(terminal, "127.0.0.1:0", token, _complain)
+        stack.enter_context(contextlib.closing(gateway))
+        stack.enter_context(token_file(token_path(options.keys, gateway.port), token))
+        signals = stack.enter_context(EndingSignals())
+        served = f"127.0.0.1:{gateway.port}"
+        write(folder, served, options.port, options.epoch, options.keys, section.command_frame_bytes)
+        compile_link(folder)
+        log = stack.enter_context((folder / "log").open("a", encoding="utf-8"))
+        yamcs = subprocess.Popen(command_line(folder), stdout=log, stderr=subprocess.STDOUT)
+        stack.callback(_end, yamcs)
+        address = f"http://127.0.0.1:{options.port}/"
+        sys.stdout.write(
+            f"Yamcs on {address}, user {USER}, password in {folder / USERS}, log in {folder / 'log'} "
+            "(Ctrl-C ends)\n"
+        )
+        sys.stdout.flush()
+        gateway.run(lambda: signals.received or yamcs.poll() is not None)
+        if not signals.received:
+            raise FlightError(f"Yamcs has ended with status {yamcs.wait()}: see {folder / 'log'}")
+    return 0
+
+
+def _complain(text: str) -> None:
+    sys.stderr.write(f"knightcube: gateway: {text}\n")
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
