@@ -211,13 +211,15 @@ class Requirements(Section, frozen=True, kw_only=True):
     Detumbling must end within `slow_within` s of the start, and the attitude must be fine within
     `fine_within` s after that. The value `knowledge_deg` limits the rms error of the attitude with star
     fixes, over all axes. The value `pointing_deg` limits the rms error of the pointing axis from ten minutes
-    after the start of pointing on.
+    after the start of pointing on. The value `camera_missed_percent` limits the percentage of the instants at
+    which the unobstructed star camera gave neither an attitude nor a rate.
     """
 
     slow_within: Positive | None = None
     fine_within: Positive | None = None
     knowledge_deg: Positive | None = None
     pointing_deg: Positive | None = None
+    camera_missed_percent: Positive | None = None
 
 
 class OrbitConfig(Config, frozen=True, kw_only=True):

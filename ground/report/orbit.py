@@ -338,12 +338,16 @@ def objects(run: Run) -> list[Object]:
 
 
 def requirements(
-    config: OrbitConfig, detumbled: Object | None, known: Object | None, pointed: Object | None
+    config: OrbitConfig,
+    detumbled: Object | None,
+    known: Object | None,
+    pointed: Object | None,
+    seen: Object | None,
 ) -> list[Object]:
     """Return each figure that the configuration's section `requirements` limits, with a verdict.
 
-    The arguments `detumbled`, `known` and `pointed` are the report's figures of detumbling, attitude
-    knowledge and pointing.
+    The arguments `detumbled`, `known`, `pointed` and `seen` are the report's figures of detumbling, attitude
+    knowledge, pointing and the star camera.
     """
     limits = config.requirements
     periods = detumbled["periods"][:1] if detumbled else []
@@ -361,4 +365,9 @@ def requirements(
     for target in pointed["targets"] if pointed else []:
         error = [math.degrees(target["axis_rms_rad"])]
         rows.append((f"pointing to {target['target']}, rms", error, limits.pointing_deg, "deg"))
+    if seen is not None:
+        missed = [100.0 * (1.0 - seen["share"])]
+        rows.append(
+            ("unobstructed frames without attitude or rate", missed, limits.camera_missed_percent, "%")
+        )
     return [judge(name, values, limit, unit) for name, values, limit, unit in rows if limit is not None]

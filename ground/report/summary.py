@@ -54,6 +54,7 @@ def summarise(run: Run) -> Object:
     detumbled, known = detumbling(run), knowledge(run)
     config = _orbit_config(run, notes) if in_orbit else None
     pointed = None if config is None else pointing(run, config.pointing.axis, power)
+    seen = None if config is None else star_camera(run, config)
     summary: Object = {
         "run": identity,
         "attitude_source": attitude.source,
@@ -61,7 +62,7 @@ def summarise(run: Run) -> Object:
         "detumbling": detumbled,
         "knowledge": known,
         "pointing": pointed,
-        "requirements": [] if config is None else requirements(config, detumbled, known, pointed),
+        "requirements": [] if config is None else requirements(config, detumbled, known, pointed, seen),
         "thesis": [] if in_orbit else against_thesis(steps, powers),
         "power": powers,
         "rate_groups": _rate_groups(run["rate_group"]),
@@ -71,7 +72,7 @@ def summarise(run: Run) -> Object:
         "estimate": estimate_errors(run),
         "streaks": streaks(run),
         "stars": star_attitudes(run),
-        "star_camera": None if config is None else star_camera(run, config),
+        "star_camera": seen,
         "failed_frames": failed_frames(run),
         "objects": objects(run),
         "modes": _modes(run["mode"]),

@@ -237,24 +237,29 @@ def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it
 
 def test_every_requirement_is_judged_by_its_figure() -> None:
     config = as_orbit(configuration.load(CONFIG.with_name("orbit.yaml")))
-    limits = Requirements(slow_within=100.0, fine_within=50.0, knowledge_deg=0.1, pointing_deg=5.0)
+    limits = Requirements(
+        slow_within=100.0, fine_within=50.0, knowledge_deg=0.1, pointing_deg=5.0, camera_missed_percent=20.0
+    )
 
     config = replace(config, requirements=limits)
     slowed = {"periods": [{"begin_s": 10.0, "duration_s": 80.0, "slowed": True}]}
     known = {"fine_after_s": 150.0, "with_stars_error_rms_rad": math.radians(0.05)}
     pointed = {"targets": [{"target": "nadir", "axis_rms_rad": math.radians(6.0)}]}
-    rows = orbit.requirements(config, slowed, known, pointed)
+    rows = orbit.requirements(config, slowed, known, pointed, {"share": 0.75})
     found = [(row["quantity"], row["worst"], row["limit"]) for row in rows]
     assert found == [
         ("detumbling time", 80.0, 100.0),
         ("time from detumbling to fine attitude", 60.0, 50.0),
         ("attitude error with stars, rms", pytest.approx(0.05), 0.1),
         ("pointing to nadir, rms", pytest.approx(6.0), 5.0),
+        ("unobstructed frames without attitude or rate", pytest.approx(25.0), 20.0),
     ]
-    early = orbit.requirements(config, slowed, {**known, "fine_after_s": 20.0}, None)
+    early = orbit.requirements(config, slowed, {**known, "fine_after_s": 20.0}, None, None)
     assert early[1]["worst"] == 0.0
-    never = orbit.requirements(config, slowed, {**known, "fine_after_s": math.nan}, None)
+    never = orbit.requirements(config, slowed, {**known, "fine_after_s": math.nan}, None, None)
     assert never[1]["worst"] == math.inf
     spinning = {"periods": [{"begin_s": 10.0, "duration_s": 80.0, "slowed": False}]}
-    assert orbit.requirements(config, spinning, None, None)[0]["worst"] == math.inf
-    assert orbit.requirements(replace(config, requirements=Requirements()), slowed, known, pointed) == []
+    assert orbit.requirements(config, spinning, None, None, None)[0]["worst"] == math.inf
+    assert (
+        orbit.requirements(replace(config, requirements=Requirements()), slowed, known, pointed, None) == []
+    )
