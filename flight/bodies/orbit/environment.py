@@ -7,8 +7,9 @@ detects a magnetometer that repeats the same field.
 
 A GPS fix that contradicts the elements or the previous fixes is refused. Refused fixes that are consistent
 with one orbit for `CONFIRMED` seconds replace the contradicted knowledge, unless the magnetometer or the Sun
-contradicts them. Fixes that agree with elements of a low accuracy are used after the same time. A receiver
-that is deceived consistently, with a possible orbit, cannot be detected.
+contradicts them. Fixes that agree with elements of a low accuracy are used after the same time. Fixes that
+agree with accurate elements are used at once, but their accuracy is believed after the same time only. A
+receiver that is deceived consistently, with a possible orbit, cannot be detected.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ time (s) between two fixes of one sequence.
 """
 FIRST_FIXES, TIGHT = 3, 1e4
 """Number of consistent fixes that begin an orbit without elements, and largest standard deviation (m) of
-elements that confirm a fix.
+elements by which a single fix begins an orbit.
 """
 UNCONFIRMED_SIGMA = 1e6
 """Standard deviation (m) of a position that follows from a few fixes without elements."""
@@ -112,6 +113,11 @@ class FixSequence:
         """Whether the fixes agree long enough to replace contradicted knowledge."""
         span = (self._newest.julian_date - self.first.julian_date) * DAY
         return span >= CONFIRMED and self.joined >= max(_LEAST_FIXES, self._offered // 2)
+
+    @property
+    def is_disputed(self) -> bool:
+        """Whether fixes since the first one disagree with it."""
+        return self._offered > self.joined
 
     @property
     def refuted(self) -> bool:
@@ -289,12 +295,22 @@ class EstimatedEnvironment:
         fix = self._recent(date)
         if fix is not None:
             state = fix.at(date)
-            return state if self._is_confirmed else replace(state, sigma=UNCONFIRMED_SIGMA)
+            return state if self._is_confirmed else self._unconfirmed(state)
         if self._elements is not None and not self.clock_doubt:
             with suppress(OrbitError):
                 state = self._elements.at(date)
                 return replace(state, sigma=self._enlarged * state.sigma)
         return None
+
+    def _unconfirmed(self, state: OrbitState) -> OrbitState:
+        """Return a state by a few fixes, whose standard deviation covers the distance to the elements."""
+        sigma = UNCONFIRMED_SIGMA
+        if self._elements is not None:
+            with suppress(OrbitError):
+                expected = self._elements.at(state.julian_date)
+                off = float(np.linalg.norm(state.position - expected.position))
+                sigma = math.hypot(off, self._enlarged * expected.sigma)
+        return replace(state, sigma=math.hypot(sigma, state.sigma))
 
     def _recent(self, date: float) -> GpsFix | None:
         """Return the newest fix that was used, or None if it is too old; few fixes become old sooner."""
@@ -329,7 +345,8 @@ class EstimatedEnvironment:
         time_ns, offset_ns = reading.time_ns, reading.utc_ns + GPS_DELAY_NS - reading.time_ns
         last = self._recent(fix.julian_date)
         if last is None and self._fix is not None:
-            self._is_doubted |= not self._is_confirmed
+            disputed = self._start is not None and self._start.is_disputed
+            self._is_doubted |= disputed and not self._is_confirmed
             self._fix, self._is_confirmed = None, False
         by_time = self._is_in_time(offset_ns, time_ns)
         by_fixes = by_time and (last is None or _agree(last, fix, FIX_GATE))
@@ -345,14 +362,15 @@ class EstimatedEnvironment:
             self._enlarge(fix)
             self._sequences, self._is_doubted = [], False
             return self._use(fix, offset_ns, time_ns, confirmed=True)
-        tight = self._is_tight(fix.julian_date)
-        if not (by_fixes and by_elements and (tight or self._is_begun(sequence, last))):
+        if not (by_fixes and by_elements and self._is_begun(sequence, last)):
             return False
-        return self._use(fix, offset_ns, time_ns, confirmed=tight)
+        return self._use(fix, offset_ns, time_ns, confirmed=False)
 
     def _is_begun(self, sequence: FixSequence, last: GpsFix | None) -> bool:
         """Return whether a sequence begins or continues an orbit that only a few fixes describe."""
-        if self._elements is not None or self._is_doubted or sequence.joined < FIRST_FIXES:
+        first = FIRST_FIXES if self._elements is None else 1
+        known = self._elements is None or self._is_tight(sequence.first.julian_date)
+        if not known or self._is_doubted or sequence.refuted or sequence.joined < first:
             return False
         if last is None:
             self._start = sequence

@@ -159,10 +159,14 @@ def unpack(data: bytes) -> tuple[Transaction, Content]:
 
     Raises PduError if the bytes are not a valid PDU.
     """
-    if len(data) < _FIXED_BYTES or data[0] & 0b111 << 5 != _PDU_VERSION:
-        raise PduError("the bytes are not a CFDP unit of version 1")
-    if data[0] & (_UNACKNOWLEDGED | _LARGE):
-        raise PduError("units of class 1 or of large files are not supported")
+    if len(data) < _FIXED_BYTES:
+        raise PduError(f"the unit has {len(data)} bytes, but a CFDP header has at least {_FIXED_BYTES}")
+    if data[0] & 0b111 << 5 != _PDU_VERSION:
+        raise PduError(f"the unit has CFDP version {data[0] >> 5}, but must have version 1")
+    if data[0] & _UNACKNOWLEDGED:
+        raise PduError("the transmission mode is 1 (class 1), but must be 0 (class 2)")
+    if data[0] & _LARGE:
+        raise PduError("the large file flag is 1, but must be 0")
     entity, number = (data[3] >> 4 & 7) + 1, (data[3] & 7) + 1
     begin = _FIXED_BYTES + 2 * entity + number
     end = begin + int.from_bytes(data[1:3], "big")
@@ -174,20 +178,26 @@ def unpack(data: bytes) -> tuple[Transaction, Content]:
         int.from_bytes(data[begin - entity : begin], "big"),
     )
     if max(transaction.source, transaction.destination) >= 1 << 16 or transaction.number > HIGHEST_NUMBER:
-        raise PduError("the entity exceeds 2 bytes or the transaction number 4 bytes")
+        raise PduError(
+            f"entities {transaction.source} and {transaction.destination} must be below 65536, and the "
+            f"transaction number {transaction.number} at most {HIGHEST_NUMBER}"
+        )
     if data[0] & _CRC:
         if crc16(data[:end]) != 0:
-            raise PduError("the CRC of the unit is wrong")
+            raise PduError(
+                f"the CRC flag is 1, but the CRC {data[end - CRC_BYTES : end].hex()} of the unit is wrong"
+            )
         end -= CRC_BYTES
     body = data[begin:end]
     try:
         if data[0] & _FILE_DATA:
             if data[3] & _METADATA_OF_SEGMENT:
-                raise PduError("segments with metadata are not supported")
+                raise PduError("the segment metadata flag is 1, but must be 0")
             return transaction, FileData(_LONG.unpack_from(body)[0], body[_LONG.size :])
         return transaction, _directive(body)
     except (struct.error, IndexError) as error:
-        raise PduError("the unit ends before its last field") from error
+        kind = "file data" if data[0] & _FILE_DATA else f"directive {body[0] if body else 'missing'}"
+        raise PduError(f"the unit ends before its last field ({kind}, {len(body)} bytes)") from error
 
 
 def _body(transaction: Transaction, content: Content) -> tuple[bytes, int]:
@@ -218,7 +228,7 @@ def _directive(body: bytes) -> Content:
             first, second = 5, 6 + rest[5]
             end = second + 1 + rest[second]
             if len(rest) < end:
-                raise PduError("the unit ends before its last file name")
+                raise PduError(f"the file names end at byte {end}, but the unit ends at byte {len(rest)}")
             names = (rest[first + 1 : second], rest[second + 1 : end])
             source_name, name = (raw.decode("utf-8", "replace") for raw in names)
             return Metadata(size, source_name, name, rest[0] & 15)
@@ -233,7 +243,7 @@ def _directive(body: bytes) -> Content:
         case Code.ACK:
             return Ack(rest[0] >> 4, rest[1] >> 4, rest[1] & 3)
         case _:
-            raise PduError(f"directive {code} is not known")
+            raise PduError(f"directive {code} is not known: the codes are {sorted(map(int, Code))}")
 
 
 def _name(text: str) -> bytes:

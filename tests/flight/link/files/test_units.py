@@ -150,6 +150,39 @@ def test_damaged_units_are_refused_and_nothing_else_happens(noise: bytes, case: 
         assert isinstance(content, Content)
 
 
+@given(st.integers(0, 8), st.integers(0, 40), st.integers(0, 255))
+def test_a_changed_byte_of_a_unit_is_refused_by_field_and_value_or_read(
+    case: int, at: int, value: int
+) -> None:
+    good = bytearray(CASES[case][1])
+    good[at % len(good)] = value
+    refusal = ""
+    try:
+        unpack(bytes(good))
+    except PduError as error:
+        refusal = str(error)
+    fields = ("version", "mode", "flag", "bytes", "byte ", "entities", "directive")
+    assert not refusal or any(field in refusal for field in fields)
+    assert not refusal or any(character.isdigit() for character in refusal)
+
+
+@pytest.mark.parametrize(
+    ("data", "named"),
+    [
+        (b"\x20", "has 1 bytes"),
+        (b"\xa0" + bytes(9), "CFDP version 5"),
+        (b"\x24" + bytes(9), "transmission mode is 1"),
+        (b"\x21" + bytes(9), "large file flag is 1"),
+        (bytes((0x20, 0, 1, 0x00, 1, 4, 2, 99)), "directive 99 is not known"),
+        (bytes((0x20, 0, 2, 0x00, 1, 4, 2, 4, 0)), "before its last field (directive 4, 2 bytes)"),
+    ],
+)
+def test_a_refusal_names_the_field_and_its_value(data: bytes, named: str) -> None:
+    with pytest.raises(PduError) as caught:
+        unpack(data)
+    assert named in str(caught.value)
+
+
 def test_a_crc_is_checked_and_left_out_of_the_content() -> None:
     theirs = config()
     theirs.crc_flag = CrcFlag.WITH_CRC

@@ -276,6 +276,26 @@ def test_any_changed_field_of_an_omm_is_refused_by_name_or_read(field: str, valu
     assert not refusal or field in refusal or "perigee" in refusal
 
 
+@given(
+    st.sampled_from([*FORMS, "tle"]),
+    st.integers(0, 10_000),
+    st.integers(0, 12),
+    st.text(st.characters(codec="utf-8"), max_size=8),
+)
+def test_any_damaged_text_of_elements_is_refused_in_one_line_or_read(
+    form: str, at: int, length: int, text: str
+) -> None:
+    whole = "\n".join(LINES) if form == "tle" else FORMS[form](OMM, OMM)
+    at %= len(whole)
+    refusal = ""
+    try:
+        for found in read_elements(whole[:at] + text + whole[at + length :]):
+            TwoLineElements(*found.lines)
+    except UsageError as error:
+        refusal = str(error)
+    assert "\n" not in refusal
+
+
 def test_the_uncertainty_covers_an_error_of_the_drag_term() -> None:
     """Elements with B* 0 of an orbit with B* 5e-4: 226 km after 6 days, and 5514 km after 30 days."""
     lines = (
