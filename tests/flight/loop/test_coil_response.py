@@ -123,11 +123,8 @@ class Orbiting:
             currents = self.watch.correction.wire(wanted) if within >= 8 else np.zeros(len(wanted))
             self.response.commanded(now_ns, tuple(currents.tolist()))
             self.watch.commanded(now_ns, currents)
-            for _ in range(5):
-                torque = _cross(self._dipoles @ (self.signs * currents), self._field)
-                torque = torque - _cross(self.rate, self.moments * self.rate)
-                self.rate = self.rate + 5e-3 * torque / self.moments
-                self._field = self._field - 5e-3 * _cross(self.rate, self._field)
+            dipole = self._dipoles @ (self.signs * currents)
+            self.rate, self._field = _moved(self.rate, self._field, dipole, self.moments)
             seen = self._field + 7.7e-4 * self._dipoles @ (self.signs * currents)
             noise = 2.8e-4 * self._noise.standard_normal(3)
             self.response.observe_motion(now_ns + TICK_NS, self.rate + noise, seen)
@@ -138,10 +135,21 @@ MOMENTS: FloatArray = np.array([1.10e-3, 1.05e-3, 0.99e-3])
 INERTIAS = np.diag(MOMENTS)
 
 
-def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the cross product (3,); numpy's takes several times as long for one pair."""
-    (a, b, c), (d, e, f) = first.tolist(), second.tolist()
-    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
+def _moved(
+    rate: FloatArray, field: FloatArray, dipole: FloatArray, moments: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return rate and field (3,) after 25 ms, in body axes; plain numbers take a tenth of numpy's time."""
+    (x, y, z), (bx, by, bz) = rate.tolist(), field.tolist()
+    (mx, my, mz), (jx, jy, jz) = dipole.tolist(), moments.tolist()
+    for _ in range(5):
+        hx, hy, hz = jx * x, jy * y, jz * z
+        tx = (my * bz - mz * by) - (y * hz - z * hy)
+        ty = (mz * bx - mx * bz) - (z * hx - x * hz)
+        tz = (mx * by - my * bx) - (x * hy - y * hx)
+        x, y, z = x + 5e-3 * tx / jx, y + 5e-3 * ty / jy, z + 5e-3 * tz / jz
+        vx, vy, vz = y * bz - z * by, z * bx - x * bz, x * by - y * bx
+        bx, by, bz = bx - 5e-3 * vx, by - 5e-3 * vy, bz - 5e-3 * vz
+    return np.array((x, y, z)), np.array((bx, by, bz))
 
 
 def test_of_a_free_body_no_sound_coil_is_found_reversed() -> None:
