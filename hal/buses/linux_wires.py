@@ -5,16 +5,21 @@ from __future__ import annotations
 import fcntl
 import os
 from array import array
+from collections.abc import Sequence
 from contextlib import ExitStack
-from struct import pack
+from struct import Struct, pack
 
 from hal.buses.i2c_bus import LinuxI2cBus, device_file
 from hal.buses.serial_port import PySerialPort
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock
 
-SPI_MODE, SPI_SPEED, SPI_MESSAGE = 0x40016B01, 0x40046B04, 0x40206B00
-"""Requests SPI_IOC_WR_MODE, SPI_IOC_WR_MAX_SPEED_HZ and SPI_IOC_MESSAGE(1) of linux/spi/spidev.h."""
+SPI_MODE, SPI_SPEED, SPI_MESSAGE = 0x40016B01, 0x40046B04, 0x40006B00
+"""Requests SPI_IOC_WR_MODE, SPI_IOC_WR_MAX_SPEED_HZ and SPI_IOC_MESSAGE(0) of linux/spi/spidev.h."""
+SPI_TRANSFER = Struct("=QQIIHBBBBBB")
+"""Layout of struct spi_ioc_transfer: buffers, length, speed, delay (us), bits, chip select change."""
+FRAME_GAP_US = 20
+"""Pause between two frames; an ADIS16470 needs 16 us."""
 
 
 class LinuxSpiDevice:
@@ -31,17 +36,24 @@ class LinuxSpiDevice:
             cure = "is the SPI bus enabled, and may this user open it?"
             raise NotResponding(device, f"cannot be opened ({error.strerror}): {cure}") from error
 
-    def transfer(self, data: bytes) -> bytes:
-        """Send `data`, and return the bytes received meanwhile. Raises OSError."""
-        sent, received = array("B", data), array("B", bytes(len(data)))
-        # struct spi_ioc_transfer: buffers, length, speed, delay, bits per word and fields that are zero.
-        buffers = sent.buffer_info()[0], received.buffer_info()[0]
-        fcntl.ioctl(
-            self._descriptor,
-            SPI_MESSAGE,
-            pack("=QQIIHBBBBBB", *buffers, len(data), self._speed_hz, 0, 8, *(0,) * 5),
+    def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
+        """Send frames one after the other, and return the bytes received during each. Raises OSError."""
+        buffers = [(array("B", frame), array("B", bytes(len(frame)))) for frame in frames]
+        request = SPI_MESSAGE | len(frames) * SPI_TRANSFER.size << 16
+        calls = b"".join(
+            SPI_TRANSFER.pack(
+                *(half.buffer_info()[0] for half in pair),
+                len(pair[0]),
+                self._speed_hz,
+                FRAME_GAP_US,
+                8,
+                index < len(frames) - 1,  # after the last frame, a change would keep the device selected
+                *(0,) * 4,
+            )
+            for index, pair in enumerate(buffers)
         )
-        return received.tobytes()
+        fcntl.ioctl(self._descriptor, request, calls)
+        return [received.tobytes() for _, received in buffers]
 
     def close(self) -> None:
         """Close the device."""

@@ -67,9 +67,9 @@ class Adis16470:
 
     def _read(self, registers: Sequence[int]) -> list[int]:
         """Return the values of 16-bit registers, each in the frame after the register's request."""
-        frames = [self._device.transfer(bytes((register, 0))) for register in (*registers, 0)]
+        frames = self._device.transfer([bytes((register, 0)) for register in (*registers, 0)])
         return [int.from_bytes(frame, "big") for frame in frames[1:]]
 
     def _write(self, register: int, value: int) -> None:
-        for address, byte in ((register, value & 0xFF), (register + 1, value >> 8)):
-            self._device.transfer(bytes((0x80 | address, byte)))
+        halves = (register, value & 0xFF), (register + 1, value >> 8)
+        self._device.transfer([bytes((0x80 | address, byte)) for address, byte in halves])

@@ -125,10 +125,10 @@ class RawI2cBus(I2cBus, Protocol):
 
 
 class SpiDevice(Protocol):
-    """One device on an SPI bus, which its chip select line selects during each transfer."""
+    """One device on an SPI bus, which its chip select line selects during each frame."""
 
-    def transfer(self, data: bytes) -> bytes:
-        """Send `data`, and return the bytes received meanwhile. Raises OSError."""
+    def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
+        """Send frames one after the other, and return the bytes received during each. Raises OSError."""
 
 
 class Wires(Protocol):

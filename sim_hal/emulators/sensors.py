@@ -8,7 +8,7 @@ returns an `I2cPart` or an SPI device.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -229,8 +229,11 @@ class EmulatedAdis16470:
         self._number = -1
         self._answer = b"\0\0"
 
-    def transfer(self, data: bytes) -> bytes:
-        """Execute the request in a frame of two bytes, and return the answer to the request before."""
+    def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
+        """Execute the request in each frame of two bytes, and return each answer to the request before."""
+        return [self._frame(data) for data in frames]
+
+    def _frame(self, data: bytes) -> bytes:
         answer, (address, value) = self._answer, data
         register = address & 0x7E
         if address & 0x80:

@@ -137,9 +137,9 @@ class RemoteI2cBus:
         """Write and read bytes without a register address."""
         return bytes(self.call("exchange", address, list(data), count))
 
-    def transfer(self, data: bytes) -> bytes:
-        """Transfer bytes, if the selected name is that of an SPI device."""
-        return bytes(self.call("spi", list(data)))
+    def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
+        """Transfer frames, if the selected name is that of an SPI device."""
+        return [bytes(frame) for frame in self.call("spi", [list(frame) for frame in frames])]
 
     def close(self) -> None:
         """Close the connection."""

@@ -228,8 +228,9 @@ class DeviceServer:
         def exchange(connection: _DeviceClient, address: int, data: list[int], count: int) -> list[int]:
             return list(wires.i2c(connection.selected).exchange(address, bytes(data), count))
 
-        def spi(connection: _DeviceClient, data: list[int]) -> list[int]:
-            return list(wires.spi(connection.selected or "", 0, 0).transfer(bytes(data)))
+        def spi(connection: _DeviceClient, frames: list[list[int]]) -> list[list[int]]:
+            device = wires.spi(connection.selected or "", 0, 0)
+            return [list(frame) for frame in device.transfer([bytes(frame) for frame in frames])]
 
         def trigger(connection: _DeviceClient, exposure_ns: int, number: int = 0) -> None:
             camera = cameras[number]

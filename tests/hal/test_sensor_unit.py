@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -147,8 +148,8 @@ def test_an_adis16470_measures_negative_rates_and_averages() -> None:
 @pytest.mark.parametrize(("answer", "error"), [(b"\xff\xff", NotResponding), (b"\x12\x34", Refused)])
 def test_another_or_no_part_on_the_spi_bus_is_refused(answer: bytes, error: type[Exception]) -> None:
     class Part:
-        def transfer(self, data: bytes) -> bytes:
-            return answer
+        def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
+            return [answer for _ in frames]
 
     with pytest.raises(error):
         Adis16470(Part())
@@ -168,14 +169,16 @@ def test_the_spi_device_makes_the_calls_of_the_kernels_interface(
 
     monkeypatch.setattr("hal.buses.linux_wires.fcntl.ioctl", record)
     opened = LinuxSpiDevice(str(device), 1_000_000, 3)
-    assert opened.transfer(b"\x72\x00") == b"\0\0"
+    assert opened.transfer([b"\x72\x00", b"\x00\x00"]) == [b"\0\0"] * 2
     opened.close()
     assert calls[:2] == [(0x40016B01, b"\x03"), (0x40046B04, struct.pack("=I", 1_000_000))]
     request, data = calls[2]
-    assert (request, len(data)) == (0x40206B00, 32)
-    sent, received, length, speed, _, bits = struct.unpack_from("=QQIIHB", data)
-    assert (length, speed, bits) == (2, 1_000_000, 8)
-    assert 0 not in {sent, received}
+    assert (request, len(data)) == (0x40406B00, 64)
+    for offset, reselected in ((0, 1), (32, 0)):
+        sent, received, length, speed, gap, bits, change = struct.unpack_from("=QQIIHBB", data, offset)
+        assert (length, speed, bits, change) == (2, 1_000_000, 8, reselected)
+        assert gap >= 16
+        assert 0 not in {sent, received}
 
 
 def test_an_spi_device_that_is_missing_is_named_with_the_cure() -> None:
