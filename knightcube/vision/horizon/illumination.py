@@ -120,6 +120,8 @@ def _away_from_glare(rays: FloatArray, bright: BoolArray) -> BoolArray:
 
 _LEAST_SKY = 8
 """Minimum number of samples in the sky to judge whether the sky is space."""
+_DIM_AIR = 30e3
+"""Height (m) above the limb at which the air has 3 % of its brightness, for images without darker sky."""
 _CLEAR = 24.0
 """Distance from the limb (px) beyond which no pixel that contributes to a sample images the Earth."""
 _DARKEST = 0.15
@@ -143,10 +145,16 @@ def why_not_space(view: LimbView, sun: FloatArray | None, samples: Samples, pixe
         samples: sampled pixels of the image.
         pixel: angular size of a pixel, rad.
     """
-    sky = limb_residuals(view, samples.rays) > np.arctan(_ATMOSPHERE / view.limb_distance) + _CLEAR * pixel
+    outside = limb_residuals(view, samples.rays)
+    away = np.ones(len(outside), dtype=bool)
     if sun is not None:
-        sky &= samples.rays @ (view.rotation @ sun) < np.cos(GLARE)
-    if np.count_nonzero(sky) < _LEAST_SKY:
+        away = samples.rays @ (view.rotation @ sun) < np.cos(GLARE)
+    # In a narrow field, the air may fill the image up to a large height.
+    for height in (_ATMOSPHERE, _DIM_AIR):
+        sky = away & (outside > np.arctan(height / view.limb_distance) + _CLEAR * pixel)
+        if np.count_nonzero(sky) >= _LEAST_SKY:
+            break
+    else:
         return ""
     if samples.floor > _BLACKEST:
         return f"the darkest pixels have {100.0 * samples.floor:.0f} % of the brightness of its bright side"

@@ -93,7 +93,7 @@ def test_clouds_below_a_real_limb_show_no_horizon_of_their_own() -> None:
         assert found.status is not HorizonStatus.FOUND
 
 
-@pytest.mark.parametrize("field", [8.0, 12.8, 16.0, 30.0, 67.0])
+@pytest.mark.parametrize("field", [4.0, 8.0, 12.8, 16.0, 30.0, 67.0])
 def test_a_bright_day_sky_over_ground_shows_no_horizon(field: float) -> None:
     """In the photograph of an aircraft, the bright side is the sky and the dark side is textured ground."""
     path = DATA / "limb/day_sky_uav.jpg"
