@@ -98,8 +98,12 @@ class ThreadTicker(ContainedJob):
             self._thread.join(timeout=2.0)
 
     def _serve(self) -> None:
+        due_ns = self._clock.now_ns() + self.period_ns
         while not self._stopped:
-            self._wake.wait(self.period_ns * 1e-9)
+            kicked = self._wake.wait(max(0, due_ns - self._clock.now_ns()) * 1e-9)
             self._wake.clear()
+            # Periods count from the start of a run, so that the job's duration does not lower the rate.
+            now_ns = self._clock.now_ns()
+            due_ns = now_ns + self.period_ns if kicked else max(now_ns, due_ns + self.period_ns)
             if not self._stopped:
                 self.run()

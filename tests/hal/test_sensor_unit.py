@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import struct
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from flight.schema.devices import axis_matrix
+from hal.buses.clock import SystemClock
 from hal.buses.linux_wires import LinuxSpiDevice
 from hal.drivers.adis16470 import Adis16470
 from hal.drivers.sensor_unit import SensorPart, SensorUnit, SensorUnitSettings, level_attitude, quaternion_of
@@ -184,3 +186,18 @@ def test_the_spi_device_makes_the_calls_of_the_kernels_interface(
 def test_an_spi_device_that_is_missing_is_named_with_the_cure() -> None:
     with pytest.raises(NotResponding, match="is the SPI bus enabled"):
         LinuxSpiDevice("/nowhere/spidev9.9", 1_000_000, 0)
+
+
+def test_the_duration_of_a_job_does_not_lower_its_rate() -> None:
+    """Reading the sensors takes milliseconds, and the control loop expects 40 readings a second."""
+    clock, begun = SystemClock(), []
+
+    def job() -> None:
+        begun.append(clock.now_ns())
+        time.sleep(0.01)
+
+    ticker = clock.ticker("slow", 20_000_000, job)
+    clock.sleep_until_ns(clock.now_ns() + 400_000_000)
+    ticker.stop()
+    # On a busy machine runs may be late, but then the next period is shorter than job and period together.
+    assert np.diff(begun).min() < 26_000_000
