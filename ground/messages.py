@@ -1,13 +1,14 @@
 """Tracked objects, the observer's orbit and the attitude as CCSDS messages.
 
 Tracking Data Messages (503.0-B-2), Orbit Parameter and Ephemeris Messages (502.0-B-3), and Attitude Ephemeris
-Messages (504.0-B-1) are in keyword = value notation.
+Messages (504.0-B-1) are in keyword = value notation, or in XML (505.0-B).
 Initial orbits are determined from the sightings and the satellite's positions in the `track` packets.
 """
 
 from __future__ import annotations
 
 import math
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,7 +35,7 @@ ORIGINATOR = "KNIGHTCUBE"
 _SECOND_NS = 1_000_000_000
 
 
-def write_tracking_data(run: Run, path: Path) -> list[Path]:
+def write_tracking_data(run: Run, path: Path, as_xml: bool = False) -> list[Path]:
     """Write the measured tracks of a run to the file `path`, and return the written files.
 
     If the satellite's own orbit was known, the file with the suffix `.oem` beside `path` has the positions of
@@ -52,14 +53,14 @@ def write_tracking_data(run: Run, path: Path) -> list[Path]:
     lines = _header("CCSDS_TDM_VERS = 2.0")
     for number in sorted(set(measured["number"].tolist())):
         lines += _segment(number, measured[measured["number"] == number], start_ns)
-    _write(path, lines)
+    _write(path, lines, as_xml)
     _, first = np.unique(measured["middle_ns"], return_index=True)
     placed = measured[first]
     placed = placed[np.isfinite(np.hstack([placed["place"], placed["velocity"]])).all(axis=1)]
     if len(placed) < 2:  # one state is not an ephemeris
         return [path]
     observer = path.with_suffix(".oem")
-    _write(observer, _ephemeris(placed, start_ns))
+    _write(observer, _ephemeris(placed, start_ns), as_xml)
     return [path, observer]
 
 
@@ -87,7 +88,7 @@ def _ephemeris(placed: PacketArray, start_ns: int) -> list[str]:
     ]
 
 
-def write_attitudes(run: Run, path: Path) -> list[Path]:
+def write_attitudes(run: Run, path: Path, as_xml: bool = False) -> list[Path]:
     """Write the estimated attitudes of a satellite as an Attitude Ephemeris Message, and return its file.
 
     The quaternions rotate from ICRS into the body frame. Raises UsageError for a run without attitudes in
@@ -125,7 +126,7 @@ def write_attitudes(run: Run, path: Path) -> list[Path]:
         ),
         "DATA_STOP",
     ]
-    _write(path, lines)
+    _write(path, lines, as_xml)
     return [path]
 
 
@@ -138,13 +139,74 @@ def _of_satellite() -> list[str]:
     return [f"OBJECT_NAME = {ORIGINATOR}", "OBJECT_ID = UNKNOWN", "CENTER_NAME = EARTH"]
 
 
-def _write(path: Path, lines: list[str]) -> None:
-    """Write a message. Raises UsageError if the file cannot be written."""
+def _write(path: Path, lines: list[str], as_xml: bool) -> None:
+    """Write a message of keyword = value lines. Raises UsageError if the file cannot be written."""
+    text = xml_of(lines) if as_xml else "\n".join(lines)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("\n".join(lines) + "\n", encoding="ascii")
+        path.write_text(text + "\n", encoding="ascii")
     except OSError as error:
         raise UsageError(f"{path}: the message cannot be written: {error.strerror or error}") from error
+
+
+_AXES = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
+
+
+def xml_of(lines: list[str]) -> str:
+    """Return the message of keyword = value `lines` in XML (CCSDS 505.0-B, Navigation Data Messages)."""
+    name, version = _keyword(lines[0])
+    kind = name.split("_")[1].lower()  # tdm, oem, opm or aem
+    root = ET.Element(kind, id=name, version=version)
+    place, body = ET.SubElement(root, "header"), ET.SubElement(root, "body")
+    segment = data = root  # until the first segment begins
+    for line in filter(None, lines[1:]):
+        key, value = _keyword(line)
+        if line == "META_START" or (kind == "opm" and key == "OBJECT_NAME"):
+            segment = ET.SubElement(body, "segment")
+            place = ET.SubElement(segment, "metadata")
+        if line == "META_STOP" or (kind == "opm" and key == "EPOCH"):
+            place = data = ET.SubElement(segment, "data")
+        if kind == "opm" and key in {"EPOCH", "COV_REF_FRAME"}:
+            place = ET.SubElement(data, "stateVector" if key == "EPOCH" else "covarianceMatrix")
+        if key == "COMMENT":
+            _element(place, key, line.removeprefix("COMMENT "))
+        elif kind == "tdm" and place is data and value:
+            date, number = value.split()
+            observation = ET.SubElement(place, "observation")
+            _element(observation, "EPOCH", date)
+            _element(observation, key, number)
+        elif value:
+            number, _, unit = value.partition(" [")
+            _element(place, key, number, **({"units": unit.rstrip("]")} if unit else {}))
+        elif place is data and len(line.split()) > 1:
+            _add_state(place, kind, *line.split())
+    ET.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode")
+
+
+def _keyword(line: str) -> tuple[str, str]:
+    """Return the keyword of a line, and its value or an empty text."""
+    key, found, value = line.partition(" = ")
+    return (line.split(maxsplit=1)[0], "") if not found or line.startswith("COMMENT") else (key, value)
+
+
+def _element(place: ET.Element, name: str, text: str, **attributes: str) -> None:
+    ET.SubElement(place, name, attributes).text = text
+
+
+def _add_state(place: ET.Element, kind: str, date: str, *numbers: str) -> None:
+    """Add one line of an ephemeris: position and velocity, or a quaternion (scalar last)."""
+    names: tuple[str, ...] = _AXES
+    if kind == "aem":
+        place = ET.SubElement(ET.SubElement(place, "attitudeState"), "quaternionState")
+        names = ("Q1", "Q2", "Q3", "QC")
+    else:
+        place = ET.SubElement(place, "stateVector")
+    _element(place, "EPOCH", date)
+    if kind == "aem":
+        place = ET.SubElement(place, "quaternion")
+    for name, number in zip(names, numbers, strict=True):
+        _element(place, name, number)
 
 
 def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
@@ -267,10 +329,7 @@ def _orbit(number: int, tracks: PacketArray, start_ns: int) -> ObjectOrbit:
     return replace(found, utc_ns=utc_ns, orbit=replace(orbit, covariance=orbit.covariance + own))
 
 
-_AXES = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
-
-
-def write_orbit_messages(found: list[ObjectOrbit], folder: Path) -> list[Path]:
+def write_orbit_messages(found: list[ObjectOrbit], folder: Path, as_xml: bool = False) -> list[Path]:
     """Write one Orbit Parameter Message per initial orbit into a folder, and return the files.
 
     Raises UsageError if the folder cannot be written.
@@ -280,7 +339,7 @@ def write_orbit_messages(found: list[ObjectOrbit], folder: Path) -> list[Path]:
         if item.orbit is None:
             continue
         path = folder / f"object-{item.number}.opm"
-        _write(path, _message(item))
+        _write(path, _message(item), as_xml)
         paths.append(path)
     return paths
 

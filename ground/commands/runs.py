@@ -109,16 +109,19 @@ def configure_export(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="write only the estimated attitudes of a satellite, as a CCSDS Attitude Ephemeris Message",
     )
+    parser.add_argument("--xml", action="store_true", help="write the message as XML (CCSDS 505.0-B)")
     parser.add_argument("--json", action="store_true", help="print the files as one JSON object")
     parser.set_defaults(command=run_export)
 
 
 def run_export(options: argparse.Namespace) -> int:
     """Write the exported files and print their paths."""
+    if options.xml and options.tdm is None and options.aem is None:
+        raise UsageError("--xml is for a message: give it with --tdm FILE or --aem FILE")
     if options.tdm is not None:
-        paths = write_tracking_data(read_run(options.run), options.tdm)
+        paths = write_tracking_data(read_run(options.run), options.tdm, options.xml)
     elif options.aem is not None:
-        paths = write_attitudes(read_run(options.run), options.aem)
+        paths = write_attitudes(read_run(options.run), options.aem, options.xml)
     else:
         place = options.out or options.run / FORMATS[options.format]
         paths = export(read_run(options.run), place, options.format)
@@ -144,6 +147,7 @@ def configure_orbit(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--opm", type=Path, metavar="FOLDER", help="write each orbit as a CCSDS Orbit Parameter Message"
     )
+    parser.add_argument("--xml", action="store_true", help="write the messages as XML (CCSDS 505.0-B)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run_orbit)
 
@@ -151,7 +155,7 @@ def configure_orbit(parser: argparse.ArgumentParser) -> None:
 def run_orbit(options: argparse.Namespace) -> int:
     """Determine, print and write the initial orbits."""
     found = orbits_of(read_run(options.run))
-    paths = [] if options.opm is None else write_orbit_messages(found, options.opm)
+    paths = [] if options.opm is None else write_orbit_messages(found, options.opm, options.xml)
     if options.json:
         facts = {"objects": [_orbit_facts(item) for item in found], "files": [str(path) for path in paths]}
         sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")

@@ -12,6 +12,7 @@ import pytest
 
 from ground import messages
 from knightcube.errors import UsageError
+from knightcube.gnc.first_orbit import FirstOrbit
 from tests.support.packed_run import packed_run
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
@@ -173,3 +174,63 @@ def test_too_few_sightings_with_a_position_give_a_reason_instead_of_an_orbit() -
     (found,) = messages.orbits_of(packed_run(run=[LABEL], track=track))
     assert (found.number, found.sightings, found.span, found.orbit) == (7, 3, 2.0, None)
     assert found.reason.startswith("2 sightings with the satellite's position")
+
+
+def both_forms(tmp_path: Path, write: Any) -> tuple[list[Any], list[Any]]:
+    """Return the messages of the same data, plain and in XML, as a program of other authors reads them."""
+    reader = pytest.importorskip("ccsds_ndm.ndm_io").NdmIo()
+    plain, xml = (write(tmp_path / name, as_xml) for name, as_xml in (("kvn", False), ("xml", True)))
+    assert all(path.read_text(encoding="ascii").startswith("<?xml") for path in xml)
+    return [reader.from_path(path) for path in plain], [reader.from_path(path) for path in xml]
+
+
+def test_tracks_and_the_camera_s_orbit_in_xml_have_the_values_of_the_plain_form(tmp_path: Path) -> None:
+    place, velocity = [6.9e6, 1e5, -2e5], [-100.0, 7500.0, 300.0]
+    track = [
+        sighting(1.0 + k, 1, 10.0 + k, 5.0, magnitude=4.0, place=place, velocity=velocity, place_sigma=20.0)
+        for k in range(3)
+    ]
+    run = packed_run(run=[LABEL], track=track)
+    plain, xml = both_forms(
+        tmp_path, lambda folder, as_xml: messages.write_tracking_data(run, folder / "a.tdm", as_xml)
+    )
+    angles = []
+    for tracks, orbit in (plain, xml):
+        (segment,) = tracks.body.segment
+        assert segment.metadata.participant_2 == "OBJECT-1"
+        angles.append(
+            [(str(one.epoch), one.angle_1, one.angle_2, one.mag) for one in segment.data.observation]
+        )
+        (segment,) = orbit.body.segment
+        read = [one for one in segment.data.state_vector]
+        assert [float(one.x_dot.value) for one in read] == [-0.1] * 3
+        assert [float(one.z.value) for one in read] == [-200.0] * 3
+    assert len(angles[0]) == 9
+    assert repr(angles[0]) == repr(angles[1])
+
+
+def test_attitudes_in_xml_have_the_values_of_the_plain_form(tmp_path: Path) -> None:
+    attitude = [(1.0 + k, {"quaternion": [0.6, 0.0, 0.0, 0.8], "angle_sigma": [0.01] * 3}) for k in range(2)]
+    run = packed_run(run=[LABEL], navigation=[(0.0, {})], attitude=attitude)
+    for (message,) in both_forms(
+        tmp_path, lambda folder, as_xml: messages.write_attitudes(run, folder / "a.aem", as_xml)
+    ):
+        (segment,) = message.body.segment
+        assert segment.metadata.start_time == "2026-01-01T00:00:01.000000"
+        read = [one.quaternion_state.quaternion for one in segment.data.attitude_state]
+        assert [(float(one.q1), float(one.qc)) for one in read] == [(0.6, 0.8)] * 2
+
+
+def test_an_orbit_in_xml_has_the_values_of_the_plain_form(tmp_path: Path) -> None:
+    state = np.array([7.0e6, 1.0e5, 2.0e5, -10.0, 7.5e3, 20.0])
+    covariance = np.diag([1e6] * 3 + [1.0] * 3)
+    orbit = FirstOrbit(0.0, state, covariance, 5.0e5, (4.0e5, 6.0e5), True, 20.0, 18)
+    found = [messages.ObjectOrbit(3, 12, 60.0, START_NS, orbit, "")]
+    for (message,) in both_forms(
+        tmp_path, lambda folder, as_xml: messages.write_orbit_messages(found, folder, as_xml)
+    ):
+        data = message.body.segment.data
+        assert float(data.state_vector.y_dot.value) == 7.5
+        assert data.state_vector.x.units.value == "km"
+        assert float(data.covariance_matrix.cx_x.value) == 1.0
+        assert data.covariance_matrix.cov_ref_frame == "ICRF"
