@@ -125,18 +125,10 @@ def assemble(
     world = make_world(WorldInputs(config, section, circuit.currents, start_ns))
     utc_offset_ns = world.utc_ns() - start_ns if isinstance(world, OrbitingWorld) else None
     receiver, currents = (np.random.default_rng([section.seed, ORBIT_STREAM, n]) for n in range(2))
-    unit_generator = np.random.default_rng(unit_seed)
+    sense, generator = _sense(config, section, world, circuit), np.random.default_rng(unit_seed)
+    times = now_ns, start_ns
     given = Emulation(
-        "inertial_unit",
-        wires,
-        config,
-        section,
-        unit_generator,
-        now_ns,
-        start_ns,
-        world,
-        _sense(config, section, world, circuit),
-        circuit.mean_supply,
+        "inertial_unit", wires, config, section, generator, *times, world, sense, circuit.mean_supply
     )
     unit = emulated(given)
     objects = sky_objects(section, start_ns, world)
@@ -152,20 +144,8 @@ def assemble(
     # Devices with events at the same time run in the order of this list.
     devices = [unit, camera, orbit.gps, *orbit.wide, faults, truth, circuit, monitor, orbit.cells]
     timed = [device for device in devices if hasattr(device, "next_event_ns")]
-    return Hardware(
-        TimedSimulation(world.advance_to, timed),
-        world,
-        wires,
-        unit,
-        circuit,
-        monitor,
-        camera,
-        truth,
-        faults,
-        orbit,
-        objects,
-        utc_offset_ns,
-    )
+    simulation, others = TimedSimulation(world.advance_to, timed), (faults, orbit, objects, utc_offset_ns)
+    return Hardware(simulation, world, wires, unit, circuit, monitor, camera, truth, *others)
 
 
 def _star_camera(
