@@ -439,14 +439,7 @@ class CoilResponse:
         `rows` (m, f, n + 3 + k) are those of m neighbouring bins, and `span` is the time (s) from bin to bin.
         """
         count, coils = len(self._free), self._count_of_coils
-        white = self._whitened(rows, span)
-        inputs = np.zeros((len(white), count, len(self._prior)))
-        inputs[:, :, :coils] = white[:, :, :coils]
-        inputs[:, :, coils + 2 * count :] = white[:, :, coils + 3 :]
-        for place in range(count):
-            inputs[:, place, coils + place] = -white[:, place, coils + 2]
-            inputs[:, place, coils + count + place] = -white[:, place, coils + 1]
-        matrix, outputs = inputs.reshape(-1, len(self._prior)), white[:, :, coils].reshape(-1)
+        matrix, outputs = self._inputs_and_outputs(rows, span)
         normal, right = matrix.T @ matrix + np.diag(self._prior), matrix.T @ outputs
         # Eliminate the nuisance parameters, which leaves one equation for each gain.
         prior, rest = self._prior[:coils], right[coils:]
@@ -488,6 +481,18 @@ class CoilResponse:
             tuple(alone),
             tuple(is_reversed),
         )
+
+    def _inputs_and_outputs(self, rows: Sequence[FloatArray], span: float) -> tuple[FloatArray, FloatArray]:
+        """Return the inputs (m f, p) of p fit parameters and the whitened accelerations (m f,) of m bins."""
+        count, coils = len(self._free), self._count_of_coils
+        white = self._whitened(rows, span)
+        inputs = np.zeros((len(white), count, len(self._prior)))
+        inputs[:, :, :coils] = white[:, :, :coils]
+        inputs[:, :, coils + 2 * count :] = white[:, :, coils + 3 :]
+        for place in range(count):
+            inputs[:, place, coils + place] = -white[:, place, coils + 2]
+            inputs[:, place, coils + count + place] = -white[:, place, coils + 1]
+        return inputs.reshape(-1, len(self._prior)), white[:, :, coils].reshape(-1)
 
     def _count(self, axis: int, possible: bool, *, alone: bool, is_reversed: bool, is_steady: bool) -> None:
         """Count the fits in a row that agree on an axis.
