@@ -859,7 +859,7 @@ def main(words: Sequence[str]) -> int:
     """Execute one run, and return the exit status."""
     parser = argparse.ArgumentParser(description="Execute one step of the renewal (docs/fly/renewal.md).")
     parser.add_argument("--root", type=Path, default=Path("/"), help="folder of the board's files")
-    parser.add_argument("--now", type=float, help="time since boot, s, for rehearsals")
+    parser.add_argument("--now", type=float, help="assumed time since boot, s, for tests")
     parser.add_argument(
         "--accepted", action="store_true", help="keep the configuration that install.sh accepted"
     )

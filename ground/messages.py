@@ -217,7 +217,7 @@ def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
         "",
         "META_START",
         f"COMMENT Standard deviation of each angle on the sky {np.median(sigma):.2f} arcsec in the median,",
-        f"COMMENT {sigma.min():.2f} to {sigma.max():.2f} arcsec, including the attitude error.",
+        f"COMMENT and {sigma.min():.2f} to {sigma.max():.2f} arcsec in all, including the attitude error.",
         *_of_magnitudes(track["magnitude_sigma"]),
         "COMMENT Stellar aberration of the camera is corrected, light time is not.",
         "TIME_SYSTEM = UTC",

@@ -307,7 +307,7 @@ def _current_lines(satellite: Satellite) -> list[Line]:
     return [
         (
             f"  current_noise: {_CURRENT_ERROR * least:.2g}",
-            "A, bound of a uniform error in each cycle [computed]",
+            "A, largest error of a measured current in each cycle [computed]",
         ),
         (f"  coil_field: [{rows}]", "T/A, field of each coil at the magnetometer [assumed]"),
     ]

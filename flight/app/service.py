@@ -292,7 +292,7 @@ class FlownRelease:
         self._done = False
 
     def serve(self, clock: Clock, stack: ExitStack) -> None:
-        """Record the release as proven after `PROVEN_NS`, outside the loop, until `stack` is closed."""
+        """Start a timer that records the release as proven after `PROVEN_NS`; `stack` stops the timer."""
         if self._path is not None:
             stack.callback(clock.ticker("release", PROVEN_NS, self.prove).stop)
 

@@ -218,8 +218,8 @@ class Vault:
     def read(self, name: int | str) -> Association | None:
         """Return the newest valid copy of an association, None if both copies are missing or damaged.
 
-        For an outdated association, the association in the witness is returned, but None for the primary
-        command SPI.
+        If the copy is older than its record in the second folder (the witness), the record is returned. For
+        the primary command SPI, the result is then None, because its counters could be repeated.
         """
         newest = max(self._copies(name), default=None)
         if newest is None or self._witness is None or not self._witness.outdates(newest):

@@ -36,7 +36,7 @@ KEPT = -1
 
 
 class Reference(Protocol):
-    """Reference motion at one instant, as implemented by each kind of body."""
+    """Interface of a reference motion at one instant; each kind of body has its own class."""
 
     @property
     def quaternion(self) -> FloatArray:

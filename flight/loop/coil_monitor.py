@@ -264,7 +264,7 @@ class BrakeProof:
     def ingest(self, exceeds: bool) -> frozenset[int]:
         """Process an ADC sample, which may show a current in spite of braking.
 
-        Return the axes that are braked wrongly.
+        Return the axes whose coils carry a current although they are braked.
         """
         self._exceeds.append(exceeds)
         if len(self._exceeds) < _PROOFS:

@@ -538,7 +538,7 @@ def _whitening(count: int, independent: float, variance: float) -> FloatArray:
     """Return the matrix (m, m) that whitens the differences of bins and removes their constant part.
 
     Args:
-        count: number of differences, m.
+        count: number m of differences between bins.
         independent: variance of the independent errors of the differences.
         variance: variance of the rate of a bin, divided by the squared time between bins.
     """

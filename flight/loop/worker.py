@@ -228,7 +228,7 @@ def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
 def message_length(data: bytes | bytearray) -> int | None:
     """Return the length of the message at the start of `data`, or None if its header is incomplete.
 
-    Raises FlightError for a length outside the permitted range.
+    Raises FlightError if the length of the message is outside the permitted range.
     """
     if len(data) < _HEADER.size:
         return None

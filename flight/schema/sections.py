@@ -137,8 +137,8 @@ class Health(Section, frozen=True, kw_only=True):
 class CommandStep(Aim, frozen=True, kw_only=True):
     """A command of the time line, executed at mission time `at` (s).
 
-    The command is one of: a mode, a slew to a q2, a pointing goal with its values, or the clearing of an
-    event.
+    The command is one of: a mode, a slew to a quaternion component q2, a pointing goal with its values, or
+    the clearing of an event.
     """
 
     at: NotNegative

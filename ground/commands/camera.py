@@ -70,7 +70,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Take, print and write the frames. The exit status is 1 if the camera is frozen."""
+    """Take and write the frames, and print a line for each. The exit status is 1 if the camera is frozen."""
     if options.count < 1:
         raise UsageError(f"--count {options.count}: give a number of frames, 1 or more")
     if options.exposure is not None and not 0.0 < options.exposure <= 10.0:

@@ -246,7 +246,7 @@ class LinkFeed:
 
     @contextlib.contextmanager
     def transferring(self, store: Store, rate: float) -> Iterator[FileSession]:
-        """Yield a session of file transfers, to which `new` passes the packets. Raises FlightError."""
+        """Yield a session of file transfers; `new` passes it the received packets. Raises FlightError."""
         with self.lock:
             session = FileSession(self._terminal, store, _SPI, rate, time.monotonic_ns())
             self._session = session

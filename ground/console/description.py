@@ -104,7 +104,7 @@ def _target_inputs(field: str) -> list[Object]:
 
 
 def _input(field: Field) -> Object:
-    """Return the input of one field of a command."""
+    """Return the description of the form input for one field of a command."""
     one: Object = {
         "name": field.name.replace("_", " "),
         "field": field.name,

@@ -112,7 +112,7 @@ class FlightSurroundings:
 
 
 UNKNOWN = FlightSurroundings(None, None)
-"""Surroundings of a flight whose configuration cannot be read."""
+"""Orbit and camera mounting of a flight whose configuration cannot be read: none are known."""
 
 
 def _julian_date(utc_ns: int) -> float:

@@ -345,7 +345,7 @@ def _fitted(record: Record, noise: MotionNoise, progress: Callable[[int, float],
                 return _finished(record, constants, noise, restarts)
             restarts = gated
     raise IdentificationError(
-        f"no constants explain this flight: the step of round {_MAX_ROUNDS} was still "
+        f"no constants explain this flight: in iteration {_MAX_ROUNDS} they still changed by "
         f"{largest:.2g} standard deviations"
     )
 

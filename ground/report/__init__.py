@@ -83,7 +83,7 @@ def draw_slew(made: OrderedSlew, order: SlewOrder, file: Path) -> None:
 
 
 def draw_fit(record: Record, found: PlantFit, file: Path) -> None:
-    """Draw the measured and predicted motion of an identification as a PNG. Raises UsageError."""
+    """Draw the measured and fitted motion of an identification flight as a PNG. Raises UsageError."""
     with drawing(file):
         from ground.report.figures import fit_figure, save  # noqa: PLC0415
 

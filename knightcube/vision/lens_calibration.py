@@ -753,7 +753,7 @@ def calibrate_lens(
 
 
 def _mirrored_back(found: LensCalibration) -> LensCalibration:
-    """Return the calibration of images from the calibration of the images with left and right exchanged."""
+    """Return the calibration of mirrored images, given the calibration of these images after mirroring."""
     if found.determined is None:
         return replace(found, mirrored=True)
     determined = found.determined

@@ -424,7 +424,7 @@ class OutputStreams:
         self._sends_foreign = self.foreign is not None
 
     def written(self, number: int) -> None:
-        """End a silent or foreign output of a register that has been written."""
+        """End the injected fault (silent or unrequested output) of a register that has been written."""
         self.muted.discard(number)
         self._sends_foreign = self._sends_foreign and number != BINARY_OUTPUTS[0]
 

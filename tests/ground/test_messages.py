@@ -78,7 +78,7 @@ def test_a_tracking_message_has_the_angles_of_every_sighting_by_object(tmp_path:
         "DATA_STOP",
     ]
     assert "COMMENT Standard deviation of each angle on the sky 20.00 arcsec in the median," in text
-    assert "COMMENT 10.00 to 30.00 arcsec, including the attitude error." in text
+    assert "COMMENT and 10.00 to 30.00 arcsec in all, including the attitude error." in text
     assert "COMMENT Standard deviation of MAG 0.200 in the median, 0.300 at most:" in text
     assert text.count("Standard deviation of MAG") == 1, "the first object has no magnitude"
 

@@ -251,7 +251,7 @@ class SatelliteEstimation(BodyEstimation):
     def _renew_redundant_coils(self) -> None:
         """Reset the learned matrix of more than three coils after a change of coils or allocation.
 
-        If only parallel coils are in use, the previous matrix is kept.
+        If only parallel coils are in use, the previously learned matrix is kept.
         """
         if not self._coils.is_redundant:
             return

@@ -456,4 +456,6 @@ class StuckFieldCheck:
         """
         if self.stuck:
             return "the magnetometer gives the same field in every reading"
-        return f"{refused} fields in a row contradict the estimate" if refused >= FIELDS_CONTRADICTED else ""
+        if refused < FIELDS_CONTRADICTED:
+            return ""
+        return f"{refused} measured fields in a row contradict the estimate"

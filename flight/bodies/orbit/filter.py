@@ -803,7 +803,7 @@ class OrbitFilter:
             for m in late:
                 if not isinstance(m, AttitudeMeasurement) or id(m) not in known - used:
                     continue
-                # A rejected attitude that is more accurate than a fine estimate is a sign of wrong dipoles.
+                # The rejection of an attitude more accurate than the estimate shows wrong learned dipoles.
                 sigma = math.sqrt(float(m.covariance.diagonal().max()))
                 if self.knowledge is Knowledge.FINE and sigma < self._free.worst_sigma:
                     used = self._replay.make_room(m, self._placed_ns)

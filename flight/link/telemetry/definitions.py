@@ -751,7 +751,7 @@ TRACK = Packet(
 PARAMETERS = Packet(
     "parameters",
     0x184,
-    "at the start of a flight that takes commands, at each load, at will",
+    "at the start of a flight that takes commands, after each load, and on request",
     "Table of the parameters in use",
     (
         counter("loads", "number of loaded tables, including earlier boots"),

@@ -156,7 +156,7 @@ class Detumbler:
             return
         window = (time_ns - self._begun_ns) // self._schedule.period_ns
         if window <= self._closed:
-            return  # the mean field of the late sample's window is already computed
+            return  # too late: the mean field of this sample's window has been computed
         if window != self._window:
             self._samples.clear()
             self._window = window

@@ -162,7 +162,7 @@ _RIVAL = 0.3
 _SAME = np.radians(1.0)
 """Angle (rad) between two nadirs from one image below which they count as the same nadir."""
 _MOST_CHANCE = -6.0
-"""Largest accepted log10 of the expected number of cones that chance edges fit as well as a horizon."""
+"""Largest accepted log10 of the number of cones that random edges are expected to support like a horizon."""
 _BREADTH = 0.125, 2.0
 """Minimum and maximum ratio of the width of the limb's edges to the width expected from the air."""
 _OFF = 9.0

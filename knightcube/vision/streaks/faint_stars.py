@@ -654,7 +654,7 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
 
 
 def _box_significance(padded: Float32Array, room: int, width: int) -> float:
-    """Return the summed squared significance of the locally best boxes of `width` samples along the circles.
+    """Return the summed squared significance of the locally best windows of `width` samples on all circles.
 
     The array `padded` (c, r) holds cumulative sums along the azimuth on r circles, with a margin of `room`
     samples at both ends.

@@ -490,8 +490,9 @@ def _path_light(
 def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, width: float) -> FloatArray:
     """Return the chi-square (s, l) of a streak for reversing motions.
 
-    The array `shares` (s,) holds ratios of the durations before and after the reversal, and `lengths` (l,)
-    the path lengths, px. Flux of the star and sky level are fitted to the pixels for each trial motion.
+    The motion reverses once. The array `shares` (s,) holds ratios of the durations before and after the
+    reversal, and `lengths` (l,) the path lengths, px. Flux of the star and sky level are fitted to the pixels
+    for each trial motion.
     """
     edges = np.append(one.places, one.places[-1] + _STEP) - 0.5 * _STEP
     # The variable `before` is the flux up to each boundary between the samples along the path.

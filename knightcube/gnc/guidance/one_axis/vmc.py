@@ -258,7 +258,10 @@ SHORTEST_WITH_TIME_COST = 1.0
 
 
 class PlanStatus(StrEnum):
-    """Whether a plan keeps the requested horizon; plans with a time cost always have the status OPTIMAL."""
+    """Whether a plan has the requested duration (OPTIMAL) or a longer one (STRETCHED).
+
+    If the duration has a cost, the status is OPTIMAL.
+    """
 
     OPTIMAL = "optimal"
     STRETCHED = "stretched"

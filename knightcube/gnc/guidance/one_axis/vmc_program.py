@@ -290,7 +290,7 @@ class PathProgram:
         return Trial(np.zeros(self.family.size), horizon)
 
     def _whitened(self, family: PathFamily, horizon: float) -> PathFamily:
-        """Return the family with parameters in which the energy has a unit Gauss-Newton Hessian.
+        """Return the path family, rescaled so that the energy has a unit Gauss-Newton Hessian.
 
         SLSQP starts with a unit matrix as Hessian, so the first step is the Gauss-Newton step at the prey
         path.
