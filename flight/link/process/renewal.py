@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flight.link.events import Severity
+from flight.link.events import CONFIG_DAMAGED, Severity
 from flight.link.modes import Mode
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import KINDS, PARTS, Activate, Privileged, Restart
@@ -76,14 +76,16 @@ class Renewal:
         return "" if self._write(name, encoded(values)) else "the request could not be stored"
 
     def followed(self, packet: bytes) -> None:
-        """Note a fault, or a reaction to SAFE, in a packet of live telemetry."""
+        """Note a fault, a refused configuration, or a reaction to SAFE, in a packet of live telemetry."""
         if packet[:2] == _MODE_LAYOUT.identifier.to_bytes(2, "big"):
             (row,) = _MODE_LAYOUT.array(packet)
             if row["mode"] == Mode.SAFE and to_text(row["trigger"]) == _REACTION:
                 self._fault = to_text(row["reason"])[:64] or _REACTION
         elif packet[:2] == _EVENT_LAYOUT.identifier.to_bytes(2, "big"):
             (row,) = _EVENT_LAYOUT.array(packet)
-            if row["severity"] == Severity.FAULT and not self._fault:
+            # A flight that refuses the new configuration flies its last good one.
+            fails = row["severity"] == Severity.FAULT or row["code"] == CONFIG_DAMAGED.code
+            if fails and not self._fault:
                 self._fault = f"{to_text(row['name'])}: {to_text(row['text'])}"[:64]
 
     def turn(self, admitted: int, now_ns: int) -> list[Report]:

@@ -138,14 +138,18 @@ def test_the_contact_counts_authentic_frames_and_reactions_to_safe(ends: Ends) -
     assert contact()["session"] != session
 
 
-@pytest.mark.parametrize("kind", [events.IMU_SILENT, events.COIL_BROKEN, events.DISK_LOW, events.MODE])
-def test_the_contact_has_the_first_event_of_severity_fault(ends: Ends, kind: events.EventKind) -> None:
+@pytest.mark.parametrize(
+    "kind",
+    [events.IMU_SILENT, events.COIL_BROKEN, events.CONFIG_DAMAGED, events.DISK_LOW, events.MODE],
+)
+def test_the_contact_has_the_first_event_that_ends_a_trial(ends: Ends, kind: events.EventKind) -> None:
     for text in ("first", "second"):
         fields = {"code": kind.code, "severity": int(kind.severity), "suppressed": 0, "name": kind.name}
         ends.record(ends.packer.pack(EVENT, ends.clock.now_ns(), fields | {"text": text}))
         ends.turn(11.0)
     fault = decoded((ends.place / "keys/renewal/contact").read_bytes())["fault"]
-    assert fault == (f"{kind.name}: first" if kind.severity is events.Severity.FAULT else "")
+    fails = kind.severity is events.Severity.FAULT or kind is events.CONFIG_DAMAGED
+    assert fault == (f"{kind.name}: first" if fails else "")
 
 
 def test_a_disk_that_cannot_be_written_is_reported_and_ends_nothing(tmp_path: Path) -> None:
