@@ -26,7 +26,12 @@ from knightcube.vision.horizon.illumination import (
     sun_elevation,
     why_not_space,
 )
-from knightcube.vision.horizon.initial_guess import SPHERE_ALTITUDE_SIGMA, InitialGuess, sun_from
+from knightcube.vision.horizon.initial_guess import (
+    SPHERE_ALTITUDE_SIGMA,
+    InitialGuess,
+    limb_tilt_sigma,
+    sun_from,
+)
 from knightcube.vision.horizon.limb import (
     SCALE_HEIGHT,
     UNIT_DEPTH_HEIGHT,
@@ -306,7 +311,7 @@ def examine(
         agreement(view, sun, observation.samples),
         _coverage(view, observation, used, sun, camera),
         night,
-        settings.sphere_sigma if np.isinf(stand.sigma) else 0.0,
+        limb_tilt_sigma(view, stand, settings),
         chance + math.log10(stand.share),
         float(np.median(observation.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma),
         why_not_space(view, sun, observation.samples, pixel),

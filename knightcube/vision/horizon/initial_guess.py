@@ -26,6 +26,7 @@ from functools import lru_cache
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, select, tangent_basis
+from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.horizon.edges import EdgeRays, Observation
 from knightcube.vision.horizon.illumination import agreement
@@ -267,7 +268,9 @@ def shortest_turn(source: FloatArray, target: FloatArray) -> FloatArray:
 
 
 SPHERE_ALTITUDE_SIGMA = 10e3
-"""Error (m) of an altitude above the mean sphere due to the flattening of the Earth."""
+"""Error (m) of a fitted altitude above the mean sphere due to the flattening of the Earth."""
+_RADIUS_SIGMA = math.sqrt(4.0 / 45.0) * (SEMI_MAJOR_AXIS - SEMI_MINOR_AXIS)
+"""Standard deviation (m) of the Earth's radius over all places on a sphere, 6.4 km."""
 _TURNS = 24
 """Number of trial rotations about nadir if the rotation is unknown."""
 
@@ -301,13 +304,37 @@ def above_sphere(altitude: float, sigma: float = 0.0) -> Place:
     return Place(np.array([0.0, 0.0, MEAN_RADIUS + altitude]), mean_sphere(), sigma, False)
 
 
+def limb_radius_sigma(altitude: float) -> float:
+    """Return the standard deviation (m) of the mean radius of the limb from an unknown place.
+
+    The difference between the ellipsoid and the mean sphere is a spherical harmonic of degree 2. The mean of
+    this harmonic over the limb is the value below the camera, multiplied by the Legendre polynomial P2 of the
+    cosine of the angle between the limb and the camera at the Earth's centre. `altitude` is above the mean
+    sphere, m.
+    """
+    cosine = MEAN_RADIUS / (MEAN_RADIUS + altitude)
+    return _RADIUS_SIGMA * abs(1.5 * cosine**2 - 0.5)
+
+
+def limb_tilt_sigma(view: LimbView, stand: Orientation, settings: HorizonSettings) -> float:
+    """Return the standard deviation per axis (rad) of the tilt of the limb by an unknown flattening.
+
+    The tilt is 0 if the rotation about nadir, and with it the direction of the flattening, is known.
+    """
+    if np.isfinite(stand.sigma):
+        return 0.0
+    return settings.sphere_sigma * MEAN_RADIUS**2 / float(view.position @ view.position)
+
+
 def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | None:
     """Return the camera's position from prior knowledge, or None if the altitude is unknown."""
     if knowledge.position is not None:
         position = np.asarray(knowledge.position, dtype=float)
         return Place(position, earth(knowledge.pole), settings.altitude_sigma, True)
     if knowledge.altitude is not None:
-        return above_sphere(knowledge.altitude, SPHERE_ALTITUDE_SIGMA)
+        # A larger Earth has the same effect on the limb as a lower altitude.
+        nearer = (MEAN_RADIUS + knowledge.altitude) / MEAN_RADIUS
+        return above_sphere(knowledge.altitude, nearer * limb_radius_sigma(knowledge.altitude))
     return None
 
 

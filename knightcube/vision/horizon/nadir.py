@@ -41,6 +41,7 @@ from knightcube.vision.horizon.initial_guess import (
     best_cone,
     initial_guess,
     left_free,
+    limb_tilt_sigma,
     orientation,
     place_of,
 )
@@ -498,8 +499,9 @@ def _measurement(
     """
     view, used = fit.view, int(np.count_nonzero(fit.used))
     altitude, nadir = view.surface.height_of(view.position), view.nadir
-    sigma = fit.altitude_sigma(0.0 if place is not None and place.located else SPHERE_ALTITUDE_SIGMA)
-    if place is None or place.altitude_sigma >= UNKNOWN:
+    free = place is None or place.altitude_sigma >= UNKNOWN
+    sigma = fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA if free else 0.0)
+    if free:
         mean, share = limited_normal(altitude, sigma, altitudes)
         # The altitude is correlated with the rotation d (3,) of the camera, which displaces nadir n by d x n.
         gain = np.cross(fit.covariance[:3, ALTITUDE] / sigma**2, nadir)
@@ -717,7 +719,7 @@ def _joint_fit(
     shared = shared_error(fit, rays, sigma, prior, groups, own)
     fit = replace(fit, covariance=fit.covariance + shared)
     nadir = fit.view.nadir
-    allowance = settings.sphere_sigma if np.isinf(stand.sigma) else 0.0
+    allowance = limb_tilt_sigma(fit.view, stand, settings)
     covariance = fit.nadir_covariance + allowance**2 * (np.eye(3) - np.outer(nadir, nadir))
     pixel = 1.0 / camera.lens.focal_length
     residual = float(np.sqrt(np.mean(fit.residuals[fit.used] ** 2))) / pixel

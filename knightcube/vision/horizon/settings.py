@@ -163,8 +163,9 @@ class HorizonSettings:
         some_edges: number of edges in an image below which the image is not searched again.
         candidates: maximum number of horizons that are searched for in one image.
         tries: maximum number of pairs or triples of edges that are tried for each horizon.
-        sphere_sigma: standard deviation per axis, rad, that is added to nadir if the direction of the Earth's
-            flattening is unknown.
+        sphere_sigma: standard deviation per axis, rad, of the tilt of a limb near the camera by the Earth's
+            flattening, added to nadir if the direction of the flattening is unknown. The tilt of the limb
+            decreases with the square of the distance from the Earth's centre.
     """
 
     edges: EdgeSettings = field(default_factory=EdgeSettings)
@@ -177,7 +178,7 @@ class HorizonSettings:
     some_edges: int = 4
     candidates: int = 4
     tries: int = 400
-    sphere_sigma: float = math.radians(0.08)
+    sphere_sigma: float = math.radians(0.1)
 
     def __post_init__(self) -> None:
         low, high = self.altitudes

@@ -184,7 +184,8 @@ def test_an_uncertain_field_of_view_is_in_the_uncertainty(folder: Path) -> None:
         )
         assert done.returncode == 0, done.stderr
         facts[field, error] = json.loads(done.stdout)
-    assert facts[67.0, 3.3]["sigma_deg"] > 1.5 * facts[67.0, None]["sigma_deg"]
+    # The curvature of the limb from a known altitude determines much of the focal length.
+    assert facts[67.0, 3.3]["sigma_deg"] > 1.1 * facts[67.0, None]["sigma_deg"]
     for uncertain in (facts[67.0, 3.3], facts[70.3, 3.3]):
         off = np.subtract(uncertain["nadir_camera"], facts[67.0, None]["nadir_camera"])
         spread, axes = np.linalg.eigh(np.array(uncertain["covariance_rad2"]))

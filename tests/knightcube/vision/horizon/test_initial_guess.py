@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, normalise
 from knightcube.vision.horizon.edges import EdgeRays
 from knightcube.vision.horizon.illumination import limb_rays
@@ -17,12 +17,14 @@ from knightcube.vision.horizon.initial_guess import (
     above_sphere,
     best_cone,
     left_free,
+    limb_radius_sigma,
+    limb_tilt_sigma,
     orientation,
     place_of,
     shortest_turn,
     sun_from,
 )
-from knightcube.vision.horizon.limb import MEAN_RADIUS, UNKNOWN, LimbView, mean_sphere
+from knightcube.vision.horizon.limb import MEAN_RADIUS, UNKNOWN, LimbView, earth, mean_sphere
 from knightcube.vision.horizon.settings import (
     HorizonKnowledge,
     HorizonSettings,
@@ -274,8 +276,7 @@ def test_the_place_is_the_position_or_the_altitude_or_unknown() -> None:
     sphere = place_of(HorizonKnowledge(altitude=4e5), settings)
     assert sphere is not None
     assert float(np.linalg.norm(sphere.position)) == pytest.approx(MEAN_RADIUS + 4e5)
-    # The Earth's radius lies between 6,356.8 and 6,378.1 km, which is 7 km to 14 km from the mean radius.
-    assert 7e3 < sphere.altitude_sigma < 14e3 < UNKNOWN
+    assert 4e3 < sphere.altitude_sigma < 7e3 < UNKNOWN
     assert place_of(HorizonKnowledge(), settings) is None
     sunny = HorizonKnowledge(sun=np.array([0.0, 3.0, 4.0]))
     sun = sun_from(known, sunny)
@@ -283,3 +284,25 @@ def test_the_place_is_the_position_or_the_altitude_or_unknown() -> None:
     assert sun == pytest.approx([0.0, 0.6, 0.8])
     assert sun_from(sphere, sunny) is None
     assert sun_from(known, HorizonKnowledge()) is None
+
+
+@pytest.mark.parametrize("altitude", [250e3, 700e3, 1900e3])
+def test_the_errors_of_the_spherical_model_are_those_of_limbs_of_the_ellipsoid(altitude: float) -> None:
+    """The truth is the circular cone through the limb of the ellipsoid, from places all over a sphere."""
+    count = 300
+    height = (2.0 * np.arange(count) + 1.0) / count - 1.0
+    radii, tilts = np.zeros(count), np.zeros((count, 2))
+    for k, z in enumerate(height):
+        position = (MEAN_RADIUS + altitude) * np.array([math.sqrt(1.0 - z * z), 0.0, z])
+        view = LimbView(np.eye(3), position, earth(NADIR), 0.0)
+        cone, *_ = np.linalg.lstsq(limb_rays(view, 72), np.ones(72), rcond=None)
+        size = float(np.linalg.norm(cone))
+        radii[k] = float(np.linalg.norm(position)) * math.sqrt(1.0 - size**-2)
+        tilts[k] = tangent_basis(view.nadir) @ cone / size
+    assert np.sqrt(np.mean((radii - MEAN_RADIUS) ** 2)) == pytest.approx(limb_radius_sigma(altitude), rel=0.1)
+    place = above_sphere(altitude)
+    view = LimbView(np.eye(3), place.position, place.surface, 0.0)
+    stand = orientation(view.nadir, view.nadir, HorizonKnowledge())
+    tilt = limb_tilt_sigma(view, stand, HorizonSettings())
+    assert np.sqrt(np.mean(tilts**2)) == pytest.approx(tilt, rel=0.1)
+    assert limb_tilt_sigma(view, replace(stand, sigma=0.1), HorizonSettings()) == 0.0

@@ -22,6 +22,7 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.horizon.edges import find_edges
 from knightcube.vision.horizon.hypothesis import Hypothesis, examine
 from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness
+from knightcube.vision.horizon.initial_guess import limb_radius_sigma
 from knightcube.vision.horizon.limb import UNIT_DEPTH_HEIGHT, limb_light
 from knightcube.vision.horizon.nadir import (
     HorizonSolution,
@@ -486,7 +487,7 @@ def test_a_measurement_states_its_altitude_points_and_tangent_covariance(
     assert found.nadir.sigma == pytest.approx(np.sqrt(0.5 * np.trace(tangent)), rel=1e-6)
     assert found.nadir.covariance @ found.nadir.direction == pytest.approx(np.zeros(3), abs=1e-12)
     assert found.nadir.direction == pytest.approx(found.view.nadir)
-    # An altitude above the mean sphere is wrong by the flattening of the Earth.
+    # An altitude above the mean sphere is wrong by the flattening of the Earth, and the limb improves it.
     sphere = find_nadir(frame, MODEL.lens, HorizonKnowledge(altitude=600e3), SETTINGS)
     assert sphere.nadir is not None
-    assert 10e3 < sphere.nadir.altitude_sigma < 20e3
+    assert 2e3 < sphere.nadir.altitude_sigma < limb_radius_sigma(600e3)
