@@ -79,6 +79,8 @@ IMU_REFUSED = _warning(
     15, "imu-refused", "inertial measurements that disagree with the estimate are rejected"
 )
 IMU_UNUSABLE = _fault(16, "imu-unusable", "the inertial unit sends bytes that contain no reading")
+GYRO_LOST = _fault(155, "gyro-lost", "the inertial unit sends readings without a valid rate")
+GYRO_RECOVERED = _info(156, "gyro-recovered", "the inertial unit measures the rate again")
 CONTROL_LOST = _fault(
     20, "control-lost", "the coils are set to zero because there is no valid estimate", Reaction.COILS_OFF
 )

@@ -338,6 +338,7 @@ class BodyEstimation(Protocol):
         feed: object that passes the inertial unit's readings to the filter.
         coil_monitor: monitor that detects broken coils.
         learned_problems: reasons why parameters that an earlier boot learned were rejected.
+        uses_readings_without_rate: whether the feed accepts readings with an invalid rate.
         horizon_cameras: use of the horizon cameras' frames, or None without these cameras.
     """
 
@@ -345,6 +346,7 @@ class BodyEstimation(Protocol):
     feed: ReadingFeed
     coil_monitor: CoilMonitor
     learned_problems: list[str]
+    uses_readings_without_rate: bool = False
     horizon_cameras: HorizonCameraUse | None = None
 
     def field(self, estimate: Estimate) -> FloatArray:

@@ -137,7 +137,7 @@ class ControlCycle:
         overdue = None
         if estimate is not None and self._target is not None:
             overdue = control.targets.error_when_due(estimate, self._target, now_ns)
-        rate = math.hypot(*record.readings[-1].rate.tolist()) if record.readings else None
+        rate = tasks.navigation.speed if record.readings else None
         record.mode = tasks.modes.step(estimate, rate, overdue, not record.coils.error, now_ns)
         target = tasks.modes.target(now_ns - self._recorder.epoch_ns)
         if target is not self._target:
@@ -145,7 +145,7 @@ class ControlCycle:
             if target is not None:
                 self._body.view.announce(target, now_ns)
                 control.planner.aim(target, now_ns)
-        measured = tasks.navigation.is_measured(now_ns)
+        measured = tasks.navigation.is_measured(estimate, now_ns)
         if estimate is not None and not self._had_estimate:
             control.planner.request(now_ns)
         elif measured and not self._was_measured:

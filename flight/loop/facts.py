@@ -166,6 +166,7 @@ COILS_BROKEN = (
 )
 """Facts that a coil is broken, in the order of the coils."""
 FIELD_EXTRAPOLATED = Fact("field-extrapolated", events.FIELD_EXTRAPOLATED)
+GYRO_LOST = Fact("gyro-lost", events.GYRO_LOST, events.GYRO_RECOVERED, after=4, mended_after=4)
 
 FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isinstance(value, Fact))
 

@@ -34,7 +34,7 @@ from hal.interfaces.devices import (
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Estimate
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 
 _AT_A_TIME = 16
@@ -42,6 +42,9 @@ _AT_A_TIME = 16
 
 Repeating the filter updates of one second takes a few control cycles.
 """
+
+_LARGEST_ANGLE_SIGMA, _LARGEST_RATE_SIGMA = 0.01, 0.01
+"""Largest standard deviations (rad, rad/s) of an estimate by which the coils are driven without a gyro."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +86,9 @@ class Navigation:
         self._doubted = False
         self._coil_factors = estimation.coil_monitor.correction.factors
         self._available = estimation.coil_monitor.available
+        self._has_rate = True
         self.speed = 0.0
-        """Body rate (rad/s) of the newest reading, including the gyro bias."""
+        """Body rate (rad/s) of the newest reading, including the gyro bias; without a gyro, the estimate."""
 
     def begin(self, time_ns: int) -> None:
         """Ignore readings made before the release of the body at `time_ns`."""
@@ -122,13 +126,15 @@ class Navigation:
             self._facts.update(facts.IMU_LINE_LOST, True, now_ns, str(error))
             return ()
         self._facts.update(facts.IMU_LINE_LOST, False, now_ns, "the serial port is back")
-        readings = tuple(reading for reading in polled if reading.time_ns >= self._since_ns)
+        readings = tuple(reading for reading in polled if self._is_usable(reading, now_ns))
         for reading in readings:
             self._ingest(reading)
             self._streams.note("imu", reading.time_ns)
             self._streams.note("field", reading.time_ns, math.hypot(*reading.field.tolist()))
             self._received_ns = reading.time_ns
-            self.speed = math.hypot(*reading.rate.tolist())
+            self._has_rate = reading.has_rate
+            if reading.has_rate:
+                self.speed = math.hypot(*reading.rate.tolist())
         self._watch_line(now_ns)
         doubted = self._filter.doubts_commands
         if doubted and not self._doubted:
@@ -142,13 +148,26 @@ class Navigation:
         """Return whether the newest reading will be recent enough for control until the next cycle."""
         return self._is_fresh(self._received_ns, now_ns)
 
-    def is_measured(self, now_ns: int) -> bool:
-        """Return whether the estimate will be recent enough for driving the coils until the next cycle.
+    def is_measured(self, estimate: Estimate | None, now_ns: int) -> bool:
+        """Return whether the estimate will be good enough for driving the coils until the next cycle.
 
         The newest reading that agreed with the estimate must stay within its age limit until the next cycle.
-        An estimate that is only propagated by the model is recorded, but not used for steering.
+        An estimate that is only propagated by the model is recorded, but not used for steering. Without a
+        gyro, the covariance of the estimate must also be small enough.
         """
-        return self._filter.started and self._is_fresh(self._agreed_ns, now_ns)
+        if estimate is None or not self._is_fresh(self._agreed_ns, now_ns):
+            return False
+        angle, rate = (float(estimate.covariance.diagonal()[part].max()) for part in (ATTITUDE, RATE))
+        accurate = angle <= _LARGEST_ANGLE_SIGMA**2 and rate <= _LARGEST_RATE_SIGMA**2
+        return self._has_rate or accurate
+
+    def _is_usable(self, reading: ImuReading, now_ns: int) -> bool:
+        """Return whether the filter can use a reading, and report a reading without a valid rate."""
+        if reading.time_ns < self._since_ns:
+            return False
+        text = "the rate is valid again" if reading.has_rate else f"invalid: {self._unit.link().rejection}"
+        self._facts.update(facts.GYRO_LOST, not reading.has_rate, now_ns, text)
+        return reading.has_rate or self._estimation.uses_readings_without_rate
 
     def _is_fresh(self, time_ns: int, now_ns: int) -> bool:
         return now_ns + self._settings.period_ns - time_ns < self._settings.max_age_ns
@@ -158,7 +177,10 @@ class Navigation:
         # During a long silence, the propagated estimate becomes inaccurate and slow to compute.
         if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
             return None
-        return self._filter.at(now_ns)
+        estimate = self._filter.at(now_ns)
+        if not self._has_rate:
+            self.speed = math.hypot(*estimate.rate.tolist())
+        return estimate
 
     def past(self, time_ns: int) -> Estimate | None:
         """Return the estimate at a past time, or None beyond the filter's history."""
@@ -226,7 +248,7 @@ class Navigation:
             self._events.report(events.IMU_CORRUPT, now_ns, text)
         odd = link.out_of_range - before.out_of_range
         endless = link.not_finite - before.not_finite
-        if odd or endless:
+        if (odd or endless) and not self._facts.holds(facts.GYRO_LOST):
             text = f"{odd} packets out of range, {endless} not finite: {link.rejection}"
             self._events.report(events.IMU_IMPLAUSIBLE, now_ns, text)
 

@@ -114,7 +114,7 @@ class CoilDrive:
             watch.commanded(now_ns, in_force.current, in_force.braked, in_force.written_ns)
         if not known:
             watch.interrupted(now_ns)
-        for reading in readings:
+        for reading in filter(lambda reading: reading.has_rate, readings):
             watch.observe_motion(reading.time_ns, reading.rate, reading.field)
         answer = self._power.latest() if self._power is not None and not self._power.error() else None
         if answer is not None:
@@ -221,11 +221,11 @@ _NO_DIPOLE: FloatArray = np.zeros(3)
 class Steering:
     """Steers the body along its path, detumbles it, or keeps the coils at zero.
 
-    Control is lost when no recent reading agrees with the estimate or, in detumbling, when there is no recent
-    reading. The estimate is propagated by the model during a silence of the inertial unit, so that control
-    returns smoothly. The currents are zero within a tenth of a second after the last reading. If the planner
-    fails, the body follows its last path and is held at its end (event `holding`). Without a path, the
-    currents are zero.
+    Control is lost when no recent reading agrees with the estimate, when without a gyro the estimate becomes
+    too inaccurate or, in detumbling, when there is no recent reading. The estimate is propagated by the model
+    during a silence of the inertial unit, so that control returns smoothly. The currents are zero within a
+    tenth of a second after the last reading. If the planner fails, the body follows its last path and is held
+    at its end (event `holding`). Without a path, the currents are zero.
     """
 
     def __init__(self, body: FlightBody, drive: CoilDrive, services: Services) -> None:
@@ -240,7 +240,8 @@ class Steering:
         """
         control = self._body.control
         reference = control.paths.sample(now_ns)
-        text = "steering again" if estimate else "no measurement fresh enough to steer by: coils to zero"
+        reason = "no measurement fresh enough or no estimate accurate enough to steer by: coils to zero"
+        text = "steering again" if estimate else reason
         self._facts.update(facts.CONTROL_LOST, estimate is None and ever_started, now_ns, text)
         state, dipole, saturated, adrift = SteeringState.OFF, _NO_DIPOLE, False, False
         if estimate is None or reference is None:

@@ -6,6 +6,7 @@ ms stays exact for years. Arrays are float64 and must be treated as read-only.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -31,7 +32,8 @@ class ImuReading:
         arrival_ns: host time at which the last byte of the packet was received, ns.
         device_time_ns: time of the unit's own clock since the unit was started, ns.
         quaternion: (4,) rotation of the reference frame into the body frame, scalar last.
-        rate: (3,) body rate with respect to inertial space, in body axes, rad/s.
+        rate: (3,) body rate with respect to inertial space, in body axes, rad/s; NaN if the gyro's output is
+            invalid.
         field: (3,) magnetic field in body axes, T.
         acceleration: (3,) specific force in body axes, m/s^2.
     """
@@ -43,6 +45,11 @@ class ImuReading:
     rate: FloatArray
     field: FloatArray
     acceleration: FloatArray
+
+    @property
+    def has_rate(self) -> bool:
+        """Whether the gyro's output is valid."""
+        return math.isfinite(self.rate[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +64,10 @@ class ImuLink:
         packets: number of valid packets.
         bad_checksum: number of packets with a wrong checksum.
         discarded_bytes: number of bytes outside valid packets.
-        out_of_range: number of samples rejected because a value is physically impossible.
-        not_finite: number of samples rejected because a value is not finite.
+        out_of_range: number of samples with a value that is physically impossible.
+        not_finite: number of samples with a value that is not finite.
         last_byte_ns: host time of the last received byte, ns; -1 before the first byte.
-        rejection: quantity and value for which the last sample was rejected, or an empty text.
+        rejection: quantity and value of the last sample with an invalid value, or an empty text.
     """
 
     bytes_received: int

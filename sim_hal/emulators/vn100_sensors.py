@@ -200,7 +200,9 @@ class MessageData:
     def text(self, names: str) -> list[str]:
         """Return the values of named quantities as text in the unit's format."""
         quantities = (_QUANTITIES[name] for name in names.split())
-        return [form % value for read, form in quantities for value in read(self)]
+        pairs = [(form, value) for read, form in quantities for value in read(self)]
+        # The zero padding would make a text that cannot be read as a NaN.
+        return [form % value if math.isfinite(value) else f"{value:+}" for form, value in pairs]
 
     def linear_acceleration(self) -> FloatArray:
         """Return the acceleration (3,) without gravity, body axes."""

@@ -180,6 +180,11 @@ def _wrong_samples(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
     return hold(bench.hardware.unit, "alter", alter, None)
 
 
+def _dead_gyro(bench: Bench, *_: object) -> Removal:
+    """Make the unit's rate NaN; its attitude, magnetic field and acceleration are not changed."""
+    return hold(bench.hardware.unit, "alter", lambda sample: replace(sample, rate=np.full(3, math.nan)), None)
+
+
 FULL_SCALE = 2.5
 """Full scale (gauss) of one magnetometer axis, from the VN-100 data sheet."""
 
@@ -504,6 +509,7 @@ _ALL = (
     _fault("imu: silent", "no byte arrives", _on_line, adds=True),
     _fault("imu: unplugged", "the serial port disappears", _unplugged),
     _fault("imu: stuck", "valid packets, constant values", _stuck_samples),
+    _fault("imu: gyro-dead", "valid packets, the rate is not a number", _dead_gyro),
     _fault("imu: garbage", "random bytes replace its own", _on_line, adds=True),
     _fault("imu: wrong", "valid packets, wrong values", _wrong_samples, _WRONG),
     _fault("imu: slow", "one of n packets arrives", _on_line, {"n": _count(8.0, 2.0, 1000.0)}, adds=True),

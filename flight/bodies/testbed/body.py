@@ -7,7 +7,7 @@ the second component of the quaternion.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -46,7 +46,6 @@ from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import ResponseSettings
 from flight.loop.facts import Services
 from flight.loop.state import Learned, start_from
-from flight.schema.devices import InertialUnitSection
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from flight.schema.testbed import TestbedConfig, as_testbed
 from hal.interfaces.devices import ImuReading
@@ -68,12 +67,38 @@ from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, PathGuida
 from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant
 from knightcube.gnc.guidance.one_axis.vmc import NODES
 
+_UNKNOWN_RATE = 1.0
+"""Standard deviation (rad/s) of the body rate if the filter starts without a gyro."""
+_LEAST_FIELD = 0.5
+"""Smallest measured horizontal field that gives a heading, as a fraction of the modelled field."""
+_COILS_DECAYED_NS = 50_000_000
+"""Time (ns) from the end of a coil current until the coil's field has decayed and left the unit's filters."""
+_CONSTANT_FOR = 5.0
+"""Time (s) during which the coils' field at the magnetometer is treated as constant."""
+_VACUUM_PERMEABILITY = 4e-7 * math.pi  # T m/A
+
 
 class UnitFeed:
-    """Starts and updates the filter from the unit's attitude and rate; implements `ReadingFeed`."""
+    """Starts and updates the filter from the unit's attitude and rate; implements `ReadingFeed`.
 
-    def __init__(self, filter_: AttitudeFilter, unit: InertialUnitSection) -> None:
+    The unit's own attitude filter depends on its gyro. While the rate is invalid, the angle about the thread
+    therefore follows from the horizontal magnetic field, and the rate from the plant model. The field of the
+    body's own coils at the magnetometer is not known. It is treated as an error as large as the field at the
+    centre of a coil, which stays constant for `_CONSTANT_FOR` seconds. While the coils are driven, star
+    attitudes and streak rates therefore outweigh the magnetometer.
+    """
+
+    def __init__(
+        self, filter_: AttitudeFilter, config: TestbedConfig, field: Callable[[int], FloatArray]
+    ) -> None:
+        """`field` is a function of a time that returns the magnetic field (3,), T, in reference axes."""
+        unit = config.inertial_unit
         self._filter = filter_
+        self._field = field
+        # Field (T) at the centre of a square coil per dipole moment (A m^2), by the law of Biot and Savart.
+        side = math.sqrt(config.plant.coil_area)
+        self._field_per_dipole = 2.0 * math.sqrt(2.0) * _VACUUM_PERMEABILITY / (math.pi * side**3)
+        self._same_error = max(_CONSTANT_FOR * unit.rate_hz, 1.0)
         self._angle_covariance: FloatArray = np.eye(3) * unit.angle_noise**2
         self._rate_covariance: FloatArray = np.eye(3) * unit.rate_noise**2
 
@@ -81,6 +106,8 @@ class UnitFeed:
         """Start the filter from a reading, or update it with the attitude and the rate of the reading."""
         latency = self._filter.latency
         time_ns = reading.time_ns - round(latency * SECOND_NS)
+        if not reading.has_rate:
+            return self._accept_field(time_ns, reading.field, latency)
         attitude = AttitudeMeasurement(time_ns, reading.quaternion, self._angle_covariance, latency)
         rate = RateMeasurement(time_ns, reading.rate, self._rate_covariance, latency)
         if not self._filter.started:
@@ -93,6 +120,27 @@ class UnitFeed:
             return ReadingAgreement(True)
         angle = angle_about_axis_y(reading.quaternion)
         return ReadingAgreement(turned or moved, f"angle {angle:.4f} rad, rate {reading.rate[1]:.5f} rad/s")
+
+    def _accept_field(self, time_ns: int, field: FloatArray, latency: float) -> ReadingAgreement:
+        """Start the filter from the direction of the magnetic field, or update it with this direction."""
+        x, _, z = field.tolist()
+        reference_x, _, reference_z = self._field(time_ns).tolist()
+        strength, expected = math.hypot(x, z), math.hypot(reference_x, reference_z)
+        if not strength >= _LEAST_FIELD * expected:
+            text = f"horizontal field {strength:.2e} T, expected {expected:.2e} T,"
+            return ReadingAgreement(False, text)
+        angle = math.atan2(reference_x, reference_z) - math.atan2(x, z)
+        dipole = self._filter.largest_dipole(time_ns - _COILS_DECAYED_NS, time_ns)
+        by_coils = self._field_per_dipole * dipole / expected
+        covariance = self._angle_covariance + self._same_error * by_coils**2 * np.eye(3)
+        attitude = AttitudeMeasurement(time_ns, about_axis_y(angle), covariance, latency)
+        if not self._filter.started:
+            unknown = RateMeasurement(time_ns, np.zeros(3), np.eye(3) * _UNKNOWN_RATE**2, latency)
+            self._filter.start(attitude, unknown)
+            return ReadingAgreement(True)
+        if self._filter.measure(attitude):
+            return ReadingAgreement(True)
+        return ReadingAgreement(False, f"angle {angle:.4f} rad by the magnetic field")
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
         """Return False, because only the inertial unit's attitude starts this filter."""
@@ -166,6 +214,8 @@ _THREAD_AXIS = np.array([0.0, 1.0, 0.0])
 class TestbedEstimation(BodyEstimation):
     """Estimation of the testbed: its attitude filter and coil monitor."""
 
+    uses_readings_without_rate = True
+
     def __init__(
         self,
         config: TestbedConfig,
@@ -182,14 +232,17 @@ class TestbedEstimation(BodyEstimation):
         self._density = noise**2 / CONTROL_RATE_HZ * np.eye(3)
         filter_, self.learned_problems = attitude_filter(config, plant, learned, cage)
         self.filter = filter_
-        self.feed = UnitFeed(filter_, config.inertial_unit)
+        self.feed = UnitFeed(filter_, config, self._field_at)
         self.coil_monitor = coil_monitor(config, plant)
 
     def field(self, estimate: Estimate) -> FloatArray:
         """Return the magnetic field (3,), T, in body axes."""
         angle = self._reader.read(estimate).angle
-        field = self._field if self._cage is None else self._cage.at(estimate.time_ns)
-        return np.asarray(attitude_matrix(about_axis_y(angle)) @ field)
+        return np.asarray(attitude_matrix(about_axis_y(angle)) @ self._field_at(estimate.time_ns))
+
+    def _field_at(self, time_ns: int) -> FloatArray:
+        """Return the magnetic field (3,), T, in reference axes."""
+        return self._field if self._cage is None else self._cage.at(time_ns)
 
     def angular_acceleration_psd(self, time_ns: int) -> FloatArray:
         """Return the power spectral density (3, 3), rad^2/s^3, of the acceleration due to current noise."""

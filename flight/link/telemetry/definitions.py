@@ -179,7 +179,7 @@ _NAMES = """
     memory-high! disk-low hot too-hot! imu-poor field-poor coils-poor power-poor camera-poor
     service-failing! camera-late vision-slow gps-lost gps-poor strings-lost sun-unclear clock-off
     field-refused wide-lost wide-false coil-4-broken! coil-5-broken! coil-6-broken!
-    field-extrapolated
+    field-extrapolated gyro-lost!
 """
 _FACTS: tuple[tuple[str, Level], ...] = tuple(
     (name.rstrip("!"), "fault" if name.endswith("!") else "warning") for name in _NAMES.split()

@@ -389,6 +389,7 @@ class Recovery:
 
 TESLA_PER_GAUSS = 1e-4
 _UNIT_NORM_TOLERANCE = 1e-2
+_NO_RATE = (math.nan, math.nan, math.nan)
 _CERTAIN = 4  # unexpected samples or messages after which the unit counts as misconfigured
 _ODD_TIME_NS = 5_000_000_000  # time without an unexpected message after which their count begins again
 _ANSWERS = frozenset(
@@ -413,9 +414,9 @@ class ReadingConverter:
 
     Attributes:
         resets: number of restarts of the unit, detected by backward steps of the device time.
-        out_of_range: number of samples rejected because values are physically impossible or stuck.
-        not_finite: number of samples rejected because a value is not finite.
-        rejection: quantity and value for which the last sample was rejected, or an empty text.
+        out_of_range: number of samples whose values are physically impossible or stuck.
+        not_finite: number of samples with a value that is not finite.
+        rejection: quantity and value of the last sample with an invalid value, or an empty text.
     """
 
     def __init__(self, settings: Vn100Settings, byte_ns: float, on_reset: Callable[[], None]) -> None:
@@ -447,33 +448,42 @@ class ReadingConverter:
         self._alike = 0
 
     def reading(self, item: BinaryPacket | AsciiLine) -> ImuReading | None:
-        """Return the reading in a packet or line, None if there is no reading or the reading is rejected."""
+        """Return the reading in a packet or line, None if there is no reading or the reading is rejected.
+
+        A reading of which only the rate is invalid has the rate NaN.
+        """
         sample = self._binary_sample(item) if isinstance(item, BinaryPacket) else self._ascii_sample(item)
         if sample is None:
             return None
         device_ns, q, rate, mag, accel = sample
-        numbers = (*q, *rate, *mag, *accel)
+        settings = self._settings
         # The sum of 32-bit floats cannot overflow, so the sum is finite only if all values are finite.
-        if not math.isfinite(sum(numbers)):
+        if not math.isfinite(sum((*q, *mag, *accel))):
             self.not_finite += 1
             self.rejection = self._fault(q, rate, mag, accel)
             return None
-        settings = self._settings
-        self._alike = self._alike + 1 if sample[1:] == self._sample else 0
-        self._sample = sample[1:]
+        has_rate = all(abs(value) <= settings.rate_range for value in rate)  # NaN compares false
+        compared = sample[1:] if has_rate else (q, mag, accel)
+        self._alike = self._alike + 1 if compared == self._sample else 0
+        self._sample = compared
         norm = math.hypot(*q)
         if (
             0 < settings.stuck_after <= self._alike
             or abs(norm - 1.0) > _UNIT_NORM_TOLERANCE
-            or max(map(abs, rate)) > settings.rate_range
             or max(map(abs, mag)) > settings.field_range / TESLA_PER_GAUSS
             or max(map(abs, accel)) > settings.acceleration_range
         ):
             self.out_of_range += 1
             self.rejection = self._fault(q, rate, mag, accel)
             return None
+        if not has_rate:
+            self.rejection = self._fault(q, rate, mag, accel)
+            finite = math.isfinite(sum(rate))
+            self.out_of_range += finite
+            self.not_finite += not finite
+            rate = _NO_RATE
         # One common array is faster than an array for each quantity.
-        values = np.array(numbers)
+        values = np.array((*q, *rate, *mag, *accel))
         quaternion = settings.attitude_map @ values[:4]
         # Of the two equivalent signs of the quaternion, the sign with a positive scalar part is returned.
         quaternion /= math.copysign(norm, quaternion[3])

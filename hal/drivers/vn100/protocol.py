@@ -282,7 +282,7 @@ def measurement(sentence: Sentence) -> Measurement | None:
     """Return the values of a VNQMR or VNYMR sentence, None for other sentences and for invalid numbers.
 
     Trailing fields that begin with T or S (count and status, see register 30) are ignored. NaN and infinite
-    values are returned, and the driver rejects them.
+    values are returned, and the driver checks them.
     """
     heads = {"QMR": 4, "YMR": 3}.get(sentence.command)
     if heads is None or len(sentence.fields) < heads + 9:

@@ -493,6 +493,14 @@ class AttitudeFilter:
             self._count(type(measurement), passed)
         branch.applied(used)
 
+    def largest_dipole(self, begin_ns: int, end_ns: int) -> float:
+        """Return the largest dipole moment (A m^2) that the coils may have had in an interval."""
+        body, sizes = self._model.body, [0.0]
+        for torquing, _ in self._commands.spans(begin_ns, end_ns):
+            unknown = 0.0 if torquing.known else body.dipole_per_ampere * self._settings.unknown_current
+            sizes.append(max(math.hypot(*torquing.dipole), unknown))
+        return max(sizes)
+
     @property
     def doubts_commands(self) -> bool:
         """Whether the coil currents are unknown because the motion contradicted the commands."""

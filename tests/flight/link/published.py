@@ -15,7 +15,7 @@ _PLAIN = {
         80 commanded  91 guardian-ready  94 real-time  97 service-recovered  100 attitude-knowledge
         102 gps-recovered  105 strings-recovered  107 sun-clear  108 slew-begun  109 slew-ended
         120 object-found  121 object-lost  122 object-followed  132 field-trusted  134 wide-recovered
-        136 wide-trusted  140 sun-found  144 coil-tested
+        136 wide-trusted  140 sun-found  144 coil-tested  156 gyro-recovered
         """,
     "warning": """
         3 cycle-slip  6 crashed-often  7 boot-waits  11 imu-corrupt  12 imu-implausible  15 imu-refused
@@ -34,7 +34,7 @@ _PLAIN = {
     "fault": """
         4 task-failed  9 no-progress  10 imu-silent  13 imu-line-lost  16 imu-unusable  49 worker-rests
         60 log-fault  79 release-left  90 guardian-lost  93 guardian-blind  96 service-failing
-        110 record-lost
+        110 record-lost  155 gyro-lost
         """,
 }
 _WITH_REACTION = {

@@ -38,7 +38,8 @@ class Bench:
         self.services.recorder.epoch_ns = 7 * PERIOD_NS
         self.services.jobs.collect.return_value = []
         self.tasks.drive.state.return_value = STILL
-        self.tasks.navigation.update.return_value = [SimpleNamespace(rate=np.array([0.0, 0.3, 0.4]))]
+        self.tasks.navigation.update.return_value = [SimpleNamespace()]
+        self.tasks.navigation.speed = 0.5
         self.tasks.navigation.estimate.return_value = ESTIMATE
         self.tasks.navigation.is_measured.return_value = True
         self.tasks.modes.step.return_value = mode

@@ -63,6 +63,7 @@ PERSISTENCE = {
     "sun-unclear": (3, 3, ""),
     "clock-off": (2, 1, ""),
     "wide-false": (3, 1, ""),
+    "gyro-lost": (4, 4, ""),
 } | {f"{stream}-poor": (4, 8, "") for stream in ("imu", "field", "coils", "power", "camera", "gps")}
 """Updates until a fact counts and until it ends, None for a latching fact, and the modes that watch it.
 
@@ -87,6 +88,7 @@ EVENTS_OF = {
     "field-refused": ("field-refused", "field-trusted"),
     "wide-lost": ("wide-lost", "wide-recovered"),
     "wide-false": ("wide-false", "wide-trusted"),
+    "gyro-lost": ("gyro-lost", "gyro-recovered"),
     **{f"coil-{axis}-broken": ("coil-broken", None) for axis in "xyz456"},
     **{name: (name, "resource-normal") for name in ("cpu-high", "memory-grows", "disk-low", "hot")},
     **{

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy import stats
 
 from hal.drivers.vn100.driver import OUTPUT_SET, Question, Vn100, Vn100Settings
 from hal.drivers.vn100.protocol import build, layout_of
+from hal.interfaces.devices import ImuLink, ImuReading
 from hal.interfaces.errors import CorruptData, NotResponding, OutOfRange, Refused
 from knightcube.astro.quaternion import (
     NED_TO_TESTBED,
@@ -327,10 +328,11 @@ def test_a_unit_that_must_not_be_set_up_is_left_alone_after_its_reset() -> None:
     [
         ({}, 0, 0),
         ({0: float("nan")}, 1, 0),
-        ({5: float("inf")}, 1, 0),
         ({3: 0.9}, 0, 1),
         ({3: 1.005}, 0, 0),
-        ({4: 36.0}, 0, 1),
+        ({4: 36.0, 8: 200.0}, 0, 1),
+        ({6: float("nan"), 10: -6.1}, 0, 1),
+        ({6: float("nan"), 11: float("nan")}, 1, 0),
         ({8: 200.0}, 0, 1),
         ({10: -6.1}, 0, 1),
         ({10: -5.9}, 0, 0),
@@ -339,6 +341,32 @@ def test_a_unit_that_must_not_be_set_up_is_left_alone_after_its_reset() -> None:
 def test_impossible_values_are_counted_not_given(
     values: dict[int, float], not_finite: int, out_of_range: int
 ) -> None:
+    readings, link = received(values)
+    assert (link.not_finite, link.out_of_range) == (not_finite, out_of_range)
+    assert len(readings) == 1 - not_finite - out_of_range
+    for reading in readings:
+        assert reading.has_rate
+        assert np.linalg.norm(reading.quaternion) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("axis", "value", "not_finite"),
+    [(0, 36.0, 0), (2, -35.0, 0), (1, float("inf"), 1), (2, float("nan"), 1)],
+)
+def test_a_sample_of_which_only_the_rate_is_invalid_is_given_without_a_rate(
+    axis: int, value: float, not_finite: int
+) -> None:
+    (reading,), link = received({4 + axis: value, 9: -9.8, 10: 2.0})
+    assert not reading.has_rate
+    assert np.isnan(reading.rate).all()
+    assert np.linalg.norm(reading.field) == pytest.approx(2e-4)
+    assert np.linalg.norm(reading.acceleration) == pytest.approx(9.8)
+    assert (link.not_finite, link.out_of_range) == (not_finite, 1 - not_finite)
+    assert link.rejection.startswith(f"rate {'xyz'[axis]} = ")
+
+
+def received(values: dict[int, float]) -> tuple[Sequence[ImuReading], ImuLink]:
+    """Return the readings and the counters after one packet at rest, whose values at some indices differ."""
     bench = bench_line()
     payload = [0.0, 0.0, 0.0, 1.0, *[0.0] * 9]
     for index, value in values.items():
@@ -348,12 +376,7 @@ def test_impossible_values_are_counted_not_given(
     bench.driver.poll()
     bench.line.device.write(layout_of(OUTPUT_SET).pack([123, *payload]), bench.clock.now_ns())
     bench.clock.sleep_until_ns(100_000_000)
-    readings = bench.driver.poll()
-    link = bench.driver.link()
-    assert (link.not_finite, link.out_of_range) == (not_finite, out_of_range)
-    assert len(readings) == 1 - not_finite - out_of_range
-    for reading in readings:
-        assert np.linalg.norm(reading.quaternion) == pytest.approx(1.0, abs=1e-12)
+    return bench.driver.poll(), bench.driver.link()
 
 
 @pytest.mark.parametrize(

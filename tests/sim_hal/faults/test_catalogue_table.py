@@ -57,8 +57,9 @@ PARAMETERS = {
     "config: corrupted": "bytes 3 1..10000 whole",
 }
 PLAIN = """
-imu: off, imu: silent, imu: unplugged, imu: stuck, imu: garbage, imu: reset, magnetometer: stuck,
-magnetometer: saturated, pwm: off, pwm: nack, pwm: garbage, pwm: brown-out, pwm: stuck, pwm: wrong,
+imu: off, imu: silent, imu: unplugged, imu: stuck, imu: gyro-dead, imu: garbage, imu: reset,
+magnetometer: stuck, magnetometer: saturated, pwm: off, pwm: nack, pwm: garbage, pwm: brown-out, pwm: stuck,
+pwm: wrong,
 monitor: off, monitor: nack, monitor: garbage, monitor: brown-out, monitor: stuck, bus: off,
 bus: arbitration, bus: hang, camera: off, camera: black, camera: saturated, camera: blinded, camera: frozen,
 camera: torn, camera: garbage, camera: wrong, gps: off, gps: silent, gps: no-fix, gps: stuck, gps: garbage,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from flight.schema import reader as configuration
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import LineFaults
-from sim_hal.emulators.vn100_sensors import Vn100Sample
+from sim_hal.emulators.vn100_sensors import MessageData, Vn100Sample
 from sim_hal.faults.bench import Bench, all_of, hold, no_removal
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.rig import build_lockstep
@@ -61,6 +62,17 @@ def test_a_stuck_unit_repeats_its_first_sample_and_a_stuck_magnetometer_only_its
     np.testing.assert_array_equal(first.mag, SAMPLE.mag)
     np.testing.assert_array_equal(second.mag, SAMPLE.mag)
     np.testing.assert_array_equal(second.rate, later.rate)
+
+
+def test_a_dead_gyro_makes_only_the_rate_invalid(bench: Bench) -> None:
+    (found,) = altered(bench, "imu: gyro-dead", [SAMPLE])
+    assert np.isnan(found.rate).all()
+    np.testing.assert_array_equal(found.quaternion, SAMPLE.quaternion)
+    np.testing.assert_array_equal(found.mag, SAMPLE.mag)
+    data = MessageData(0, found, 0, 0.025, 20.0, 101.0)
+    rate = data.text("rate")
+    assert all(math.isnan(float(value)) for value in rate), "the sentence contains numbers"
+    assert data.text("mag") == ["+00.2000", "-00.1000", "+00.4000"]
 
 
 def test_a_saturated_field_is_2_5_gauss_with_the_sign_of_each_axis(bench: Bench) -> None:
