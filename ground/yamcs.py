@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import re
 import secrets
 import shutil
 import subprocess
@@ -29,6 +30,7 @@ from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES
 from ground.link.gateway import ADDRESS, token_path
 from ground.link.terminal import DEFAULTS, FRAME_OVERHEAD_BYTES
 from ground.xtce import EPOCH, SPACE, document
+from ground.yamcs_operations import DISPLAYS, STACKS, stacks_and_displays
 from knightcube.errors import FlightError, UsageError
 
 INSTANCE = SPACE.lower()
@@ -36,6 +38,7 @@ HTTP_PORT = 8090
 KEYS = Path("keys/ground")
 CFDP, DOWN_BUCKET, UP_BUCKET = "files", "down", "up"
 """Yamcs's file transfer service, and the buckets (folders) of received files and of files to send."""
+_BUCKETS = (DOWN_BUCKET, UP_BUCKET, STACKS, DISPLAYS)
 _LOOPBACK = "127.0.0.1"
 _SECRET_BYTES = 16
 
@@ -44,7 +47,7 @@ services:
   - class: org.yamcs.http.HttpServer
     args: {{address: {host}, port: {http}}}
 instances: [{instance}]
-buckets: [{{name: {down}, path: {folder}/{down}}}, {{name: {up}, path: {folder}/{up}}}]
+buckets: [{buckets}]
 dataDir: {data}
 cacheDir: {data}/cache
 secretKey: {secret}
@@ -68,6 +71,7 @@ services:
   - class: org.yamcs.parameterarchive.ParameterArchive
   - class: org.yamcs.ProcessorCreatorService
     args: {{name: realtime, type: realtime}}
+  - class: org.yamcs.timeline.TimelineService
   - class: org.yamcs.cfdp.CfdpService
     name: {cfdp}
     args:
@@ -196,7 +200,6 @@ def files(
     The folder `keys` is that of the gateway, and no PDU needs a frame longer than `command_frame_bytes`.
     """
     host, port = host_port(gateway)
-    buckets = {"down": DOWN_BUCKET, "up": UP_BUCKET}
     server = _SERVER.format(
         host=_LOOPBACK,
         http=http_port,
@@ -204,7 +207,7 @@ def files(
         data=folder / "data",
         folder=folder,
         secret=secrets.token_hex(_SECRET_BYTES),
-        **buckets,
+        buckets=", ".join(f"{{name: {name}, path: {folder}/{name}}}" for name in _BUCKETS),
     )
     instance = _INSTANCE.format(
         gateway_host=host,
@@ -230,6 +233,7 @@ def files(
         "etc/processor.yaml": _PROCESSORS,
         LINK_SOURCE: _LINK,
         f"{INSTANCE}.xml": document(epoch=epoch, verified=True),
+        **stacks_and_displays(),
     }
 
 
@@ -254,10 +258,17 @@ def write(
             path.touch(mode=0o600)
             path.chmod(0o600)
             path.write_text(text, encoding="utf-8")
-        for name in ("data", DOWN_BUCKET, UP_BUCKET):
+        for name in ("data", *_BUCKETS):
             (folder / name).mkdir(exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written: {error.strerror or error}") from error
+
+
+def password_in(folder: Path) -> str:
+    """Return the password in the configuration in a folder."""
+    found = re.search(r'password: "(\w+)"', (folder / USERS).read_text(encoding="utf-8"))
+    assert found is not None
+    return found[1]
 
 
 _BUNDLE = "fprime_yamcs_bundle"

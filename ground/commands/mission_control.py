@@ -6,19 +6,40 @@ import argparse
 import contextlib
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flight.app.service import EndingSignals
 from flight.schema.document import config_path
 from flight.schema.reader import load
 from ground.commands.options import count
+from ground.commands.passes import add_stations, predicted
 from ground.link.commanding import terminal_of
 from ground.link.gateway import Gateway, new_token, token_file, token_path
 from ground.xtce import EPOCH
-from ground.yamcs import HTTP_PORT, KEYS, USER, USERS, command_line, compile_link, missing, write
+from ground.yamcs import (
+    HTTP_PORT,
+    INSTANCE,
+    KEYS,
+    USER,
+    USERS,
+    command_line,
+    compile_link,
+    missing,
+    password_in,
+    write,
+)
+from ground.yamcs_operations import Session, add_passes
 from knightcube.errors import FlightError, UsageError
 
+if TYPE_CHECKING:
+    from ground.passes import OrbitPrediction, Station
+
+_ASK_S = 0.2
+"""Interval (s) between two questions whether Yamcs runs."""
 _END_S = 30.0
 """Longest time (s) to wait for the end of Yamcs."""
 
@@ -29,7 +50,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Run the mission control system Yamcs for the satellite of a configuration. Yamcs gets the "
         "satellite's telemetry, limits and commands from our tables, and reaches the satellite through a "
         "gateway in this process, which holds the keys. Yamcs archives all packets, raises alarms at the "
-        "limits and transfers files. Needs Java 17 and the extra `interop`. Loopback only. Ctrl-C ends."
+        "limits, transfers files, executes command stacks and, with --station or --stations, shows the "
+        "passes on its timeline. Needs Java 17 and the extra `interop`. Loopback only. Ctrl-C ends."
     )
     parser.add_argument("config", type=config_path, metavar="CONFIG", help="configuration that is flown")
     text = "address of the satellite's link (default `link.udp`, or `link.tcp`, of CONFIG)"
@@ -42,6 +64,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=count, default=HTTP_PORT, metavar="PORT", help=text)
     text = "UTC of mission time zero (default %(default)s)"
     parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=text)
+    text = "file of two-line elements or OMM that predicts the passes (default `elements` of CONFIG)"
+    parser.add_argument("--elements", type=Path, metavar="FILE", help=text)
+    add_stations(parser)
     parser.set_defaults(command=run, spacecraft=None, frame_bytes=None)
 
 
@@ -56,6 +81,7 @@ def run(options: argparse.Namespace) -> int:
     options.link = options.link or default
     if options.link is None:
         raise UsageError(f"{options.config}: has neither `link.udp` nor `link.tcp`: give --link ADDRESS")
+    forecast = _forecast(options)
     folder, token = options.out.absolute(), new_token()
     with ExitStack() as stack:
         terminal = stack.enter_context(contextlib.closing(terminal_of(options)))
@@ -69,16 +95,49 @@ def run(options: argparse.Namespace) -> int:
         log = stack.enter_context((folder / "log").open("a", encoding="utf-8"))
         yamcs = subprocess.Popen(command_line(folder), stdout=log, stderr=subprocess.STDOUT)
         stack.callback(_end, yamcs)
-        address = f"http://127.0.0.1:{options.port}/"
-        sys.stdout.write(
-            f"Yamcs on {address}, user {USER}, password in {folder / USERS}, log in {folder / 'log'} "
-            "(Ctrl-C ends)\n"
-        )
-        sys.stdout.flush()
+        if _started(options.port, folder, forecast, lambda: signals.received or yamcs.poll() is not None):
+            sys.stdout.write(
+                f"Yamcs on http://127.0.0.1:{options.port}/, user {USER}, password in {folder / USERS}, "
+                f"log in {folder / 'log'} (Ctrl-C ends)\n"
+            )
+            sys.stdout.flush()
         gateway.run(lambda: signals.received or yamcs.poll() is not None)
         if not signals.received:
             raise FlightError(f"Yamcs has ended with status {yamcs.wait()}: see {folder / 'log'}")
     return 0
+
+
+_Forecast = tuple["OrbitPrediction", tuple["Station", ...]]
+
+
+def _forecast(options: argparse.Namespace) -> _Forecast | None:
+    """Return the predicted orbit and the stations, or None without stations. Raises UsageError."""
+    if not options.station and options.stations is None:
+        return None
+    source = argparse.Namespace(**{**vars(options), "config": options.elements or options.config})
+    return predicted(source)[:2]
+
+
+def _started(port: int, folder: Path, forecast: _Forecast | None, ended: Callable[[], bool]) -> bool:
+    """Wait until Yamcs answers or `ended` is true, show the passes, and return whether Yamcs answers."""
+    session = Session(f"http://127.0.0.1:{port}/api", USER, password_in(folder))
+    while not ended() and not _runs(session):
+        time.sleep(_ASK_S)
+    if ended():
+        return False
+    if forecast is not None:
+        try:
+            add_passes(session, INSTANCE, *forecast)
+        except OSError as error:
+            raise FlightError(f"Yamcs refuses the passes: {error}: see {folder / 'log'}") from error
+    return True
+
+
+def _runs(session: Session) -> bool:
+    try:
+        return bool(session.ask(f"/instances/{INSTANCE}")["state"] == "RUNNING")
+    except (OSError, ValueError):  # a ValueError is an answer that is not JSON
+        return False
 
 
 def _complain(text: str) -> None:

@@ -76,6 +76,11 @@ def _add_orbit(parser: argparse.ArgumentParser) -> None:
         metavar="CONFIG",
         help="configuration of the satellite with `elements`, or a file of two-line elements or OMM",
     )
+    add_stations(parser)
+
+
+def add_stations(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that select the satellite in a file of elements, the stations, and the span."""
     parser.add_argument(
         "--satellite", type=int, metavar="NUMBER", help="satellite number, if the file has several satellites"
     )
@@ -97,7 +102,7 @@ def _add_orbit(parser: argparse.ArgumentParser) -> None:
 
 def run_passes(options: argparse.Namespace) -> int:
     """Predict the passes and print them."""
-    prediction, stations, _ = _prediction(options)
+    prediction, stations, _ = predicted(options)
     from ground.passes import facts_of, scheduled_targets  # noqa: PLC0415
 
     found = prediction.passes(stations)
@@ -118,7 +123,7 @@ def run_day(options: argparse.Namespace) -> int:
     """Draw the day and print the name of the picture."""
     from ground.report import draw_day  # noqa: PLC0415
 
-    prediction, stations, config = _prediction(options)
+    prediction, stations, config = predicted(options)
     span = (prediction.end - prediction.begin).total_seconds()
     steps = [] if config is None else [step for step in config.targets if step.at < span]
     draw_day(prediction, stations, [(step.at, step.target().text) for step in steps], options.picture)
@@ -126,10 +131,13 @@ def run_day(options: argparse.Namespace) -> int:
     return 0
 
 
-def _prediction(
+def predicted(
     options: argparse.Namespace,
 ) -> tuple[OrbitPrediction, tuple[Station, ...], OrbitConfig | None]:
-    """Return the predicted orbit, the stations, and the configuration if one is given. Raises UsageError."""
+    """Return the predicted orbit, the stations, and the configuration if one is given. Raises UsageError.
+
+    The path `options.config` is that of a configuration or of a file of elements.
+    """
     try:
         from ground.passes import OrbitPrediction, read_stations, station_of  # noqa: PLC0415
     except ModuleNotFoundError as error:

@@ -21,6 +21,7 @@ STATED = {
     "GPL-3.0-or-later": "GNU General Public License v3 or later",
     "AGPL-3.0": "AGPL-3.0",
     "LGPL-2.1": "LGPL-2.1",
+    "LGPL-3.0": "LGPLv3",
     "Unlicense or MIT-0": "Unlicense|Public Domain",
 }
 """Pattern by licence, as packages state it in their metadata."""

@@ -7,20 +7,25 @@ from __future__ import annotations
 
 import json
 import socket
-import time
 import urllib.error
 import urllib.request
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
-from ground.xtce import SPACE
-from ground.yamcs import INSTANCE, USER, files, main, write
+from flight.link.telemetry.packets import LAYOUTS
+from ground.passes import OrbitPrediction, station_of
+from ground.xtce import SPACE, TELECOMMANDS, spread
+from ground.yamcs import INSTANCE, USER, files, main, password_in, write
+from ground.yamcs_operations import Session, add_passes, stacks_and_displays
 from tests.flight.app.cli.linked_board import free_ports, write_linked_config
 from tests.studies.interop.yamcs import PLANS, fly
 from tests.support.linked_flight import free_port, service
-from tests.support.yamcs_server import Yamcs, basic, credentials, missing, serving
+from tests.support.orbit_elements import POLAR_ORBIT
+from tests.support.yamcs_operator import Operator
+from tests.support.yamcs_server import basic, missing, serving
 
 
 def test_the_command_writes_the_whole_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -29,6 +34,26 @@ def test_the_command_writes_the_whole_configuration(tmp_path: Path, monkeypatch:
     written = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     assert written == set(files(tmp_path, "127.0.0.1:1", 1, "2026-11-23T12:00:00"))
     assert {path.stat().st_mode & 0o077 for path in tmp_path.rglob("*") if path.is_file()} == {0}, "passwords"
+
+
+def test_stacks_and_displays_name_commands_arguments_and_parameters_of_the_tables() -> None:
+    """Each argument is given, each state is one of its field, and each name is one that Yamcs knows."""
+    fields = {f"/{SPACE}/{name}": field for layout in LAYOUTS.values() for name, field in spread(layout)}
+    steps = []
+    for name, text in stacks_and_displays().items():
+        content = json.loads(text)
+        steps += content.get("steps", ())
+        assert set(content.get("parameters", ())) <= set(fields), name
+    for step in steps:
+        if step["type"] == "command":
+            packet = TELECOMMANDS[step["name"].removeprefix(f"/{SPACE}/")].packet
+            given = [(one["name"], one["value"]) for one in step["arguments"]]
+            assert [name for name, _ in given] == [field.name for field in packet.fields]
+            pairs = [(field, value) for field, (_, value) in zip(packet.fields, given, strict=True)]
+        else:
+            pairs = [(fields[one["parameter"]], one["value"]) for one in step["condition"]]
+        assert all(not field.states or value in dict(field.states).values() for field, value in pairs), step
+    assert {step["type"] for step in steps} == {"command", "verify"}
 
 
 @pytest.mark.parametrize(("frame_bytes", "unit_bytes"), [(1024, 900), (300, 246), (128, 74)])
@@ -66,24 +91,43 @@ def test_yamcs_does_not_obey_a_web_page_that_has_no_password(tmp_path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
-def test_mission_control_commands_the_satellite_of_a_configuration(tmp_path: Path) -> None:
+@pytest.mark.timeout(300)
+def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path: Path) -> None:
+    """An alarm is raised and acknowledged, stacks run, files go both ways, and a pass is on the timeline."""
     (udp,), http = free_ports([socket.SOCK_DGRAM]), free_port()
-    config, out = write_linked_config(tmp_path, udp=f"127.0.0.1:{udp}"), tmp_path / "out"
+    config = write_linked_config(tmp_path, udp=f"127.0.0.1:{udp}", rate=1_000_000)
+    out, run = tmp_path / "out", tmp_path / "runs"
+    elements = tmp_path / "elements.txt"
+    elements.write_text("\n".join(POLAR_ORBIT) + "\n", encoding="utf-8")
     words = ["mission-control", config, "--keys", tmp_path / "keys" / "ground", "--out", out, "--port", http]
+    words += ["--elements", elements, "--station", "Berlin,52.5,13.4", "--from", "2026-03-20T12:00:00"]
+    begin, station = datetime(2026, 3, 20, 12, tzinfo=UTC), station_of("Berlin,52.5,13.4")
+    prediction = OrbitPrediction(POLAR_ORBIT, begin, 1.0)
     with ExitStack() as stack:
-        link = ("link", config, "--log", tmp_path / "runs")
-        stack.enter_context(service(tmp_path / "link.log", "link open", *link))
-        process = stack.enter_context(service(tmp_path / "said", "Yamcs on", *words))
-        server = Yamcs(f"http://127.0.0.1:{http}/api", process, out / "log", credentials(out))
-        server.wait()
-        until = time.monotonic() + 60.0
-        while not server.link_up() and time.monotonic() < until:
-            time.sleep(0.2)
-        identifier = server.command("list-schedule", {})
-        while "CommandComplete_Status" not in (history := server.history(identifier)):
-            assert time.monotonic() < until + 60.0, history
-            time.sleep(0.2)
-    assert history["CommandComplete_Status"] == "OK"
+        stack.enter_context(service(tmp_path / "link.log", "link open", "link", config, "--log", run))
+        stack.enter_context(service(tmp_path / "said", "Yamcs on", *words))
+        flight = ("run", config, "--realtime", "--out", run)
+        stack.enter_context(service(tmp_path / "flight.log", "", *flight))
+        operator = Operator(http, password_in(out))
+        operator.wait_for("health_mode", "testbed-demo")
+        assert operator.run_stack("leave-safe-to-hold") == "FAILED", "the condition is not met"
+        assert operator.run_stack("enter-safe") == "SUCCESSFUL"
+        assert operator.raised_and_acknowledged("health_mode") == ("WARNING", True, "seen")
+        assert operator.run_stack("leave-safe-to-hold") == "SUCCESSFUL"
+        assert operator.sent() == ["safe", "mode"], "no command follows a condition that is not met"
+        assert operator.downloaded("log/config.yaml") == (run / "config.yaml").read_bytes()
+        operator.upload(b"new elements", "elements/new.txt")
+        received = tmp_path / "keys" / "files" / "received" / "elements" / "new.txt"
+        assert received.read_bytes() == b"new elements"
+        passes = operator.passes()
+        add_passes(
+            Session(f"http://127.0.0.1:{http}/api", USER, password_in(out)), INSTANCE, prediction, [station]
+        )
+        assert operator.passes() == passes, "a second prediction replaces the first"
+    foreseen = prediction.passes([station])
+    assert [start for start, _ in passes] == [one.rise.replace(microsecond=0) for one in foreseen]
+    lengths = [(one.set - one.rise).total_seconds() for one in foreseen]
+    assert [seconds for _, seconds in passes] == pytest.approx(lengths, abs=1.5)
     assert "connection closed" not in (tmp_path / "said").read_text(encoding="utf-8")
 
 
