@@ -93,7 +93,7 @@ def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agree
         dark = away & (dark | ((outside < 0.0) & (elevation < -_TWILIGHT)))
         lit = (outside < -0.01) & (elevation > DAYLIGHT)
     else:
-        dark &= _away_from_glare(rays, bright & dark)
+        dark &= _away_from_glare(rays, dark, bright)
     darks, lits = int(np.count_nonzero(dark)), int(np.count_nonzero(lit))
     stray = float(np.count_nonzero(bright & dark)) / max(darks, 1)
     return Agreement(stray, float(np.count_nonzero(lit & ~bright)) / max(lits, 1), darks, lits)
@@ -101,21 +101,30 @@ def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agree
 
 _LEAST_GLARE, _IN_GLARE = 4, 0.8
 """Minimum number and fraction of the bright samples in the sky that lie in the glare of an unknown Sun."""
+_ROUND_GLARE = 0.85
+"""Minimum fraction of bright samples among as many samples around the Sun as the glare has bright ones."""
 
 
-def _away_from_glare(rays: FloatArray, bright: BoolArray) -> BoolArray:
+def _away_from_glare(rays: FloatArray, sky: BoolArray, bright: BoolArray) -> BoolArray:
     """Return which rays (n, 3) are outside the glare of a Sun whose direction is unknown.
 
-    The Sun is assumed at the mean of the samples in the sky that are `bright` (n,), if most of these samples
-    are within its glare.
+    The Sun is assumed at the mean of the samples in the `sky` (n,) that are `bright` (n,), if most of these
+    samples are within its glare and form a round patch. A band of clouds is not round.
     """
+    everywhere = np.ones(len(rays), dtype=bool)
+    bright = bright & sky
     count = np.count_nonzero(bright)
     if count < _LEAST_GLARE:
-        return np.ones(len(rays), dtype=bool)
+        return everywhere
     middle = rays[bright].sum(axis=0)
-    away: BoolArray = rays @ (middle / np.linalg.norm(middle)) < np.cos(GLARE)
-    compact = np.count_nonzero(bright & ~away) > _IN_GLARE * count
-    return away if compact else np.ones(len(rays), dtype=bool)
+    cosine = rays @ (middle / np.linalg.norm(middle))
+    glare = sky & (cosine > np.cos(GLARE))
+    inside = np.count_nonzero(bright & glare)
+    if inside <= _IN_GLARE * count:
+        return everywhere
+    nearest = np.argsort(-cosine[glare])[:inside]
+    is_round = np.mean(bright[glare][nearest]) > _ROUND_GLARE
+    return np.asarray(cosine < np.cos(GLARE)) if is_round else everywhere
 
 
 _LEAST_SKY = 8

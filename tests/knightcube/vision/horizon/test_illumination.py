@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.arrays import FloatArray, Image, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.horizon.edges import Samples
@@ -194,6 +194,18 @@ def test_the_glare_of_an_unknown_sun_is_not_stray_light_but_scattered_samples_ar
     bright = np.isin(np.arange(len(sky)), chosen)
     samples = Samples(sky, bright, bright.astype(float), np.zeros(len(sky)), 0.0, 0.0)
     assert (agreement(view, None, samples).stray > 0.02) is stray
+
+
+def test_a_bright_band_in_the_sky_is_stray_light_although_it_is_as_small_as_a_glare() -> None:
+    """The band is 4 deg wide and 20 deg long, and the samples are 1 deg apart."""
+    view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
+    middle = at(2.2)[0]
+    first, second = tangent_basis(middle)
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-19.5, 20.0), np.arange(-19.5, 20.0)))
+    sky = normalise(middle + np.radians(x)[:, None] * first + np.radians(y)[:, None] * second)
+    for bright, stray in ((np.hypot(x, y) < 5.0, 0.0), ((np.abs(x) < 2.0) & (np.abs(y) < 10.0), 0.05)):
+        samples = Samples(sky, bright, bright.astype(float), np.zeros(len(sky)), 0.0, 0.0)
+        assert agreement(view, None, samples).stray == pytest.approx(stray, abs=1e-6)
 
 
 def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> None:
