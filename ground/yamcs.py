@@ -39,6 +39,8 @@ KEYS = Path("keys/ground")
 CFDP, DOWN_BUCKET, UP_BUCKET = "files", "down", "up"
 """Yamcs's file transfer service, and the buckets (folders) of received files and of files to send."""
 _BUCKETS = (DOWN_BUCKET, UP_BUCKET, STACKS, DISPLAYS)
+RECORDED = "recorded"
+"""Data link, and the folder from which it reads files of packets, which it deletes afterwards."""
 _LOOPBACK = "127.0.0.1"
 _SECRET_BYTES = 16
 
@@ -91,6 +93,7 @@ services:
 dataLinks:
   - name: gateway
     class: GatewayLink
+    enabledAtStartup: {live}
     tokenFile: {token}
     tmStream: tm_realtime
     tcStream: tc_realtime
@@ -99,7 +102,7 @@ dataLinks:
     packetInputStreamClassName: org.yamcs.tctm.CcsdsPacketInputStream
     packetInputStreamArgs: {{maxPacketLength: 65542}}
     packetPreprocessorClassName: org.yamcs.tctm.GenericPacketPreprocessor
-    packetPreprocessorArgs:
+    packetPreprocessorArgs: &packets
       timestampOffset: 7
       seqCountOffset: 2
       errorDetection: {{type: CRC-16-CCIIT}}
@@ -107,6 +110,15 @@ dataLinks:
         {{type: FIXED, size: 8, multiplier: 1.0e-6, epoch: CUSTOM, epochUTC: "{epoch}Z"}}
     commandPostprocessorClassName: org.yamcs.pus.PusCommandPostprocessor
     commandPostprocessorArgs: {{pus11Crc: false}}
+  - name: {recorded}
+    class: org.yamcs.tctm.FilePollingTmDataLink
+    stream: tm_realtime
+    incomingDir: {folder}/{recorded}
+    deleteAfterImport: true
+    packetInputStreamClassName: org.yamcs.tctm.CcsdsPacketInputStream
+    packetInputStreamArgs: {{maxPacketLength: 65542}}
+    packetPreprocessorClassName: org.yamcs.tctm.GenericPacketPreprocessor
+    packetPreprocessorArgs: *packets
 mdb:
   - type: xtce
     args: {{file: {folder}/{instance}.xml}}
@@ -189,7 +201,7 @@ ArchiveRetrieval: *replay
 
 def files(
     folder: Path,
-    gateway: str,
+    gateway: str | None,
     http_port: int,
     epoch: str,
     keys: Path = KEYS,
@@ -198,8 +210,9 @@ def files(
     """Return the content of each file by its name below `folder`.
 
     The folder `keys` is that of the gateway, and no PDU needs a frame longer than `command_frame_bytes`.
+    Without a gateway, Yamcs reads recorded packets only.
     """
-    host, port = host_port(gateway)
+    host, port = host_port(gateway or ADDRESS)
     server = _SERVER.format(
         host=_LOOPBACK,
         http=http_port,
@@ -210,6 +223,8 @@ def files(
         buckets=", ".join(f"{{name: {name}, path: {folder}/{name}}}" for name in _BUCKETS),
     )
     instance = _INSTANCE.format(
+        live=str(gateway is not None).lower(),
+        recorded=RECORDED,
         gateway_host=host,
         gateway_port=port,
         token=token_path(keys.absolute(), port),
@@ -239,7 +254,7 @@ def files(
 
 def write(
     folder: Path,
-    gateway: str = ADDRESS,
+    gateway: str | None = ADDRESS,
     http_port: int = HTTP_PORT,
     epoch: str = EPOCH,
     keys: Path = KEYS,
@@ -258,7 +273,7 @@ def write(
             path.touch(mode=0o600)
             path.chmod(0o600)
             path.write_text(text, encoding="utf-8")
-        for name in ("data", *_BUCKETS):
+        for name in ("data", RECORDED, *_BUCKETS):
             (folder / name).mkdir(exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written: {error.strerror or error}") from error

@@ -13,17 +13,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flight.app.service import EndingSignals
+from flight.link.telemetry.log import SUFFIX, find_segments
+from flight.link.telemetry.packets import walk
 from flight.schema.document import config_path
 from flight.schema.reader import load
 from ground.commands.options import count
 from ground.commands.passes import add_stations, predicted
 from ground.link.commanding import terminal_of
 from ground.link.gateway import Gateway, new_token, token_file, token_path
+from ground.link.terminal import DEFAULTS
 from ground.xtce import EPOCH
 from ground.yamcs import (
     HTTP_PORT,
     INSTANCE,
     KEYS,
+    RECORDED,
     USER,
     USERS,
     command_line,
@@ -36,6 +40,7 @@ from ground.yamcs_operations import Session, add_passes
 from knightcube.errors import FlightError, UsageError
 
 if TYPE_CHECKING:
+    from flight.schema.sections import Link
     from ground.passes import OrbitPrediction, Station
 
 _ASK_S = 0.2
@@ -54,8 +59,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "passes on its timeline. Needs Java 17 and the extra `interop`. Loopback only. Ctrl-C ends."
     )
     parser.add_argument("config", type=config_path, metavar="CONFIG", help="configuration that is flown")
+    way = parser.add_mutually_exclusive_group()
     text = "address of the satellite's link (default `link.udp`, or `link.tcp`, of CONFIG)"
-    parser.add_argument("--link", metavar="ADDRESS", help=text)
+    way.add_argument("--link", metavar="ADDRESS", help=text)
+    text = "show the packets of a recorded run, without a link; RUN is a folder that `run --out` wrote"
+    way.add_argument("--recorded", type=Path, metavar="RUN", help=text)
     text = "keys of the ground (default %(default)s)"
     parser.add_argument("--keys", type=Path, default=KEYS, metavar="FOLDER", help=text)
     text = "folder of Yamcs's configuration and archive (default %(default)s)"
@@ -71,40 +79,69 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run Yamcs and the gateway until a signal arrives or Yamcs ends."""
+    """Run Yamcs, and the gateway unless a run is replayed, until a signal arrives or Yamcs ends."""
     if problem := missing():
         raise FlightError(problem)
+    packets = None if options.recorded is None else _packets(options.recorded)
     section = load(options.config).link
-    if section is None:
-        raise UsageError(f"{options.config}: has no section `link`")
-    default = section.udp or (f"tcp:{section.tcp}" if section.tcp else None)
-    options.link = options.link or default
-    if options.link is None:
-        raise UsageError(f"{options.config}: has neither `link.udp` nor `link.tcp`: give --link ADDRESS")
-    forecast = _forecast(options)
-    folder, token = options.out.absolute(), new_token()
+    frame_bytes = DEFAULTS.command_frame_bytes if section is None else section.command_frame_bytes
+    if packets is None:
+        options.link = options.link or _address(options.config, section)
+    forecast, folder = _forecast(options), options.out.absolute()
     with ExitStack() as stack:
-        terminal = stack.enter_context(contextlib.closing(terminal_of(options)))
-        gateway = Gateway(terminal, "127.0.0.1:0", token, _complain)
-        stack.enter_context(contextlib.closing(gateway))
-        stack.enter_context(token_file(token_path(options.keys, gateway.port), token))
+        gateway = None if packets is not None else _gateway(options, stack)
         signals = stack.enter_context(EndingSignals())
-        served = f"127.0.0.1:{gateway.port}"
-        write(folder, served, options.port, options.epoch, options.keys, section.command_frame_bytes)
+        served = None if gateway is None else f"127.0.0.1:{gateway.port}"
+        write(folder, served, options.port, options.epoch, options.keys, frame_bytes)
+        if packets is not None:
+            (folder / RECORDED / f"run{SUFFIX}").write_bytes(packets)
         compile_link(folder)
         log = stack.enter_context((folder / "log").open("a", encoding="utf-8"))
         yamcs = subprocess.Popen(command_line(folder), stdout=log, stderr=subprocess.STDOUT)
         stack.callback(_end, yamcs)
-        if _started(options.port, folder, forecast, lambda: signals.received or yamcs.poll() is not None):
+
+        def ended() -> bool:
+            return signals.received or yamcs.poll() is not None
+
+        if _started(options.port, folder, forecast, ended):
             sys.stdout.write(
                 f"Yamcs on http://127.0.0.1:{options.port}/, user {USER}, password in {folder / USERS}, "
                 f"log in {folder / 'log'} (Ctrl-C ends)\n"
             )
             sys.stdout.flush()
-        gateway.run(lambda: signals.received or yamcs.poll() is not None)
+        while not ended():
+            time.sleep(_ASK_S) if gateway is None else gateway.turn(_ASK_S)
         if not signals.received:
             raise FlightError(f"Yamcs has ended with status {yamcs.wait()}: see {folder / 'log'}")
     return 0
+
+
+def _packets(run: Path) -> bytes:
+    """Return the packets of the flight log in a run's folder. Raises UsageError."""
+    segments = find_segments(run, "flight")
+    if not segments:
+        raise UsageError(f"{run}: no flight log (flight-0001{SUFFIX}) in this folder")
+    data = b"".join(path.read_bytes() for path in segments)
+    return b"".join(data[begin:end] for _, begin, end in walk(data))
+
+
+def _address(config: Path, section: Link | None) -> str:
+    """Return the address of the link that a configuration states. Raises UsageError."""
+    if section is None:
+        raise UsageError(f"{config}: has no section `link`")
+    if section.udp is None and section.tcp is None:
+        raise UsageError(f"{config}: has neither `link.udp` nor `link.tcp`: give --link ADDRESS")
+    return section.udp or f"tcp:{section.tcp}"
+
+
+def _gateway(options: argparse.Namespace, stack: ExitStack) -> Gateway:
+    """Return a gateway to the satellite, which `stack` closes. Its token is in a file beside the keys."""
+    token = new_token()
+    terminal = stack.enter_context(contextlib.closing(terminal_of(options)))
+    gateway = Gateway(terminal, "127.0.0.1:0", token, _complain)
+    stack.enter_context(contextlib.closing(gateway))
+    stack.enter_context(token_file(token_path(options.keys, gateway.port), token))
+    return gateway
 
 
 _Forecast = tuple["OrbitPrediction", tuple["Station", ...]]

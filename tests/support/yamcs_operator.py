@@ -37,6 +37,11 @@ class Operator:
 
         _until(lambda: value() == wanted)
 
+    def wait_for_packets(self, number: int, packet: str) -> None:
+        """Wait until the archive has a number of packets of one kind."""
+        archive = self._client.get_archive(INSTANCE)
+        _until(lambda: len(list(archive.list_packets(name=f"/{SPACE}/{packet}"))) == number)
+
     def run_stack(self, name: str) -> str:
         """Run a command stack and return how it ended."""
         definition = StackActivity(STACKS, f"{name}.ycs")._to_proto()

@@ -15,8 +15,10 @@ from pathlib import Path
 
 import pytest
 
+from flight.app.cli import main as command_line_main
 from flight.link.telemetry.packets import LAYOUTS
 from ground.passes import OrbitPrediction, station_of
+from ground.telemetry import read_run
 from ground.xtce import SPACE, TELECOMMANDS, spread
 from ground.yamcs import INSTANCE, USER, files, main, password_in, write
 from ground.yamcs_operations import Session, add_passes, stacks_and_displays
@@ -89,6 +91,18 @@ def test_yamcs_does_not_obey_a_web_page_that_has_no_password(tmp_path: Path) -> 
     assert found == [401, 401, 200]
 
 
+@pytest.mark.skipif(bool(missing()), reason=missing() or "-")
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [((), "has no section `link`"), (("--recorded", "runs/none"), "runs/none: no flight log")],
+)
+def test_mission_control_refuses_what_it_cannot_show(
+    words: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command_line_main(["mission-control", "step_demo", *words]) == 2
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
 @pytest.mark.timeout(300)
@@ -129,6 +143,10 @@ def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path:
     lengths = [(one.set - one.rise).total_seconds() for one in foreseen]
     assert [seconds for _, seconds in passes] == pytest.approx(lengths, abs=1.5)
     assert "connection closed" not in (tmp_path / "said").read_text(encoding="utf-8")
+    words = ["mission-control", config, "--recorded", run, "--out", tmp_path / "replay", "--port", http]
+    with service(tmp_path / "replay.log", "Yamcs on", *words):
+        replay = Operator(http, password_in(tmp_path / "replay"))
+        replay.wait_for_packets(read_run(run).flight.counts["health"], "health")
 
 
 @pytest.mark.slow
