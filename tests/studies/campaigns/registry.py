@@ -16,6 +16,7 @@ from tests.studies.campaigns.faults import FAULTS
 from tests.studies.campaigns.faults_kill import FAULTS_KILL
 from tests.studies.campaigns.first_orbits import FIRST_ORBITS
 from tests.studies.campaigns.frames import FRAMES_CAMPAIGN
+from tests.studies.campaigns.gyro_dead import GYRO_DEAD
 from tests.studies.campaigns.horizon_methods import HORIZON_METHODS
 from tests.studies.campaigns.installer_kill import INSTALLER_KILL
 from tests.studies.campaigns.knowledge import AGED_ELEMENTS, CALENDAR
@@ -77,6 +78,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         PLANNER_EDGE,
         FAULTS,
         FAULTS_KILL,
+        GYRO_DEAD,
         INSTALLER_KILL,
         DAMAGED_FILES,
         RESTORED_KEYS,

@@ -1,0 +1,20 @@
+"""A small slice of the campaign `gyro-dead`, always the same."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from tests.studies.campaigns.gyro_dead import GYRO_DEAD, run
+
+
+def test_a_step_without_gyro_and_camera_is_reached_within_realistic_uncertainty(tmp_path: Path) -> None:
+    case = next(case for case in GYRO_DEAD.cases(1, 3) if case.key == "dark/0")
+    result = run(replace(case, parameters={**case.parameters, "duration": 34.0}))
+    assert (result["steps"], result["reached"], result["failed"]) == (1, 1, 0)
+    assert result["reported"]
+    assert max(result["nees_angle"], result["nees_rate"]) < 1.5
+    (row,) = GYRO_DEAD.summarise([result], tmp_path).facts["rows"]
+    assert (row["flights"], row["camera"], row["worst_deg"]) == (1, False, result["worst_deg"])
+    json.dumps(row, allow_nan=False)
