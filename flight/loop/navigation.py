@@ -43,7 +43,7 @@ _AT_A_TIME = 16
 Repeating the filter updates of one second takes a few control cycles.
 """
 
-_LARGEST_ANGLE_SIGMA, _LARGEST_RATE_SIGMA = 0.01, 0.01
+_LARGEST_ANGLE_SIGMA, _LARGEST_RATE_SIGMA = 0.0035, 0.01
 """Largest standard deviations (rad, rad/s) of an estimate by which the coils are driven without a gyro."""
 
 

@@ -75,6 +75,8 @@ _COILS_DECAYED_NS = 50_000_000
 """Time (ns) from the end of a coil current until the coil's field has decayed and left the unit's filters."""
 _CONSTANT_FOR = 5.0
 """Time (s) during which the coils' field at the magnetometer is treated as constant."""
+_REFUSED_TO_RESTART = 8
+"""Number of rejected angles in a row, measured while the coils rest, after which the filter starts again."""
 _VACUUM_PERMEABILITY = 4e-7 * math.pi  # T m/A
 
 
@@ -99,6 +101,7 @@ class UnitFeed:
         side = math.sqrt(config.plant.coil_area)
         self._field_per_dipole = 2.0 * math.sqrt(2.0) * _VACUUM_PERMEABILITY / (math.pi * side**3)
         self._same_error = max(_CONSTANT_FOR * unit.rate_hz, 1.0)
+        self._refused = 0
         self._angle_covariance: FloatArray = np.eye(3) * unit.angle_noise**2
         self._rate_covariance: FloatArray = np.eye(3) * unit.rate_noise**2
 
@@ -134,12 +137,17 @@ class UnitFeed:
         by_coils = self._field_per_dipole * dipole / expected
         covariance = self._angle_covariance + self._same_error * by_coils**2 * np.eye(3)
         attitude = AttitudeMeasurement(time_ns, about_axis_y(angle), covariance, latency)
-        if not self._filter.started:
+        at_rest = not dipole
+        # The many readings that the coils disturb are too uncertain to restart a wrong estimate.
+        if not self._filter.started or (at_rest and self._refused >= _REFUSED_TO_RESTART):
+            self._refused = 0
             unknown = RateMeasurement(time_ns, np.zeros(3), np.eye(3) * _UNKNOWN_RATE**2, latency)
             self._filter.start(attitude, unknown)
             return ReadingAgreement(True)
         if self._filter.measure(attitude):
+            self._refused = 0 if at_rest else self._refused
             return ReadingAgreement(True)
+        self._refused += at_rest
         return ReadingAgreement(False, f"angle {angle:.4f} rad by the magnetic field")
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
