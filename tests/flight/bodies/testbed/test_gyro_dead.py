@@ -89,7 +89,8 @@ def test_an_estimate_that_the_resting_coils_field_refutes_is_discarded(current: 
     for step in range(40):
         feed.accept(reading(step * PERIOD_NS, FIELD))
     turned = attitude_matrix(about_axis_y(2.5)) @ FIELD
-    held, step = [], 40
+    held: list[bool] = []
+    step = 40
     while len(held) < 9:
         filter_.command(step * PERIOD_NS, np.array([0.0, current, 0.0]))
         feed.accept(reading((step + 1) * PERIOD_NS, turned))
