@@ -209,8 +209,7 @@ def files(
 ) -> Mapping[str, str]:
     """Return the content of each file by its name below `folder`.
 
-    The folder `keys` is that of the gateway, and no PDU needs a frame longer than `command_frame_bytes`.
-    Without a gateway, Yamcs reads recorded packets only.
+    Without a gateway, whose keys are in the folder `keys`, Yamcs reads recorded packets only.
     """
     host, port = host_port(gateway or ADDRESS)
     server = _SERVER.format(

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 _ASK_S = 0.2
 """Interval (s) between two questions whether Yamcs runs."""
+_START_S = 60.0
+"""Longest time (s) to wait for the link."""
 _END_S = 30.0
 """Longest time (s) to wait for the end of Yamcs."""
 
@@ -64,6 +66,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--link", metavar="ADDRESS", help=text)
     text = "show the packets of a recorded run, without a link; RUN is a folder that `run --out` wrote"
     way.add_argument("--recorded", type=Path, metavar="RUN", help=text)
+    text = "fly the simulation of CONFIG in real time with its link, which write below --out"
+    way.add_argument("--fly", action="store_true", help=text)
     text = "keys of the ground (default %(default)s)"
     parser.add_argument("--keys", type=Path, default=KEYS, metavar="FOLDER", help=text)
     text = "folder of Yamcs's configuration and archive (default %(default)s)"
@@ -89,19 +93,18 @@ def run(options: argparse.Namespace) -> int:
         options.link = options.link or _address(options.config, section)
     forecast, folder = _forecast(options), options.out.absolute()
     with ExitStack() as stack:
-        gateway = None if packets is not None else _gateway(options, stack)
         signals = stack.enter_context(EndingSignals())
+        running = _flown(options.config, folder, stack) if options.fly else {}
+        gateway = None if packets is not None else _gateway(options, stack)
         served = None if gateway is None else f"127.0.0.1:{gateway.port}"
         write(folder, served, options.port, options.epoch, options.keys, frame_bytes)
         if packets is not None:
             (folder / RECORDED / f"run{SUFFIX}").write_bytes(packets)
         compile_link(folder)
-        log = stack.enter_context((folder / "log").open("a", encoding="utf-8"))
-        yamcs = subprocess.Popen(command_line(folder), stdout=log, stderr=subprocess.STDOUT)
-        stack.callback(_end, yamcs)
+        yamcs = running["Yamcs"] = _process(command_line(folder), folder / "log", stack)
 
         def ended() -> bool:
-            return signals.received or yamcs.poll() is not None
+            return signals.received or yamcs.poll() is not None or any(map(_failed, running.values()))
 
         if _started(options.port, folder, forecast, ended):
             sys.stdout.write(
@@ -112,8 +115,37 @@ def run(options: argparse.Namespace) -> int:
         while not ended():
             time.sleep(_ASK_S) if gateway is None else gateway.turn(_ASK_S)
         if not signals.received:
-            raise FlightError(f"Yamcs has ended with status {yamcs.wait()}: see {folder / 'log'}")
+            name, process = next(one for one in running.items() if one[0] == "Yamcs" or _failed(one[1]))
+            raise FlightError(f"{name} has ended with status {process.wait()}: see the logs in {folder}")
     return 0
+
+
+def _flown(config: Path, folder: Path, stack: ExitStack) -> dict[str, subprocess.Popen[bytes]]:
+    """Start link and flight of a configuration in real time. Return their processes, which `stack` ends."""
+    runs = folder / "runs"
+    runs.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "flight"]
+    link = _process([*command, "link", str(config), "--log", str(runs)], folder / "link.log", stack)
+    until = time.monotonic() + _START_S
+    while link.poll() is None and "link open" not in (folder / "link.log").read_text(encoding="utf-8"):
+        if time.monotonic() > until:
+            raise FlightError(f"the link does not open: see {folder / 'link.log'}")
+        time.sleep(_ASK_S)
+    words = ["run", str(config), "--realtime", "--archive", str(runs)]
+    return {"the link": link, "the flight": _process([*command, *words], folder / "flight.log", stack)}
+
+
+def _process(command: list[str], log: Path, stack: ExitStack) -> subprocess.Popen[bytes]:
+    """Start a process that writes to a new log, and return the process, which `stack` ends."""
+    file = stack.enter_context(log.open("w", encoding="utf-8"))
+    process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
+    stack.callback(_end, process)
+    return process
+
+
+def _failed(process: subprocess.Popen[bytes]) -> bool:
+    """Return whether a process has ended with an error; a flight ends without one after its duration."""
+    return process.poll() not in (None, 0)
 
 
 def _packets(run: Path) -> bytes:

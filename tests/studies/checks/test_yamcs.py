@@ -9,7 +9,6 @@ import json
 import socket
 import urllib.error
 import urllib.request
-from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -110,26 +109,33 @@ def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path:
     """An alarm is raised and acknowledged, stacks run, files go both ways, and a pass is on the timeline."""
     (udp,), http = free_ports([socket.SOCK_DGRAM]), free_port()
     config = write_linked_config(tmp_path, udp=f"127.0.0.1:{udp}", rate=1_000_000)
-    out, run = tmp_path / "out", tmp_path / "runs"
+    out = tmp_path / "out"
     elements = tmp_path / "elements.txt"
     elements.write_text("\n".join(POLAR_ORBIT) + "\n", encoding="utf-8")
-    words = ["mission-control", config, "--keys", tmp_path / "keys" / "ground", "--out", out, "--port", http]
+    words = [
+        "mission-control",
+        config,
+        "--fly",
+        "--keys",
+        tmp_path / "keys" / "ground",
+        "--out",
+        out,
+        "--port",
+        http,
+    ]
     words += ["--elements", elements, "--station", "Berlin,52.5,13.4", "--from", "2026-03-20T12:00:00"]
     begin, station = datetime(2026, 3, 20, 12, tzinfo=UTC), station_of("Berlin,52.5,13.4")
     prediction = OrbitPrediction(POLAR_ORBIT, begin, 1.0)
-    with ExitStack() as stack:
-        stack.enter_context(service(tmp_path / "link.log", "link open", "link", config, "--log", run))
-        stack.enter_context(service(tmp_path / "said", "Yamcs on", *words))
-        flight = ("run", config, "--realtime", "--out", run)
-        stack.enter_context(service(tmp_path / "flight.log", "", *flight))
+    with service(tmp_path / "said", "Yamcs on", *words):
         operator = Operator(http, password_in(out))
         operator.wait_for("health_mode", "testbed-demo")
+        (run,) = (out / "runs").glob("run-*")
         assert operator.run_stack("leave-safe-to-hold") == "FAILED", "the condition is not met"
         assert operator.run_stack("enter-safe") == "SUCCESSFUL"
         assert operator.raised_and_acknowledged("health_mode") == ("WARNING", True, "seen")
         assert operator.run_stack("leave-safe-to-hold") == "SUCCESSFUL"
         assert operator.sent() == ["safe", "mode"], "no command follows a condition that is not met"
-        assert operator.downloaded("log/config.yaml") == (run / "config.yaml").read_bytes()
+        assert operator.downloaded(f"log/{run.name}/config.yaml") == (run / "config.yaml").read_bytes()
         operator.upload(b"new elements", "elements/new.txt")
         received = tmp_path / "keys" / "files" / "received" / "elements" / "new.txt"
         assert received.read_bytes() == b"new elements"
