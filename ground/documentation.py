@@ -19,11 +19,12 @@ from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layo
 _FOREWORD = """\
 # Telemetry
 
-Made from `flight/link/telemetry/definitions.py` by `python -m ground.documentation > docs/telemetry.md`;
-`--json` prints the same as a database for ground stations. A flight log is these packets back to back; a
-downlink is a stream of them.
+This page is made from `flight/link/telemetry/definitions.py`.
+The command is `python -m ground.documentation > docs/telemetry.md`.
+`--json` prints the same content as a database for ground stations.
+A flight log is a sequence of these packets, and a downlink is a stream of them.
 
-Every packet is a CCSDS space packet (133.0-B-2), all numbers big-endian:
+Every packet is a CCSDS space packet (133.0-B-2) with big-endian numbers:
 
 | byte | type | content |
 |---|---|---|
@@ -36,18 +37,18 @@ Every packet is a CCSDS space packet (133.0-B-2), all numbers big-endian:
 | last 2 | u2 | CRC-16: x^16 + x^12 + x^5 + 1, preset to ones, over everything before it |
 """
 _TYPES = """
-A type is u (unsigned integer), i (signed integer) or f (IEEE 754), with its size in bytes. S with a size in
-bytes is UTF-8 text, padded with zeros; its last byte is always zero.
+A type is u (unsigned integer), i (signed integer) or f (IEEE 754), with its size in bytes.
+The type S with a size in bytes is UTF-8 text, padded with zeros; its last byte is always zero.
 """
 _FOREWORD_OF_TELECOMMANDS = """\
 # Telecommands
 
-Made from `flight/link/commands.py` and `flight/link/process/directives.py` by
-`python -m ground.documentation --telecommands > docs/telecommands.md`. The page
-[commands and telemetry](fly/commands.md) explains the commands to the flight, and the page
-[the link](fly/link.md) the commands to the link and the frames that protect both.
+This page is made from `flight/link/commands.py` and `flight/link/process/directives.py`.
+The command is `python -m ground.documentation --telecommands > docs/telecommands.md`.
+The page [commands and telemetry](fly/commands.md) explains the commands to the flight.
+The page [the link](fly/link.md) explains the commands to the link, and the frames of both kinds of commands.
 
-Every telecommand is a CCSDS space packet (133.0-B-2), all numbers big-endian:
+Every telecommand is a CCSDS space packet (133.0-B-2) with big-endian numbers:
 
 | byte | type | content |
 |---|---|---|
