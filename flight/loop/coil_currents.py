@@ -1,13 +1,9 @@
-"""Whether the coil currents are known, and the supply currents of healthy and of broken coils.
+"""Supply currents of healthy and of broken coils.
 
 For each hypothesis, which is that all coils are healthy or that one axis has one fault, the supply current is
 predicted from the commands. Each H-bridge has two inputs, A and B. The input A is pulsed for positive
 currents, the input B for negative currents. If an output leg is stuck high, it drives its coil continuously,
 except while the other input is pulsed.
-
-The class `CoilKnowledge` determines whether the coil currents are known, with which the filter propagates.
-The currents are unknown while the PWM driver fails, after the loop has stalled, and while the supply current
-contradicts the commands.
 """
 
 from __future__ import annotations
@@ -19,7 +15,6 @@ from functools import cache
 
 import numpy as np
 
-from hal.interfaces.devices import CoilState
 from knightcube.astro.arrays import FloatArray
 
 
@@ -203,59 +198,3 @@ def fits(
 def _scales(gain: float) -> FloatArray:
     """Return nine factors (9, 1, 1) between the bounds of the gain error."""
     return np.linspace(1.0 - gain, 1.0 + gain, 9)[:, None, None]
-
-
-_UNSEEN_NS = 600_000_000
-"""Largest age (ns) of a PWM error at its detection; the driver reads its outputs back twice a second."""
-_UNSUSPECTED_NS = 800_000_000
-"""Longest time (ns) from a fault to its suspicion, which takes four readings of the current monitor."""
-STOOD_NS = 200_000_000
-"""Stall of the control loop (ns) after which the guardian may have set the coils to zero."""
-
-
-@dataclass(frozen=True, slots=True)
-class CurrentValidity:
-    """Validity of the recorded coil currents.
-
-    Attributes:
-        now: whether the currents in force are known.
-        since_last_look: whether the PWM chip kept all commands since the previous call.
-        since_ns: time (ns) since which the currents have been known.
-        uncertain_since_ns: time (ns) since which currents recorded as known are uncertain, or None.
-    """
-
-    now: bool
-    since_last_look: bool
-    since_ns: int
-    uncertain_since_ns: int | None
-
-
-class CoilKnowledge:
-    """Determines once a cycle whether the coil currents are known."""
-
-    def __init__(self) -> None:
-        self._obeys = True
-        self._suspected = False
-        self._since_ns = -1
-        self._looked_ns: int | None = None
-
-    def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
-        """Return which currents are known, from the driver's state and the time since the last call.
-
-        `suspected` states whether the supply current contradicts a healthy circuit, so that a coil may carry
-        any current.
-        """
-        obeyed, self._obeys = self._obeys, not in_force.error
-        was_suspected, self._suspected = self._suspected, suspected
-        looked_ns, self._looked_ns = self._looked_ns, now_ns
-        stood = looked_ns is not None and now_ns - looked_ns > STOOD_NS
-        since_last_look = obeyed and self._obeys and not stood
-        now = self._obeys and not suspected
-        if now and (was_suspected or not since_last_look):
-            self._since_ns = now_ns
-        uncertain = [now_ns - _UNSEEN_NS] if obeyed and not self._obeys else []
-        if suspected and not was_suspected:
-            uncertain.append(now_ns - _UNSUSPECTED_NS)
-        if looked_ns is not None and stood:
-            uncertain.append(looked_ns)
-        return CurrentValidity(now, since_last_look, self._since_ns, min(uncertain, default=None))

@@ -13,7 +13,6 @@ from flight.link.telemetry.definitions import ATTITUDE, COIL_CURRENTS
 from flight.loop import horizon_cameras as horizon_task
 from flight.loop import imaging as imaging_task
 from flight.loop.body import PLANNER, ControlOutput, FlightBody, Steered, Target
-from flight.loop.coil_currents import CoilKnowledge, CurrentValidity
 from flight.loop.commanding import CommandTask
 from flight.loop.executive import Cycle
 from flight.loop.facts import Services
@@ -21,7 +20,7 @@ from flight.loop.health import HealthWatch, Housekeeping, PerformanceObserver
 from flight.loop.horizon_cameras import HorizonCameraTask
 from flight.loop.imaging import Imaging
 from flight.loop.modes import ModeControl
-from flight.loop.navigation import Navigation, Positioning, SunSensing
+from flight.loop.navigation import CoilKnowledge, CurrentValidity, Navigation, Positioning, SunSensing
 from flight.loop.steering import CoilDrive, Steering
 from hal.interfaces.devices import MOST_COILS, CoilState, ImuReading
 from knightcube.astro.arrays import FloatArray

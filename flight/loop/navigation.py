@@ -2,7 +2,8 @@
 
 The serial line of the inertial unit is monitored for silence (no bytes), corruption (bytes without valid
 packets) and implausible values. Rates from streaks and attitudes from stars update the estimate at the times
-of their measurement.
+of their measurement. The filter propagates with the coil currents, which are unknown (`CoilKnowledge`) while
+the PWM driver fails, after the loop has stalled, and while the supply current contradicts the commands.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from flight.link import events
 from flight.link.telemetry.definitions import FIX, GPS_LINK, IMU
 from flight.loop import facts
 from flight.loop.body import BodyEstimation
-from flight.loop.coil_currents import CurrentValidity
 from flight.loop.coil_response import CoilCorrection
 from flight.loop.facts import Services
 from hal.interfaces.devices import (
@@ -61,6 +61,62 @@ class NavigationSettings:
     max_age_ns: int
     coast_ns: int
     period_ns: int
+
+
+_UNSEEN_NS = 600_000_000
+"""Largest age (ns) of a PWM error at its detection; the driver reads its outputs back twice a second."""
+_UNSUSPECTED_NS = 800_000_000
+"""Longest time (ns) from a fault to its suspicion, which takes four readings of the current monitor."""
+STOOD_NS = 200_000_000
+"""Stall of the control loop (ns) after which the guardian may have set the coils to zero."""
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentValidity:
+    """Validity of the recorded coil currents.
+
+    Attributes:
+        now: whether the currents in force are known.
+        since_last_look: whether the PWM chip kept all commands since the previous call.
+        since_ns: time (ns) since which the currents have been known.
+        uncertain_since_ns: time (ns) since which currents recorded as known are uncertain, or None.
+    """
+
+    now: bool
+    since_last_look: bool
+    since_ns: int
+    uncertain_since_ns: int | None
+
+
+class CoilKnowledge:
+    """Determines once a cycle whether the coil currents are known."""
+
+    def __init__(self) -> None:
+        self._obeys = True
+        self._suspected = False
+        self._since_ns = -1
+        self._looked_ns: int | None = None
+
+    def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
+        """Return which currents are known, from the driver's state and the time since the last call.
+
+        `suspected` states whether the supply current contradicts a healthy circuit, so that a coil may carry
+        any current.
+        """
+        obeyed, self._obeys = self._obeys, not in_force.error
+        was_suspected, self._suspected = self._suspected, suspected
+        looked_ns, self._looked_ns = self._looked_ns, now_ns
+        stood = looked_ns is not None and now_ns - looked_ns > STOOD_NS
+        since_last_look = obeyed and self._obeys and not stood
+        now = self._obeys and not suspected
+        if now and (was_suspected or not since_last_look):
+            self._since_ns = now_ns
+        uncertain = [now_ns - _UNSEEN_NS] if obeyed and not self._obeys else []
+        if suspected and not was_suspected:
+            uncertain.append(now_ns - _UNSUSPECTED_NS)
+        if looked_ns is not None and stood:
+            uncertain.append(looked_ns)
+        return CurrentValidity(now, since_last_look, self._since_ns, min(uncertain, default=None))
 
 
 class Navigation:

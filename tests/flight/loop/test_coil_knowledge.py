@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.loop.coil_currents import STOOD_NS, CoilKnowledge, CurrentValidity
+from flight.loop.navigation import STOOD_NS, CoilKnowledge, CurrentValidity
 from hal.guardian import SILENCE_NS
 from hal.interfaces.devices import CoilState
 

@@ -14,9 +14,9 @@ from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.definitions import ATTITUDE, COIL_CURRENTS
 from flight.loop import horizon_cameras, imaging
 from flight.loop.body import PLANNER, ControlOutput
-from flight.loop.coil_currents import CurrentValidity
 from flight.loop.control_cycle import ATTITUDE_EVERY, ControlCycle
 from flight.loop.executive import Cycle
+from flight.loop.navigation import CurrentValidity
 from hal.interfaces.devices import MOST_COILS, CoilState
 
 PERIOD_NS = 25_000_000
