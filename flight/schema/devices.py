@@ -514,9 +514,12 @@ def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:
     """
     mask = polygon_mask(camera.rows, camera.columns, camera.structure)
     if of_file and camera.structure_file is not None:
-        from knightcube.vision.camera.images import read_image  # noqa: PLC0415 - only with a file
+        from knightcube.vision.camera.images import read_image, read_raw  # noqa: PLC0415 - only with a file
 
-        pixels = read_image(Path(camera.structure_file))
+        path = Path(camera.structure_file)
+        # A board has no Pillow, but a PGM file needs none.
+        is_pgm = path.suffix == ".pgm"
+        pixels = read_raw(path, camera.columns, camera.rows, 8) if is_pgm else read_image(path)
         if pixels.shape != mask.shape:
             sizes = [f"{shape[1]} x {shape[0]}" for shape in (pixels.shape, mask.shape)]
             raise UsageError(f"{camera.structure_file}: {sizes[0]} pixels, but the camera has {sizes[1]}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shlex
 import socket
@@ -26,6 +27,8 @@ ENVIRONMENT = {
     "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
 }
 READY_S = 100.0
+FIXES_S = 45.0
+"""Mission time (s) after which the log has enough fixes for elements; a person takes longer to get there."""
 
 
 @contextlib.contextmanager
@@ -87,6 +90,11 @@ def test_the_commands_of_the_page_operate_a_simulated_satellite(tmp_path: Path) 
         in_background(fly, tmp_path, lambda _: (tmp_path / "practice.socket").exists()),
         in_background(link[0], tmp_path, lambda log: "link open on" in log.read_text(encoding="utf-8")),
     ):
+        until = time.monotonic() + READY_S
+        state = "knightcube watch $SATELLITE --json"
+        while json.loads(run(state, tmp_path, satellite))["mission_time_s"] < FIXES_S:
+            assert time.monotonic() < until
+            time.sleep(2.0)
         printed = {line: run(line, tmp_path, satellite) for lines in ground for line in lines}
     shown = [text for line, text in printed.items() if "ping" in line or "mode point" in line]
     assert all("started" in text for text in shown)

@@ -58,12 +58,17 @@ def elsewhere(seen: Vn100Sample) -> Vn100Sample:
     return replace(seen, quaternion=multiply(turn, seen.quaternion), rate=seen.rate + 0.1)
 
 
+def shifted(seen: Vn100Sample, by: float) -> Vn100Sample:
+    """Return a sample with `by` added to rate (rad/s) and field, because without a rate alone it flies on."""
+    return replace(seen, rate=seen.rate + by, mag=seen.mag + by)
+
+
 LOSSES: dict[str, tuple[Break, Break]] = {
     "silence": (on_the_line(LineFaults(silent=True)), on_the_line(SOUND)),
     "garbage": (on_the_line(LineFaults(garbage=True)), on_the_line(SOUND)),
     "damage": (on_the_line(LineFaults(cut_probability=1.0)), on_the_line(SOUND)),
-    "not finite": (in_the_unit(lambda seen: replace(seen, rate=np.nan * seen.rate)), in_the_unit(None)),
-    "out of range": (in_the_unit(lambda seen: replace(seen, rate=seen.rate + 1e3)), in_the_unit(None)),
+    "not finite": (in_the_unit(lambda seen: shifted(seen, np.nan)), in_the_unit(None)),
+    "out of range": (in_the_unit(lambda seen: shifted(seen, 1e3)), in_the_unit(None)),
     "refused": (in_the_unit(elsewhere), in_the_unit(None)),
 }
 """What begins, and what ends it."""

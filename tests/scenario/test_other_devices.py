@@ -78,6 +78,7 @@ def test_a_testbed_flies_on_circuitpython_drivers_and_bridges_with_an_i2c_interf
 
 
 def test_a_satellite_flies_with_a_sensor_on_spi_and_a_receiver_with_nmea_sentences(tmp_path: Path) -> None:
+    pytest.importorskip("adafruit_lis3mdl")
     run = flown(ORBIT, tmp_path)
     truth = run["truth"]
     times = run["imu"]["sample_time_ns"] * 1e-9

@@ -36,7 +36,7 @@ def camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> IoctlCamera:
     clock = ManualClock()
     kernel = kernel_in(tmp_path, clock, monkeypatch)
     kernel.sizes = {"GREY": (64, 64), "Y10": (64, 64)}
-    monkeypatch.setattr("ground.commands.camera.SystemClock", lambda: clock)
+    monkeypatch.setattr("flight.app.devices.SystemClock", lambda: clock)
     return kernel
 
 
@@ -129,7 +129,7 @@ def test_each_kind_of_camera_has_its_own_keys(tmp_path: Path) -> None:
         ("{driver: v4l2, gian: 3}", 8, "unknown key, did you mean `gain`"),
         ("{driver: aravis, name: x, nane: 3}", 12, "unknown key, did you mean `name`"),
         ("{driver: aravis, name: x, path: /dev/video0}", 12, "known keys: name, pixel_format, gain"),
-        ("{kind: webcam}", 8, "webcam"),
+        ("{driver: webcam}", 8, "webcam"),
         ("{driver: v4l2, pixel_format: GREY}", 12, "pixels of GREY have 8"),
         ("{driver: v4l2, pixel_format: Y16}", 8, "pixels of Y16 have 9 to 16"),
         ("{driver: aravis}", 8, "`camera.device.name` is missing"),
@@ -156,7 +156,7 @@ def test_the_commented_example_of_the_testbed_is_right(tmp_path: Path) -> None:
     camera = configuration.load(path).camera
     assert camera is not None
     assert isinstance(camera.device, V4l2Device)
-    other = next(line for line in section if "kind: aravis" in line)
+    other = next(line for line in section if "driver: aravis" in line)
     configuration.load(with_camera(tmp_path, other[other.index("{") :], 12))
 
 
