@@ -37,10 +37,17 @@ class Operator:
 
         _until(lambda: value() == wanted)
 
-    def wait_for_packets(self, number: int, packet: str) -> None:
-        """Wait until the archive has a number of packets of one kind."""
+    def archived(self, packet: str) -> int:
+        """Wait until the archive has packets of one kind, and return how many it has then."""
         archive = self._client.get_archive(INSTANCE)
-        _until(lambda: len(list(archive.list_packets(name=f"/{SPACE}/{packet}"))) == number)
+        counts: list[int] = []
+
+        def has_some() -> bool:
+            counts.append(len(list(archive.list_packets(name=f"/{SPACE}/{packet}"))))
+            return counts[-1] > 0
+
+        _until(has_some)
+        return counts[-1]
 
     def run_stack(self, name: str) -> str:
         """Run a command stack and return how it ended."""
