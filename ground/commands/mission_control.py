@@ -98,8 +98,6 @@ def run(options: argparse.Namespace) -> int:
         gateway = None if packets is not None else _gateway(options, stack)
         served = None if gateway is None else f"127.0.0.1:{gateway.port}"
         write(folder, served, options.port, options.epoch, options.keys, frame_bytes)
-        if packets is not None:
-            (folder / RECORDED / f"run{SUFFIX}").write_bytes(packets)
         compile_link(folder)
         yamcs = running["Yamcs"] = _process(command_line(folder), folder / "log", stack)
 
@@ -107,6 +105,11 @@ def run(options: argparse.Namespace) -> int:
             return signals.received or yamcs.poll() is not None or any(map(_failed, running.values()))
 
         if _started(options.port, folder, forecast, ended):
+            if packets is not None:
+                # Yamcs reads a file as soon as it appears, and packets before its archive runs would be lost.
+                complete = folder / f"run{SUFFIX}"
+                complete.write_bytes(packets)
+                complete.replace(folder / RECORDED / complete.name)
             sys.stdout.write(
                 f"Yamcs on http://127.0.0.1:{options.port}/, user {USER}, password in {folder / USERS}, "
                 f"log in {folder / 'log'} (Ctrl-C ends)\n"

@@ -8,6 +8,7 @@ returns an `I2cPart` or an SPI device.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -60,7 +61,7 @@ class Measurements:
         return np.asarray(turned + deviation * self.generator.standard_normal(3))
 
 
-class Registers:
+class Registers(ABC):
     """A chip on the I2C bus with a register pointer that increments at each byte."""
 
     def __init__(self, address: int) -> None:
@@ -84,16 +85,17 @@ class Registers:
         self._pointer += count
         return bytes(self.load(register) for register in range(self._pointer - count, self._pointer))
 
+    @abstractmethod
     def latch(self) -> None:
         """Make a new sample if one is due, before registers are read."""
 
+    @abstractmethod
     def store(self, register: int, value: int) -> None:
         """Write a register."""
-        raise NotImplementedError
 
+    @abstractmethod
     def load(self, register: int) -> int:
         """Return a register's value."""
-        raise NotImplementedError
 
 
 class EmulatedLis3mdl(Registers):

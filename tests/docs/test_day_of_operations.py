@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import shlex
-import socket
 import subprocess
 import sys
 import time
@@ -16,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from tests.docs.blocks import blocks
-from tests.flight.app.cli.linked_board import free_ports
 from tests.ground.commands.in_process import command
+from tests.support.flooded_flight import free_port
 from tests.support.places import ROOT
 
 PAGE = "docs/fly/day-of-operations.md"
@@ -53,7 +52,7 @@ def in_background(line: str, folder: Path, is_ready: Callable[[Path], bool]) -> 
 
 
 def run(line: str, folder: Path, satellite: str) -> str:
-    """Run a command of the ground and return what it printed. Most run in this process, to save time."""
+    """Return the output of a command of the ground. Most commands run in this process, to save time."""
     words = shlex.split(line.replace("$SATELLITE", satellite))
     if words[0] == "knightcube" and not {"|", ">"} & set(words):
         done = command(*words[1:], folder=folder)
@@ -80,7 +79,7 @@ def test_the_commands_of_the_page_operate_a_simulated_satellite(tmp_path: Path) 
         if block.page == PAGE and block.commands and block.mark == "run by"
     ]
     keys, copy, fly = first
-    (port,) = free_ports([socket.SOCK_DGRAM])
+    port = free_port()
     satellite = export[0].partition("=")[2].strip('"').replace("5010", str(port))
     run(keys, tmp_path, satellite)
     run(copy.replace("~/knightcube", str(ROOT)), tmp_path, satellite)
@@ -95,11 +94,16 @@ def test_the_commands_of_the_page_operate_a_simulated_satellite(tmp_path: Path) 
         while json.loads(run(state, tmp_path, satellite))["mission_time_s"] < FIXES_S:
             assert time.monotonic() < until
             time.sleep(2.0)
-        printed = {line: run(line, tmp_path, satellite) for lines in ground for line in lines}
-    shown = [text for line, text in printed.items() if "ping" in line or "mode point" in line]
-    assert all("started" in text for text in shown)
-    watched = [text for line, text in printed.items() if "watch" in line]
-    assert watched
-    listed = next(text for line, text in printed.items() if "list-schedule" in line)
-    assert "2026-03-20T13:30:00Z point ground" in listed
-    assert "Berlin" in next(text for line, text in printed.items() if "passes" in line)
+        printed = [(line, run(line, tmp_path, satellite)) for lines in ground for line in lines]
+
+    def after(words: str) -> list[str]:
+        return [text for line, text in printed if words in line]
+
+    assert ["completed: ping" in text for text in after("ping")] == [True]
+    assert "started: mode point" in after("mode point")[0]
+    before, in_safe, at_the_end = (text.split()[2] for text in after("watch"))
+    assert before != "safe"
+    assert in_safe == "safe"
+    assert at_the_end != "safe"
+    assert "2026-03-20T13:30:00Z point ground" in after("list-schedule")[0]
+    assert "Berlin" in after("passes")[0]

@@ -37,12 +37,12 @@ class LinkedFlight:
 
     def end(self) -> None:
         """End the flight; link and gateway carry what is left of its log."""
-        _end(self.processes["flight"])
+        end(self.processes["flight"])
 
     def stop(self) -> None:
         """End all processes."""
         for process in reversed(self.processes.values()):
-            _end(process)
+            end(process)
 
 
 def free_port() -> int:
@@ -83,7 +83,7 @@ def service(log: Path, ready: str, *words: object) -> Iterator[subprocess.Popen[
         _wait(lambda: ready in log.read_text(), str(words[0]), log)
         yield process
     finally:
-        _end(process)
+        end(process)
 
 
 def _started(words: list[str], log: Path) -> subprocess.Popen[bytes]:
@@ -99,7 +99,8 @@ def _wait(done: Callable[[], bool], name: str, log: Path) -> None:
         time.sleep(0.1)
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+def end(process: subprocess.Popen[bytes]) -> None:
+    """End a process, and kill it if it does not end by itself."""
     process.terminate()
     try:
         process.wait(_END_S)

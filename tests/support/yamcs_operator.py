@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from datetime import datetime
@@ -37,16 +38,16 @@ class Operator:
 
         _until(lambda: value() == wanted)
 
-    def archived(self, packet: str) -> int:
-        """Wait until the archive has packets of one kind, and return how many it has then."""
-        archive = self._client.get_archive(INSTANCE)
-        counts: list[int] = []
+    def archived(self, packet: str, number: int) -> int:
+        """Wait for a number of packets of one kind, and return how many the archive has at the end."""
+        archive, counts = self._client.get_archive(INSTANCE), [0]
 
-        def has_some() -> bool:
+        def complete() -> bool:
             counts.append(len(list(archive.list_packets(name=f"/{SPACE}/{packet}"))))
-            return counts[-1] > 0
+            return counts[-1] == number
 
-        _until(has_some)
+        with contextlib.suppress(AssertionError):  # the caller compares the numbers
+            _until(complete)
         return counts[-1]
 
     def run_stack(self, name: str) -> str:

@@ -18,11 +18,11 @@ from urllib.parse import quote
 
 from ground.xtce import SPACE
 from ground.yamcs import INSTANCE, USER, USERS, command_line, compile_link, missing
+from tests.support.linked_flight import end
 
 __all__ = ["Yamcs", "basic", "credentials", "missing", "serving", "troubles"]
 
 _START_S = 120.0
-_END_S = 30.0
 _LONGEST_S = 300.0
 _TROUBLE = ("WARNING", "SEVERE", "Exception")
 
@@ -44,12 +44,7 @@ def serving(folder: Path, http_port: int) -> Iterator[Yamcs]:
         server.wait()
         yield server
     finally:
-        process.terminate()
-        try:
-            process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        end(process)
 
 
 def basic(password: str) -> str:

@@ -448,7 +448,7 @@ class ReadingConverter:
         self._alike = 0
 
     def reading(self, item: BinaryPacket | AsciiLine) -> ImuReading | None:
-        """Return the reading in a packet or line, None if there is no reading or the reading is rejected.
+        """Return the reading in a packet or line, None without a reading or if it is rejected.
 
         A reading of which only the rate is invalid has the rate NaN.
         """

@@ -30,10 +30,10 @@ from flight.link.process.directives import Play, SendFile
 from flight.link.telemetry.definitions import LINK
 from flight.link.telemetry.packets import LAYOUTS
 from ground.link.commanding import FileSession
-from ground.link.terminal import make_keys, open_terminal
-from tests.support.flights import CONFIG
+from ground.link.terminal import open_terminal
 from tests.support.flooded_flight import flood, free_port, lateness, process, wait_for
 from tests.support.link_attacker import LinkAttacker
+from tests.support.linked_board import write_linked_config
 
 _FRAMES_A_SECOND = 10_000
 _KINDS = 500
@@ -60,7 +60,7 @@ def measure(place: Path, seconds: float, *, flooded: bool) -> dict[str, Any]:
     """Fly once; return lateness in ms by quantile, cycles, and the link's counts."""
     with ExitStack() as stack:
         port = free_port()
-        config = _config(place, port)
+        config = write_linked_config(place, udp=f"127.0.0.1:{port}", rate=1e6)
         run = place / "run"
         flight = stack.enter_context(
             process("run", config, "--realtime", "--out", run, "--duration", seconds, "--json")
@@ -116,17 +116,6 @@ def _flood(port: int, ended: threading.Event, forged: list[int]) -> None:
         attacker = LinkAttacker(Path(folder))
         frames = [attacker.frame(chance)[1] for _ in range(_KINDS)]
     flood(port, frames, _FRAMES_A_SECOND, ended, forged)
-
-
-def _config(place: Path, port: int) -> Path:
-    """Write the configuration of a flight with a link, and make its keys."""
-    satellite, _ = make_keys(place / "keys")
-    link = {"keys": str(satellite), "udp": f"127.0.0.1:{port}", "rate": 1e6}
-    commands = json.dumps({"socket": str(place / "commands")})
-    path = place / "flight.yaml"
-    text = CONFIG.read_text(encoding="utf-8")
-    path.write_text(f"{text}\ncommands: {commands}\nlink: {json.dumps(link)}\n", encoding="utf-8")
-    return path
 
 
 if __name__ == "__main__":

@@ -29,11 +29,10 @@ from typing import Any
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
 from ground.link.commanding import failed, obeyed
-from ground.link.terminal import make_keys, open_terminal
+from ground.link.terminal import open_terminal
 from knightcube.errors import FlightError
-from tests.flight.app.cli.linked_board import free_ports
-from tests.support.flights import CONFIG
 from tests.support.flooded_flight import lateness, process, wait_for
+from tests.support.linked_board import free_ports, write_linked_config
 
 DATAGRAMS, CONNECTIONS, COMMANDS = 30_000, 200, 40
 """Datagrams a second, TCP connections a second, and commands of the operator in each flight."""
@@ -70,7 +69,12 @@ def measure(place: Path, commands: int, *, attacked: bool) -> dict[str, Any]:
     """Fly once; return the commands that were obeyed, the lateness in ms and the strangers' rates."""
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
     with ExitStack() as stack:
-        config, run = _config(place, udp, tcp), place / "run"
+        config, run = (
+            write_linked_config(
+                place, udp=f"127.0.0.1:{udp}", tcp=f"127.0.0.1:{tcp}", peers=["127.0.0.1/32"], rate=1e5
+            ),
+            place / "run",
+        )
         flight = stack.enter_context(process("run", config, "--realtime", "--out", run))
         wait_for(run / "flight-0001.ccsds")
         link = stack.enter_context(process("link", config, "--log", run))
@@ -181,23 +185,6 @@ def _grid(period: float) -> Iterator[None]:
         yield
         due += period
         time.sleep(max(0.0, due - time.monotonic()))
-
-
-def _config(place: Path, udp: int, tcp: int) -> Path:
-    """Write the configuration of a flight whose link has this machine's first address as its peer."""
-    satellite, _ = make_keys(place / "keys")
-    link = {
-        "keys": str(satellite),
-        "udp": f"127.0.0.1:{udp}",
-        "tcp": f"127.0.0.1:{tcp}",
-        "peers": ["127.0.0.1/32"],
-        "rate": 1e5,
-    }
-    commands = json.dumps({"socket": str(place / "commands")})
-    path = place / "flight.yaml"
-    text = CONFIG.read_text(encoding="utf-8")
-    path.write_text(f"{text}\ncommands: {commands}\nlink: {json.dumps(link)}\n", encoding="utf-8")
-    return path
 
 
 if __name__ == "__main__":

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.errors import UsageError
-from tests.flight.app.cli.linked_board import write_linked_config
 from tests.studies.campaigns.start import CALLS, Board, cases_of, check_injection, points
 from tests.studies.campaigns.start import summarise as summarise_starts
+from tests.support.linked_board import write_linked_config
 
 LINK_CALLS = (
     *CALLS,

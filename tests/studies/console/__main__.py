@@ -113,8 +113,8 @@ def measure(
             equal, red = replayed == (live, values), _red(page, source)
             wrong = _looked_at(page, looks)
             filed = _filed(page, Path(place)) if by_link else ""
-            told = (page.complaints, page.strangers, equal, commanded, red, wrong, filed)
-            return Figures(_weight_kb(), lag, memory, share, *told)
+            others = (page.complaints, page.strangers, equal, commanded, red, wrong, filed)
+            return Figures(_weight_kb(), lag, memory, share, *others)
 
 
 def _filed(page: Page, place: Path) -> str:

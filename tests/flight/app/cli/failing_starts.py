@@ -26,7 +26,7 @@ from unittest.mock import patch
 from flight.app.cli import main
 from flight.app.service import StartRetry
 from flight.link.process.station import Station
-from tests.flight.app.cli.linked_board import write_linked_config
+from tests.support.linked_board import write_linked_config
 
 CALLS = frozenset({"open", "os.mkdir", "os.remove", "os.listdir", "os.scandir", "socket.bind"})
 """Audit events (Python's documentation, "Audit events table"), each raised before its call."""

@@ -38,9 +38,9 @@ from ground.link.terminal import (
 )
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import UsageError
-from tests.flight.app.cli.linked_board import ROOT, free_ports, write_linked_config
 from tests.flight.link.vaults import frame_with
 from tests.support.flights import CONFIG
+from tests.support.linked_board import ROOT, free_ports, write_linked_config
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from flight.link.security import Vault
-from tests.flight.app.cli.linked_board import ROOT, free_ports, write_linked_config
+from tests.support.linked_board import ROOT, free_ports, write_linked_config
 
 _LONGEST_S = 120.0
 

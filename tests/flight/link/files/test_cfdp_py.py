@@ -120,7 +120,7 @@ class Ends:
         return self.ours.send(path, received.name, FOREIGN, kind, 10**9, self.now_ns, NOBODY).number
 
     def turn(self, seconds: float = STEP_S) -> None:
-        """Let both ends send what they have."""
+        """Let both ends send their waiting units."""
         until = self.now_ns + round(seconds * 1e9)
         while self.now_ns < until:
             self.now_ns += round(STEP_S * 1e9)

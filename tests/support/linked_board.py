@@ -11,7 +11,7 @@ from typing import Any
 from ground.link.terminal import make_keys
 from tests.support.flights import CONFIG
 
-ROOT = Path(__file__).resolve().parents[4]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def free_ports(kinds: list[socket.SocketKind]) -> list[int]:
