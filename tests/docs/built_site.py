@@ -73,7 +73,8 @@ def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> 
         for words, right in first_found.items():
             page.goto((site.resolve() / "index.html").as_uri())
             page.click(".md-search__input")
-            page.keyboard.type(words)
+            # All words at once: the results of the first letters would still be on the page.
+            page.fill(".md-search__input", words)
             page.wait_for_selector(item, timeout=60_000)
             first = str(page.get_attribute(item, "href")).partition("?")[0]
             if not first.endswith(f"/{right}"):
