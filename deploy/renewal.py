@@ -339,7 +339,7 @@ class Board:
         replace_file(self.own / RESTART, " ".join(parts or ("flight", "link")).encode())
 
     def restart_parts(self) -> None:
-        """Restart the parts whose restart a run has requested; a damaged request restarts flight and link.
+        """Restart the requested parts (flight, link, board); a damaged request restarts flight and link.
 
         The request is deleted last, so that a kill does not lose it. Only a restart of the board is deleted
         first, because it would otherwise be repeated after each boot. Raises OSError.
@@ -532,7 +532,8 @@ class Renewal:
         version = int(facts["version"])
         if version <= state.versions.get(kind, 0) and not facts["back"]:
             raise Refused(
-                f"{kind} {version} is not newer than {state.versions[kind]}: sign a newer one, or with --back"
+                f"{kind} {version} is not newer than {state.versions[kind]}: "
+                "sign a newer version, or sign this one with --back"
             )
         left_s, despite = 3600.0 * hours, bool(request["despite_faults"])
         before, session = board.release("previous"), str(self._contact.get("session", ""))

@@ -171,5 +171,8 @@ def _emulator(sensor: Sensor, key: str, measured: Measurements) -> Any:
         return imported(f"{key}.emulator", sensor.emulator, {}, os.environ)(measured, sensor)
     if place not in EMULATORS:
         known = ", ".join(SENSOR_PARTS)
-        raise ConfigError(f"{key}.emulator", f"is missing: only {known} have one; name yours by `emulator`")
+        raise ConfigError(
+            f"{key}.emulator",
+            f"is missing: only {known} have a built-in emulator; name your own by `emulator`",
+        )
     return EMULATORS[place](sensor.address or _ADDRESSES.get(place, 0), measured)

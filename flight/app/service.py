@@ -204,7 +204,7 @@ class SeparationInhibit:
                 folder.mkdir(parents=True, exist_ok=True)
                 replace_file(LinuxFiles(), path, to_record(b"%.1f" % self._elapsed))
         if (left := seconds - self._elapsed) > 0.0:
-            raise InhibitedError(f"separation inhibit of {seconds:g} s: {left:.0f} s with power are left")
+            raise InhibitedError(f"separation inhibit of {seconds:g} s: {left:.0f} s of powered time remain")
 
 
 def _powered(path: Path) -> float:

@@ -52,7 +52,7 @@ class Document:
         values: values without the key `extends`.
         name: name of the file in messages.
         lines: line of each dotted name (`steps[1].at`), in the file that gives its value.
-        files: file of each dotted name whose value stands in another file than `name`.
+        files: name of the extended file for each dotted name whose value that file gives.
         chain: name of this file, of the file that it extends, and so on.
     """
 

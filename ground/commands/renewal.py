@@ -57,7 +57,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
     keys = words.add_parser("keys", help="make root keys, a signing key and the first metadata")
-    keys.add_argument("folder", type=Path, metavar="FOLDER", help="a folder that does not exist")
+    keys.add_argument("folder", type=Path, metavar="FOLDER", help="new folder to create")
     renewed = words.add_parser("new-key", help="replace the signing key")
     renewed.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the keys and the metadata")
     renewed.add_argument("--root", action="store_true", help="replace both root keys too")
@@ -89,7 +89,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         placed.add_argument("--timeout", type=float, default=_TIMEOUT_S, metavar="S", help=text)
         if word == "activate":
             placed.add_argument("path", type=Path, metavar="BUNDLE", help="local copy of the bundle")
-            text = "time with power within which the ground must confirm (default %(default)g h)"
+            text = "powered time (h) within which the ground must confirm (default %(default)g)"
             placed.add_argument("--hours", type=float, default=24.0, metavar="H", help=text)
             text = "a fault that the flight reports does not end the trial"
             placed.add_argument("--despite-faults", action="store_true", help=text)

@@ -488,7 +488,7 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
         "--folder",
         type=Path,
         metavar="DIR",
-        help="folder of received files and open transfers (default files beside the keys)",
+        help="folder of received files and open transfers (default: the folder `files` beside the keys)",
     )
     text = "maximum rate of frames to the satellite, bytes/s (default %(default)g)"
     parser.add_argument("--rate", type=float, default=_RATE, metavar="B", help=text)

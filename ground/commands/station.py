@@ -56,7 +56,7 @@ def configure_keys(parser: argparse.ArgumentParser) -> None:
         "Make new keys: FOLDER/satellite for the board, FOLDER/ground for the ground, readable by their "
         "owner only. Existing keys are never overwritten."
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a folder that does not exist")
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="new folder to create")
     parser.set_defaults(command=run_keys)
 
 

@@ -112,7 +112,7 @@ class FlightSurroundings:
 
 
 UNKNOWN = FlightSurroundings(None, None)
-"""Orbit and camera mounting of a flight whose configuration cannot be read: none are known."""
+"""Surroundings without orbit and camera mounting, for a flight whose configuration cannot be read."""
 
 
 def _julian_date(utc_ns: int) -> float:

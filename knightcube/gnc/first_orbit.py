@@ -299,7 +299,7 @@ class _ArcFit:
         unknowns = np.zeros((len(logarithms), 6))
         unknowns[:, 5] = logarithms
         times = self._seen.times - self.time
-        # The initial guess of the velocity is the mean motion of the observed direction.
+        # The initial guess of the velocity is the mean rate of change of the observed direction.
         weights = (times - times.mean()) / np.sum((times - times.mean()) ** 2)
         unknowns[:, 2:4] = (weights @ self._seen.directions) @ self._basis.T
         for _ in range(_ROUNDS):

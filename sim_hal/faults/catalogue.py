@@ -409,7 +409,7 @@ def _coil_faults(axis: str) -> tuple[FaultKind, ...]:
         _fault(f"coil-{axis}: open", "broken wire: no current", _coil),
         _fault(
             f"coil-{axis}: shorted",
-            "the bridge drives `ohm`, the coil carries no current",
+            "short circuit of resistance `ohm` across the bridge: no current in the coil",
             _coil,
             {"ohm": ohm},
         ),

@@ -676,7 +676,7 @@ def built_craft(
 
 
 def craft_model(section: FreeBodySection, config: Config | None = None) -> CraftModel:
-    """Return the craft of a section, whose omitted values are those of the flight configuration.
+    """Return the simulated craft; values that `section` omits are taken from the flight configuration.
 
     Raises ConfigError for an impossible inertia tensor, and for values missing in both sections.
     """

@@ -267,7 +267,7 @@ def log_density(position: FloatArray, sun: FloatArray, day_bulge: float = 1.0) -
 
     `position` (n, 3) and the Sun's position `sun` (n, 3) are geocentric, m, ICRS.
 
-        `day_bulge` scales the day bulge. If `day_bulge` is zero, the mean density applies in all directions.
+    `day_bulge` scales the diurnal bulge; at zero the density depends only on the altitude.
     """
     distance = np.linalg.norm(position, axis=-1)
     profile = np.interp(distance - EARTH_RADIUS, _PROFILE[:, 0], np.log(_PROFILE[:, 1]))

@@ -131,7 +131,9 @@ class OrbitView:
         self._facts.update(facts.FIELD_EXTRAPOLATED, None if sigma is None else sigma > 0.0, now_ns, text)
         late = self._environment.clock_doubt
         if late or (self._is_clock_doubted and not self._environment.is_timed):
-            self._facts.update(facts.CLOCK_OFF, bool(late), now_ns, late or "the date follows the elements")
+            self._facts.update(
+                facts.CLOCK_OFF, bool(late), now_ns, late or "the clock is set from the date of the elements"
+            )
         self._is_clock_doubted = bool(late)
         doubt = found.field_doubt
         self._facts.update(

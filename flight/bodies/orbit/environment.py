@@ -65,7 +65,7 @@ field times the radius, as a fraction of the field.
 LOWEST_ORBIT = 1.01 * EARTH_RADIUS
 """Minimum radius (m) of a satellite's position and perigee."""
 EARLIEST = 2.0
-"""Largest time (days) before the epoch of the elements at which the elements are assumed to be published."""
+"""Longest time (days) by which orbital elements may be published before their epoch."""
 TIME_GATE_NS, CLOCK_DRIFT = SECOND_NS // 2, 1e-4
 """Largest accepted step (ns) of the receiver's time relative to the host's clock, and drift of that clock."""
 UNKNOWN_SIGMA, UNKNOWN_VELOCITY_SIGMA = 100.0, 1.0
@@ -334,7 +334,7 @@ class EstimatedEnvironment:
         return near, np.array([seconds])
 
     def _is_possible(self, fix: GpsFix) -> bool:
-        """Return whether radius and velocity are those of an orbit, and the date follows the elements."""
+        """Return whether position and velocity are an orbit, and the date is not long before the elements."""
         perigee, radius = fix.at(fix.julian_date).perigee_radius, float(np.linalg.norm(fix.position))
         if not (perigee >= LOWEST_ORBIT and radius >= LOWEST_ORBIT):
             return False

@@ -75,7 +75,7 @@ ACTIVATE = telecommand(
     "Try a received and signed artefact until it is confirmed, and return to the previous one otherwise",
     _NAME,
     Field("sum", "u1", "-", "SHA-256 of the bundle", SUM_BYTES),
-    Field("hours", "f4", "h", "time with power within which the ground must confirm"),
+    Field("hours", "f4", "h", "powered time within which the ground must confirm"),
     Field("despite_faults", "u1", "-", "1 if a fault that the flight reports does not end the trial"),
     hazard="restarts flight and link with another configuration or release",
 )
@@ -198,7 +198,7 @@ class Activate:
     Attributes:
         name: name of the bundle in the list of files.
         sum: SHA-256 of the bundle.
-        hours: time with power within which the ground must confirm the artefact, h.
+        hours: powered time (h) within which the ground must confirm the artefact.
         despite_faults: 1 if a fault that the flight reports does not end the trial.
     """
 

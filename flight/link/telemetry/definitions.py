@@ -202,7 +202,7 @@ RUN = Packet(
         Field("config_crc", "u4", "-", "CRC-32 of the configuration in the folder of the run"),
         Field("software", "S32", "-", "version of the flight application"),
         Field("seed", "u8", "-", "seed of the simulation, 0 on hardware"),
-        Field("utc_ns", "i8", "ns", "best known UTC at mission time zero since 1970, a label only"),
+        Field("utc_ns", "i8", "ns", "best known UTC, since 1970, at mission time zero; not used for control"),
         flag("simulated", "whether the devices are emulated"),
         flag("realtime", "whether the run uses the machine's clock; no means lock-step simulation"),
         Field("control_period_ns", "u8", "ns", "period of the control rate group"),
@@ -816,7 +816,7 @@ VERIFICATION = Packet(
 TRANSFER = Packet(
     "transfer",
     0x172,
-    "1 Hz of each open transfer and at its end, of the link process; not in the flight log",
+    "1 Hz for each open transfer, and at its end; from the link process, not in the flight log",
     "Progress of a file transfer",
     (
         flag("down", "whether the satellite sends the file"),

@@ -89,7 +89,7 @@ class DetumblerSettings:
                 raise UsageError(f"detumble {name} is {value}: it must be finite and positive")
         if self.share >= 1.0:
             raise UsageError(
-                f"detumble share is {self.share}: from 1 on the rate would change sign each window"
+                f"detumble share is {self.share}: it must be below 1, so that the rate keeps its sign"
             )
 
 

@@ -8,7 +8,7 @@ rate and the rotation of the field in inertial axes. A gyro sample gives the rat
 momentum plan uses a predicted field. If the orbit is known, the field is predicted along the orbit. Without a
 known attitude, the predicted field is rotated so that its direction and its change agree with the measured
 field. Without a known orbit, the measured field is assumed to continue to rotate at the present rate. Near
-the equator it does not: the field's direction oscillates by some 20 deg in each orbit. In contrast to B-dot
+the equator, however, the field's direction oscillates by some 20 deg in each orbit. In contrast to B-dot
 control, a spin along the field is also removed, as soon as the field has rotated. The coils stay off until
 `TRUSTED` consecutive samples agree with the prediction of the filter and the standard deviation of the rate
 across the field is below `BOUNDED`. Until the coils are driven, samples outside the pauses are used as well.

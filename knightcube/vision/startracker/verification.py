@@ -229,7 +229,7 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
 def _bright_matched(
     expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]
 ) -> npt.NDArray[np.bool_]:
-    """Return a mask of the expected stars that match, down to the brightness of the median matched star."""
+    """Return a mask of the matched stars, for the expected stars brighter than the median matched star."""
     matched = np.isin(expected, star)
     places = np.flatnonzero(matched)
     return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]

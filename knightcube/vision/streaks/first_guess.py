@@ -224,7 +224,7 @@ _LENGTH_ERROR = 1.0
 _LENGTH_SHARE = 0.015
 # Maximum number of rotation angles from each of two rankings, with and without votes against an angle.
 _MOST_HYPOTHESES = 3
-# Largest distance (px) across the circles between two fragments of one star.
+# Largest radial distance (px) from the centre of rotation between two fragments of one star's streak.
 _SAME_CIRCLE = 2.0
 # Largest relative difference between a region's length and the expected streak length.
 _LIKELY_LENGTH = 0.2

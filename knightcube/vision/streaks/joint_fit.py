@@ -388,7 +388,7 @@ def _end_motions(
 ) -> Iterator[tuple[int, float, CameraMotion, FloatArray, FloatArray]]:
     """Yield, for each end of the streaks, array column, outward sign, uniform motion, positions and speeds.
 
-    A uniform motion extrapolates the paths, because the true motion may come to rest at a streak end.
+    The paths are extrapolated with a uniform motion, because the star may have no speed at a streak end.
     """
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     steady = CameraMotion.steady(scene.motion.rotation)
@@ -692,7 +692,7 @@ def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
 
 
 def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
-    """Return a fit of the brightest streaks of the fit `last` with all stars on the pixels of these streaks.
+    """Fit the brightest streaks of `last` again, together with all stars on the pixels of these streaks.
 
     Faint stars hidden in a bright streak shift the fitted streak ends. If the limit on fitted pixels excluded
     hidden stars from the joint fit, a fit of fewer streaks with all their hidden stars is more accurate.

@@ -48,7 +48,7 @@ _MARGIN = 3.0
 _INSTANTS = 9
 # Residual, relative to the modelled counts, up to which a pixel is never excluded as an outlier.
 _UNRESOLVED = 0.1
-# Largest relative change of a star's speed over one point-spread width of a path fitted on a pixel strip.
+# Largest relative speed change over one point-spread width for which a star is fitted on a pixel strip.
 _STEADY = 0.05
 # Minimum length (point-spread widths) of the fast part of a path that is fitted on a pixel strip.
 _LEAST_FAST = 4.0
@@ -71,7 +71,7 @@ class BlockPixels:
         ceiling: counts above the background from which each pixel is saturated.
         gain: gain of the camera, electrons per count.
         crowded: flat indices (e,), in the arrays of this class, of the e pixels that several stars share.
-        common: index of each shared pixel in the list of all pixels that several stars share (e,).
+        common: indices (e,) that are equal for entries of `crowded` at the same pixel of the frame.
     """
 
     slot: IntArray

@@ -195,9 +195,9 @@ class PathGuidance:
     def _untimely(self, origin_ns: int, now_ns: int) -> str:
         age = (now_ns - origin_ns) * 1e-9
         if age < 0.0:
-            return f"its origin lies {-age:.3f} s in the future"
+            return f"the plan starts {-age:.3f} s in the future"
         if age > self._rules.late_after:
-            return f"late: {age:.3f} s after its origin, {self._rules.late_after} s allowed"
+            return f"the plan is late: it started {age:.3f} s ago, {self._rules.late_after} s are allowed"
         if self._planned_ns is not None and origin_ns <= self._planned_ns:
             return "out of order: the path being flown is not older"
         return ""

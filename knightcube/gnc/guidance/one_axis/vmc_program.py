@@ -131,7 +131,7 @@ class PathFamily:
 
     @classmethod
     def around(cls, boundary: BoundaryStates, horizon: float, reference: float, count: int) -> PathFamily:
-        """Return the family with parameters y = v - 1 on the free nodes, for the prey path over `horizon`."""
+        """Return the VMC paths around a prey path of `horizon` s, with parameters y = v - 1 at nodes."""
         grid = discretisation(count)
         fraction = 0.5 * (grid.rule.nodes + 1.0)
         still = CubicPrey.between(boundary.start, 0.0, boundary.end, 0.0, 1.0).q2(fraction)

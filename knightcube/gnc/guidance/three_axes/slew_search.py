@@ -273,7 +273,7 @@ class _MomentumCurves:
     """Curves of the angular momentum at n times, kg m^2/s, ICRS axes.
 
     Attributes:
-        base: momentum curve (n, 3) that reaches the end of the slew.
+        base: momentum curve (n, 3) that leads to the attitude and rate at the end of the slew.
         modes: changes (d, n, 3) of the momentum curve that preserve both ends; an amplitude of one
             corresponds to the torques of a rotation by about half a revolution.
     """
