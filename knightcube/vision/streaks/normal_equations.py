@@ -71,7 +71,7 @@ class BlockPixels:
         ceiling: counts above the background from which each pixel is saturated.
         gain: gain of the camera, electrons per count.
         crowded: flat indices (e,), in the arrays of this class, of the e pixels that several stars share.
-        common: indices (e,) that are equal for entries of `crowded` at the same pixel of the frame.
+        common: index of each fitted pixel in the list of the pixels that several stars share.
     """
 
     slot: IntArray
