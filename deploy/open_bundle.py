@@ -1,15 +1,17 @@
 """Checks a signed bundle of a renewal, and prepares its content for installation.
 
-The program renewal.py runs `open_bundle.py TRUSTED ROOT BUNDLE KIND FOLDER PRESENT KEPT` as root with the
-Python of a release. A bundle is a compressed tar archive of TUF metadata and of one artefact, whose kind is
-its TUF target path. Python-tuf checks the metadata against the metadata in the folder TRUSTED, whose versions
-never decrease, and against the first root metadata in the file ROOT. Python-tuf reads the unpacked bundle
-instead of downloading files.
+The program renewal.py runs `open_bundle.py TRUSTED ROOT BUNDLE KIND FOLDER PRESENT KEPT UTC` as root with
+the Python of a release. A bundle is a compressed tar archive of TUF metadata and of one artefact, whose kind
+is its TUF target path. Python-tuf checks the metadata against the metadata in the folder TRUSTED, whose
+versions never decrease, and against the first root metadata in the file ROOT. Python-tuf reads the unpacked
+bundle instead of downloading files.
 
 The program writes the artefact to FOLDER/artefact. For a configuration, the program also writes FOLDER/set
 with the configuration and the drop-ins of its units. For orbital elements or a star catalogue, this
 configuration is a copy of the configuration PRESENT with one value replaced. KEPT is the folder that will
-contain the catalogue. The program prints the version, the permission to replace a newer version, and the
+contain the catalogue. UTC is the mission time (s since 1970) at which expiry dates are judged. With an empty
+UTC the mission time is unknown, and no expiry date is judged, because the system clock of a board may be
+wrong. The program prints the version, the permission to replace a newer version, and the
 SHA-256 as one JSON object. For a refused bundle, the program prints one line and exits with status 1.
 """
 
@@ -22,6 +24,7 @@ import re
 import sys
 import tarfile
 from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -82,10 +85,12 @@ def unpack(bundle: Path, kind: str, folder: Path) -> None:
         raise Refused(f"the bundle is damaged: {error}") from error
 
 
-def verified(trusted: Path, root: bytes, unpacked: Path, kind: str, artefact: Path) -> dict[str, Any]:
+def verified(
+    trusted: Path, root: bytes, unpacked: Path, kind: str, artefact: Path, now: datetime
+) -> dict[str, Any]:
     """Verify an unpacked bundle, write its artefact, and return the signed description of the artefact.
 
-    Raises Refused.
+    Metadata that expired before `now` are refused. Raises Refused.
     """
     trusted.mkdir(parents=True, exist_ok=True)
     try:
@@ -97,6 +102,8 @@ def verified(trusted: Path, root: bytes, unpacked: Path, kind: str, artefact: Pa
             FolderFetcher(unpacked),
             bootstrap=root,
         )
+        # Python-tuf has no argument for the time; it reads the system clock when the updater is made.
+        updater._trusted_set.reference_time = now
         target = updater.get_targetinfo(kind)
         if target is None:
             raise Refused(f"the signed metadata name no {kind}")
@@ -174,12 +181,13 @@ def write_set(text: str, folder: Path) -> None:
 
 def main(words: Sequence[str]) -> int:
     """Check the bundle and prepare its content; return the exit status."""
-    trusted, root, bundle, kind, folder, present, kept = words
+    trusted, root, bundle, kind, folder, present, kept, utc = words
     place = Path(folder)
+    now = datetime.fromtimestamp(int(utc), UTC) if utc else datetime.min.replace(tzinfo=UTC)
     try:
         unpack(Path(bundle), kind, place / "unpacked")
         artefact = place / "artefact"
-        facts = verified(Path(trusted), Path(root).read_bytes(), place / "unpacked", kind, artefact)
+        facts = verified(Path(trusted), Path(root).read_bytes(), place / "unpacked", kind, artefact, now)
         with artefact.open("rb") as file:
             facts["sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
         if kind != "release":

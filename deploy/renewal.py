@@ -44,7 +44,8 @@ MOST_TRIES = 3
 LARGEST_RECORD, LARGEST_BUNDLE = 1 << 16, 128 << 20
 """Maximum sizes (bytes) of a record (request or state) and of a bundle."""
 KEPT_REPORTS, KEPT_REQUESTS = 16, 64
-MOST_HOURS = 2400.0
+MOST_HOURS, MOST_DIGITS = 2400.0, 11
+"""Longest trial (h), and maximum number of digits of the mission time (s since 1970) in a request."""
 KINDS = ("configuration", "elements", "catalogue", "release")
 STEPS = ("release", "configuration", "ground")
 """Versions to which the command-loss timer returns, one after the other."""
@@ -528,7 +529,10 @@ class Renewal:
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir(parents=True, mode=0o700)
         self._copy_bundle(kind, str(request["name"]), str(request["sum"]), staging / "bundle")
-        facts = self._opened(kind, staging)
+        utc = "" if "utc" not in request else str(int(request["utc"]))
+        if len(utc) > MOST_DIGITS:
+            raise Refused("the request is damaged")
+        facts = self._opened(kind, staging, utc)
         version = int(facts["version"])
         if version <= state.versions.get(kind, 0) and not facts["back"]:
             raise Refused(
@@ -567,8 +571,11 @@ class Renewal:
         if digest.hexdigest() != expected:
             raise Refused(f"{name} is not the file that was activated: its SHA-256 is {digest.hexdigest()}")
 
-    def _opened(self, kind: str, staging: Path) -> dict[str, Any]:
-        """Return the result of `open_bundle.py` for the bundle. Raises Refused if no attempt succeeds."""
+    def _opened(self, kind: str, staging: Path, utc: str) -> dict[str, Any]:
+        """Return the result of `open_bundle.py` for the bundle at the mission time `utc` (s), if it is known.
+
+        Raises Refused if no attempt succeeds.
+        """
         board, problems = self._board, list[str]()
         program = Path(__file__).resolve().with_name("open_bundle.py")
         kept = "/" / board.kept.relative_to(board.root)
@@ -578,7 +585,8 @@ class Renewal:
             for left in ("unpacked", "set"):
                 shutil.rmtree(staging / left, ignore_errors=True)
             words = [program, board.own / "trusted", root, staging / "bundle", kind, staging]
-            done = board.run([board.python(release), "-I", "-B", *words, board.configuration(), kept], 600.0)
+            words += [board.configuration(), kept, utc]
+            done = board.run([board.python(release), "-I", "-B", *words], 600.0)
             if done.returncode == 0:
                 facts: dict[str, Any] = json.loads(done.stdout)
                 return facts

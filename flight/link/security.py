@@ -112,6 +112,16 @@ COMMAND_SPIS = (1, 2)
 TELEMETRY_SPIS = (3, 4)
 """Primary and reserve SPI of telemetry frames."""
 
+
+def may_change(spi: int, changed: int) -> bool:
+    """Return whether a command of an SPI may change the key of the SPI `changed`.
+
+    Only the reserve SPI may change the keys of reserve SPIs, so that a stolen primary key cannot lock out the
+    reserve.
+    """
+    return spi == COMMAND_SPIS[1] or changed not in (COMMAND_SPIS[1], TELEMETRY_SPIS[1])
+
+
 HIGHEST_COUNTER = 2**63
 """Largest accepted frame counter, which is reached after 292 million years at 1000 frames per second."""
 

@@ -31,7 +31,7 @@ from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import Directive, NewKey, SendFile
 from flight.link.process.filing import LISTING
-from flight.link.security import COMMAND_SPIS, NEXT, Association, Sealer, Vault, new_key
+from flight.link.security import COMMAND_SPIS, NEXT, Association, Sealer, Vault, may_change, new_key
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET
 from flight.schema.reader import load
@@ -182,8 +182,12 @@ def change_key(
 
     The new key is stored on the ground before it is sent, and replaces the old key when the satellite has
     confirmed it. If the result of an earlier change is unknown, a ping under that change's new key is sent
-    first. Raises FlightError if no answer arrives.
+    first. Raises UsageError if the satellite would refuse the change, and FlightError if no answer arrives.
     """
+    if not may_change(spi, changed):
+        raise UsageError(
+            f"new-key {changed}: only the reserve SPI may change its own key: add --spi {COMMAND_SPIS[1]}"
+        )
     old, name = vault.read(changed), f"{changed}-{NEXT}"
     if old is None:
         raise UsageError(f"both copies of SPI {changed} are lost on the ground too: make new keys")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -269,11 +270,28 @@ def test_an_old_key_is_refused_once_a_root_key_has_named_another(board: RenewedB
 
 
 def test_the_expiry_of_a_signature_is_the_signers_choice(board: RenewedBoard) -> None:
+    end = datetime.now(UTC) + timedelta(days=300)
+    before, after = (round((end + timedelta(days=days)).timestamp()) for days in (-3, 3))
+    bundle = board.bundle("configuration", board.changed("second"), 1, expires=end.date().isoformat())
+    request = board.activate(bundle, utc=after)
+    board.step()
+    assert "ExpiredMetadataError" in board.reports(request)[-1][1], "the system clock is before the end"
+    request = board.activate(bundle, utc=before)
+    board.step()
+    assert board.reports(request)[-1][0] == "started"
+
+
+def test_a_wrong_system_clock_bars_no_signature_while_the_mission_time_is_unknown(
+    board: RenewedBoard,
+) -> None:
     bundle = board.bundle("configuration", board.changed("second"), 1, expires="2020-01-01")
+    for utc in ("soon", 10**11):
+        request = board.activate(bundle, utc=utc)
+        board.step()
+        assert board.reports(request)[-1][0] == "failed"
     request = board.activate(bundle)
     board.step()
-    assert "ExpiredMetadataError" in board.reports(request)[-1][1]
-    activated(board, version=2)  # without an end, no clock can bar it
+    assert board.reports(request)[-1][0] == "started"
 
 
 ELEMENTS = (

@@ -17,7 +17,7 @@ from flight.link.modes import Mode
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import KINDS, PARTS, Activate, Privileged, Restart
 from flight.link.regular_files import line_of, overwrite, read_regular, to_record
-from flight.link.telemetry.definitions import EVENT, MODE
+from flight.link.telemetry.definitions import EVENT, FIX, MODE
 from flight.link.telemetry.packets import LAYOUTS, to_text
 from hal.interfaces.wires import SECOND_NS
 
@@ -26,7 +26,7 @@ CONTACT_NS = 10 * SECOND_NS
 """Minimum time (ns) between two records of the contact with the ground."""
 _LARGEST = 1 << 16
 _REACTION = "reaction safe"  # trigger in the mode packet after an event (flight.loop.modes)
-_MODE_LAYOUT, _EVENT_LAYOUT = LAYOUTS[MODE.name], LAYOUTS[EVENT.name]
+_MODE_LAYOUT, _EVENT_LAYOUT, _FIX_LAYOUT = (LAYOUTS[packet.name] for packet in (MODE, EVENT, FIX))
 _STAGES = {"started": Stage.STARTED, "completed": Stage.COMPLETED, "failed": Stage.FAILED}
 _DAMAGED = (ValueError, TypeError, AttributeError, LookupError, RecursionError)
 
@@ -54,13 +54,18 @@ class Renewal:
         self._limit = command_loss
         self._session = os.urandom(8).hex()
         self._fault = ""
+        self._utc_offset_ns: int | None = None  # receiver's UTC minus the time of the host's clock
         self._recorded = ("", "")
         self._due_ns = 0
         self._modified_ns = 0
         self._reported = self._stored_number()
 
-    def request(self, directive: Privileged, done: Report) -> str:
-        """Store a request for the privileged part. Return the reason for a failure, or an empty text."""
+    def request(self, directive: Privileged, done: Report, now_ns: int) -> str:
+        """Store a request for the privileged part. Return the reason for a failure, or an empty text.
+
+        The request to activate an artefact contains the UTC (s) by the receiver, if a fix was used since the
+        start of the link. The host's clock may be wrong, so expiry dates are not judged by it.
+        """
         if not self._status.exists():
             return "this board has no renewal: deploy/install.sh installs it"
         name = f"{done.spi}-{done.counter}-{done.request.packet}-{done.request.sequence}"
@@ -69,14 +74,19 @@ class Renewal:
             kind, _, own = directive.name.removeprefix("received/").partition("/")
             values |= {"kind": kind, "name": own, "sum": directive.sum.hex(), "hours": directive.hours}
             values["despite_faults"] = bool(directive.despite_faults)
+            if self._utc_offset_ns is not None:
+                values["utc"] = (now_ns + self._utc_offset_ns) // SECOND_NS
         elif isinstance(directive, Restart):
             values["part"] = PARTS[directive.part]
         else:
             values["kind"] = KINDS[directive.kind]
         return "" if self._write(name, encoded(values)) else "the request could not be stored"
 
-    def followed(self, packet: bytes) -> None:
-        """Note a fault, a refused configuration, or a reaction to SAFE, in a packet of live telemetry."""
+    def followed(self, packet: bytes, now_ns: int, *, live: bool) -> None:
+        """Note a fault, a refused configuration, or a reaction to SAFE, in a packet of telemetry.
+
+        The time of a used GPS fix is noted too, if the packet was written a moment ago (`live`).
+        """
         if packet[:2] == _MODE_LAYOUT.identifier.to_bytes(2, "big"):
             (row,) = _MODE_LAYOUT.array(packet)
             if row["mode"] == Mode.SAFE and to_text(row["trigger"]) == _REACTION:
@@ -87,6 +97,10 @@ class Renewal:
             fails = row["severity"] == Severity.FAULT or row["code"] == CONFIG_DAMAGED.code
             if fails and not self._fault:
                 self._fault = f"{to_text(row['name'])}: {to_text(row['text'])}"[:64]
+        elif live and packet[:2] == _FIX_LAYOUT.identifier.to_bytes(2, "big"):
+            (row,) = _FIX_LAYOUT.array(packet)
+            if row["used"]:
+                self._utc_offset_ns = int(row["utc_ns"]) - now_ns
 
     def turn(self, admitted: int, now_ns: int) -> list[Report]:
         """Record the contact with the ground, and return new reports of the privileged part.

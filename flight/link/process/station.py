@@ -73,6 +73,7 @@ from flight.link.security import (
     RefusedError,
     Sealer,
     Vault,
+    may_change,
 )
 from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION, Packet
 from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError
@@ -446,10 +447,12 @@ def host_port(address: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def _change_key(change: NewKey, vault: Vault, gate: Gate, sealers: Mapping[int, Sealer]) -> str:
-    """Change the key of an SPI. Return the problem, or an empty text on success."""
+def _change_key(change: NewKey, spi: int, vault: Vault, gate: Gate, sealers: Mapping[int, Sealer]) -> str:
+    """Change a key by a command of an SPI. Return the problem, or an empty text on success."""
     if change.spi not in (*COMMAND_SPIS, *TELEMETRY_SPIS):
         return f"there is no SPI {change.spi}"
+    if not may_change(spi, change.spi):
+        return f"SPI {spi} must not change the key of the reserve SPI {change.spi}: send it under SPI 2"
     before = vault.read(change.spi)
     if before is not None and change.generation != before.generation + 1:
         return f"the key of SPI {change.spi} is of generation {before.generation}"
@@ -720,7 +723,7 @@ class Station:
             case Stop():
                 return [*self._playback.end("stopped"), done]
             case NewKey():
-                problem = _change_key(directive, self._vault, self._gate, self._sealers)
+                problem = _change_key(directive, done.spi, self._vault, self._gate, self._sealers)
                 return [replace(done, stage=Stage.FAILED, text=problem) if problem else done]
             case Activate() | Confirm() | Withdraw() | Restart():
                 return self._renew(directive, done)
@@ -731,7 +734,7 @@ class Station:
 
     def _renew(self, directive: Privileged, done: Report) -> list[Report]:
         """Hand a directive over to the privileged part, which reports its completion."""
-        request = partial(self._renewal.request, directive, done)
+        request = partial(self._renewal.request, directive, done, self._clock.now_ns())
         handed_over = replace(done, stage=Stage.STARTED, text=f"{directive}: handed over")
         if isinstance(directive, Activate):
             return self._filing.select(UseFile(directive.name, directive.sum), handed_over, request)
@@ -743,7 +746,7 @@ class Station:
             self._mission_ns, self._mission_at_ns = time_of(packet), now_ns
             self._downlink.live(packet)
             self._scheduling.followed(packet)
-            self._renewal.followed(packet)
+            self._renewal.followed(packet, now_ns, live=self._log.is_live)
             self._report(*self._verification.followed(packet))
             if self._log.is_live and self._log.label:
                 self._follow_utc(self._log.label, time_of(packet) - now_ns)

@@ -28,7 +28,7 @@ def test_a_bundle_is_opened_by_the_root_metadata_of_the_board(signing: Path, tmp
     assert bundle.stat().st_size < 8192, "few frames of a slow radio"
     root, folder = signing / "metadata/1.root.json", tmp_path / "opened"
     folder.mkdir()
-    words = [tmp_path / "trusted", root, bundle, "configuration", folder, config, "/kept"]
+    words = [tmp_path / "trusted", root, bundle, "configuration", folder, config, "/kept", ""]
     assert script("open_bundle").main([str(word) for word in words]) == 0
     assert (folder / "set/flight.yaml").read_bytes() == config.read_bytes()
 
@@ -50,7 +50,16 @@ def test_a_release_is_signed_under_the_version_of_its_sources(
     assert (done.returncode, done.stderr) == (0, "")
     root, folder = signing / "metadata/1.root.json", tmp_path / "opened"
     folder.mkdir()
-    words = [tmp_path / "trusted", root, tmp_path / f"release-{number}.renewal", "release", folder, "-", "-"]
+    words = [
+        tmp_path / "trusted",
+        root,
+        tmp_path / f"release-{number}.renewal",
+        "release",
+        folder,
+        "-",
+        "-",
+        "",
+    ]
     assert script("open_bundle").main([str(word) for word in words]) == 0
     with tarfile.open(folder / "artefact") as archive:
         assert {"deploy/build_release.py", "pyproject.toml"} < set(archive.getnames())

@@ -125,7 +125,7 @@ class Order:
         return self._offer(self._gate, frame)
 
     def _change_key(self, spi: int) -> None:
-        carrier = COMMAND_SPIS[spi == COMMAND_SPIS[0]]
+        carrier = COMMAND_SPIS[spi != TELEMETRY_SPIS[0]]
         if self._command(carrier):
             self._set_key(spi)
 

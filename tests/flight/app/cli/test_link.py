@@ -156,7 +156,10 @@ def test_a_key_is_changed_at_both_ends_also_when_the_answer_was_lost(
     assert command(lines, "udp", "new-key", "1") == 0
     assert vault.read("1-next") is None
     assert command(lines, "udp", "ping") == 0
+    assert command(lines, "udp", "new-key", "2") == 2
+    assert vault.read("2-next") is None
     text = capsys.readouterr()
+    assert "only the reserve SPI may change its own key: add --spi 2" in text.err
     assert new.key.hex() not in text.out + text.err
 
 

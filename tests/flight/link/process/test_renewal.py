@@ -12,9 +12,10 @@ from flight.link import events
 from flight.link.modes import Mode
 from flight.link.process.directives import Activate, Confirm, Listing, Withdraw
 from flight.link.process.renewal import Renewal, decoded, encoded
-from flight.link.telemetry.definitions import EVENT
+from flight.link.telemetry.definitions import EVENT, FIX
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.process.filed_ends import FiledEnds
+from tests.flight.link.telemetry.samples import plain_contents
 
 DATA = b"a bundle" * 100
 
@@ -85,6 +86,26 @@ def test_an_activation_is_a_request_for_exactly_the_checked_bytes(ends: Ends) ->
     ends.restart()
     ends.turn(2.5)
     assert len(stages(ends, "activate")) == 4, "a restarted link repeats no report"
+
+
+def test_an_activation_has_the_time_of_the_receiver_and_never_that_of_the_host(ends: Ends) -> None:
+    directive, utc = put(ends), 1_900_000_000
+
+    def asked() -> object:
+        ends.ask(directive)
+        ends.turn(3.0)
+        newest = max(ends.requests().items(), key=lambda item: int(item[0].split("-")[1]))
+        return newest[1].get("utc")
+
+    ends.turn(3.0)
+    for used, second in ((0, utc + 50), (1, utc)):
+        assert asked() is None, "no fix was used"
+        fields = {**plain_contents(FIX), "used": used, "utc_ns": second * 10**9}
+        ends.record(ends.packer.pack(FIX, ends.clock.now_ns(), fields))
+        ends.turn(3.0)
+    known = asked()
+    assert isinstance(known, int)
+    assert utc <= known < utc + 60
 
 
 def test_other_bytes_are_not_requested(ends: Ends) -> None:

@@ -317,6 +317,20 @@ def test_a_new_key_makes_the_old_one_worthless(link: BothEnds) -> None:
     assert link.status()["generation"].tolist() == [2, 1, 1, 1]
 
 
+def test_a_stolen_primary_key_cannot_change_the_keys_of_the_reserves(link: BothEnds) -> None:
+    key = bytes(range(32))
+    for changed in (2, 4):
+        counter = link.terminal.send(directives.pack(NewKey(changed, 2, key), 1))
+        link.turn()
+        assert link.stages(counter) == ["accepted", "failed"]
+    assert link.status()["generation"].tolist() == [1, 1, 1, 1]
+    for changed in (4, 1, 2):
+        counter = link.terminal.send(directives.pack(NewKey(changed, 2, key), 1), spi=2)
+        link.turn()
+        assert link.stages(counter, spi=2) == ["accepted", "completed"]
+    assert link.status()["generation"].tolist() == [2, 2, 1, 2]
+
+
 def test_a_new_key_of_telemetry_is_followed_by_the_ground(link: BothEnds) -> None:
     old = link.ground.read(3)
     assert old is not None
