@@ -349,10 +349,11 @@ def horizon_camera_settings(cameras: Sequence[WideCamera]) -> HorizonCameraSetti
     """Return the times of the horizon cameras; all cameras use those of the most frequent camera."""
     fine_ns = round(min(camera.fine_period for camera in cameras) * SECOND_NS)
     period_ns = min(round(min(camera.period for camera in cameras) * SECOND_NS), fine_ns)
+    margin_ns = min(SECOND_NS // 2, period_ns // 10)  # for a late run of the task
     return HorizonCameraSettings(
         [round(camera.exposure * SECOND_NS) for camera in cameras],
-        period_ns - SECOND_NS // 2,  # half a second of margin for a late run of the task
-        fine_ns - SECOND_NS // 2,
+        period_ns - margin_ns,
+        fine_ns - margin_ns,
         min(2 * SECOND_NS, period_ns),
         max(round(max(camera.max_age for camera in cameras) * SECOND_NS), 2 * fine_ns),
     )

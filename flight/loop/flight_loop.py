@@ -80,7 +80,7 @@ class FlightEnding:
 
 
 HEALTH_PERIOD_NS = SECOND_NS // 4
-COMMAND_PERIOD_NS = SECOND_NS // 10
+COMMAND_PERIOD_NS = HORIZON_PERIOD_NS = SECOND_NS // 10
 LABEL_PERIOD_NS = 60 * SECOND_NS
 """Period (ns) of the repetitions of the run packet after the UTC of the run was corrected."""
 
@@ -274,9 +274,19 @@ class FlightLoop:
             groups.append(RateGroup("camera", round(camera.period * SECOND_NS), tasks.imaging.trigger))
         if tasks.commanding is not None:
             groups.append(RateGroup("commands", COMMAND_PERIOD_NS, tasks.commanding.run))
+        if self._has_fast_cameras():
+            groups.append(RateGroup("horizon", HORIZON_PERIOD_NS, self._run_horizon_cameras))
         groups.append(RateGroup("health", HEALTH_PERIOD_NS, tasks.health.run))
         groups.append(RateGroup("housekeeping", SECOND_NS, self._keep_house))
         return groups
+
+    def _has_fast_cameras(self) -> bool:
+        """Return whether the horizon cameras take frames more often than once in two seconds."""
+        return any(camera.period < 2.0 for camera in self._config.wide_cameras)
+
+    def _run_horizon_cameras(self, cycle: Cycle) -> None:
+        if self._tasks.horizon_cameras is not None:
+            self._tasks.horizon_cameras.run(cycle.start_ns)
 
     def _run_control(self, cycle: Cycle) -> None:
         self._output = self._control.run(cycle)
@@ -285,9 +295,11 @@ class FlightLoop:
     def _keep_house(self, cycle: Cycle) -> None:
         now_ns, output = cycle.start_ns, self._output
         state = output.steered.state if output is not None else SteeringState.OFF
-        for sensing in (self._tasks.positioning, self._tasks.sun, self._tasks.horizon_cameras):
+        for sensing in (self._tasks.positioning, self._tasks.sun):
             if sensing is not None:
                 sensing.run(now_ns)
+        if not self._has_fast_cameras():
+            self._run_horizon_cameras(cycle)
         self._tasks.housekeeping.run(cycle, state)
         self._correct_label(now_ns)
         self._keep_state(now_ns)

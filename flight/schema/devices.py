@@ -465,9 +465,10 @@ class WideCamera(Section, frozen=True, kw_only=True):
     `structure_file` show where the spacecraft itself is in view. Each polygon is a list of corners (x, y) in
     px. Pixels above 0 of the file, a PGM or PNG image of the camera's size, show the spacecraft. All cameras
     are triggered together, with the shortest `period` of the cameras or, while the attitude is known to
-    0.05 deg, with the shortest `fine_period`. The angle `lens_error_deg` is the residual error of the
-    calibrated lens. The angle `mounting_deg` is the largest rotation of a camera about each body axis from
-    its `mounting`; the true rotation is assumed to be uniform within it.
+    0.05 deg, with the shortest `fine_period`. With `sun: false`, a camera is not searched for the Sun. The
+    angle `lens_error_deg` is the residual error of the calibrated lens. The angle `mounting_deg` is the
+    largest rotation of a camera about each body axis from its `mounting`; the true rotation is assumed to be
+    uniform within it.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -480,8 +481,9 @@ class WideCamera(Section, frozen=True, kw_only=True):
     bits: Annotated[int, Meta(ge=8, le=16)] = 8
     pedestal: Annotated[float, Meta(ge=0.0, le=200.0)] = 8.0
     exposure: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.005
-    period: Annotated[float, Meta(ge=2.0)] = 5.0
-    fine_period: Annotated[float, Meta(ge=2.0)] = 60.0
+    period: Annotated[float, Meta(ge=0.5)] = 5.0
+    fine_period: Annotated[float, Meta(ge=0.5)] = 60.0
+    sun: bool = True
     max_age: Positive = 30.0
     lens_error_deg: NotNegative = 0.02
     mounting_deg: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.1

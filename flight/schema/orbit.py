@@ -141,7 +141,9 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     (`OrbitConfig.torque_sizes`). From one boot to the next, the gyro bias may change by 10 deg/h, and the
     residual dipole by the fraction `changed` of its initial standard deviation. The mapping `roles` sets the
     role of blocks of the error state: `estimated`, `considered` (the block is not corrected, but its
-    uncertainty is part of every covariance) or `fixed` (the block is known exactly).
+    uncertainty is part of every covariance) or `fixed` (the block is known exactly). With `compare: meller`,
+    the attitude is also determined as the ION-F satellites do (`knightcube.reference.sensor_fusion`), for
+    comparison in the telemetry; this attitude is not flown.
     """
 
     bias_walk: NotNegative = 2.0e-6
@@ -152,6 +154,7 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     torque_start: Positive | None = None
     torque_walk: Positive | None = None
     roles: dict[BlockName, Literal["estimated", "considered", "fixed"]] = msgspec.field(default_factory=dict)
+    compare: Literal["meller"] | None = None
 
 
 class ExclusionCones(Section, frozen=True, kw_only=True):

@@ -43,6 +43,7 @@ class HorizonCameraJob:
             of the currents, `strings` is None.
         response: response of the cameras' detectors to light intensity; None: linear.
         structure: maps of the spacecraft's own structure in the images, by the index of the camera.
+        earth_only: indices of the cameras in whose images the Sun is not searched.
     """
 
     frames: Mapping[int, Image]
@@ -51,6 +52,7 @@ class HorizonCameraJob:
     strings: tuple[SolarStringModel, FloatArray] | None
     response: LogarithmicResponse | None = None
     structure: Mapping[int, StructureMap] = field(default_factory=dict)
+    earth_only: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +109,8 @@ def _sun(job: HorizonCameraJob) -> MeasuredDirection | None:
     coarse = CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the strings give no readings")
     if job.strings is not None:
         coarse = coarse_sun(job.strings[1], job.strings[0], _expected_nadir(job.knowledge))
-    found = sun_of_cameras(job.frames, job.cameras, coarse, LINEAR if job.response is None else SunSettings())
+    frames = {number: image for number, image in job.frames.items() if number not in job.earth_only}
+    found = sun_of_cameras(frames, job.cameras, coarse, LINEAR if job.response is None else SunSettings())
     if found.direction is None or found.covariance is None:
         return None
     return MeasuredDirection(

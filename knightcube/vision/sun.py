@@ -519,6 +519,8 @@ _SIGMAS = 3.0
 """Number of standard deviations of the coarse Sun direction within which the Sun is expected."""
 _RING = 12
 """Number of directions that are tested at each angular distance from the coarse Sun direction."""
+_SHARES = (1.0 / 6.0, 1.0 / 3.0, 0.5, 2.0 / 3.0, 5.0 / 6.0, 1.0)
+"""Angular distances of these directions, as fractions of the largest expected distance."""
 _CONTRADICTED = 5.0
 """Largest distance of measured and coarse Sun direction, in standard deviations of the coarse direction."""
 _CUT = np.radians(0.05)
@@ -555,10 +557,11 @@ def cameras_by_sun(sun: CoarseSun, cameras: Sequence[MountedCamera]) -> list[Cam
         return [CameraChoice(index, False, True, float("nan")) for index in range(len(cameras))]
     angle = np.arange(_RING) * (2.0 * np.pi / _RING)
     root = np.linalg.cholesky(sun.tangent_covariance)
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ root.T @ sun.basis
-    around = np.concatenate(
-        [sun.direction[None, :], *(sun.direction + k * ring for k in (1.0, 2.0, _SIGMAS))]
-    )
+    ring = _SIGMAS * np.stack([np.cos(angle), np.sin(angle)], axis=1) @ root.T @ sun.basis
+    # Solar strings in one plane leave one angle open, so that the samples are spaced by equal angles.
+    reach = np.linalg.norm(ring, axis=1, keepdims=True)
+    spaced = (ring / reach * np.tan(share * np.arctan(reach)) for share in _SHARES)
+    around = np.concatenate([sun.direction[None, :], *(sun.direction + offset for offset in spaced)])
     choices = []
     for index, camera in enumerate(cameras):
         seen = around @ attitude_matrix(camera.mounting).T

@@ -32,7 +32,15 @@ from flight.link import events
 from flight.link.modes import TESTBED, Mode
 from flight.link.telemetry.definitions import DESCRIPTION, NAVIGATION, SPIN
 from flight.loop import facts
-from flight.loop.body import BodyControl, BodyEstimation, BodyKind, ControlOutput, FlightBody, Target
+from flight.loop.body import (
+    BodyControl,
+    BodyEstimation,
+    BodyKind,
+    ControlOutput,
+    FlightBody,
+    ReadingFeed,
+    Target,
+)
 from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import ResponseSettings
 from flight.loop.coil_self_test import SelfTestSettings
@@ -200,7 +208,7 @@ class SatelliteEstimation(BodyEstimation):
         self._services = services
         self.orbit_filter, self.learned_problems = _filter(config, self.environment, learned, _utc(services))
         self.filter = self.orbit_filter
-        self.feed = OrbitFeed(self.orbit_filter)
+        self.feed: ReadingFeed = OrbitFeed(self.orbit_filter)
         self.coil_monitor = _coil_monitor(config)
         self._coils, self._errors = config.coils.map(), description_errors(config)
         self._field_bias = config.inertial_unit.accuracy.field_bias
@@ -216,6 +224,11 @@ class SatelliteEstimation(BodyEstimation):
             self.horizon_cameras = horizon_camera_feed(
                 config.wide_cameras, self.orbit_filter, self.environment, self._sun
             )
+            if config.estimation.compare is not None:
+                from flight.bodies.orbit.comparison import ComparedFeed  # noqa: PLC0415 - seldom needed
+
+                compared = ComparedFeed(self.feed, self.orbit_filter, config, services)
+                self.feed, self.horizon_cameras.compare = compared, compared.compare
 
     def field(self, estimate: Estimate) -> FloatArray:
         """Return the expected magnetic field (3,), T, in body axes, or zero while the orbit is unknown."""

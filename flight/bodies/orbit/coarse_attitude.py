@@ -12,7 +12,7 @@ estimate that star fixes have not made fine, the filter is restarted.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -169,6 +169,11 @@ FIELD_SIGMA = 0.03
 """Lower bound (rad) of the standard deviation of the field direction in the search for the horizon."""
 
 
+Sight = VectorObservation | None
+Compare = Callable[[int, Sight, Sight, Sight], None]
+"""Function of a time (ns) and the directions of Sun, nadir and field, which compares other methods."""
+
+
 class HorizonCameraFeed:
     """Updates the filter from the horizon cameras; implements `flight.loop.body.HorizonCameraUse`."""
 
@@ -196,6 +201,8 @@ class HorizonCameraFeed:
         self._response = response
         self._structure = dict(structure)
         self._against = 0
+        self.compare: Compare | None = None
+        self.earth_only: frozenset[int] = frozenset()
 
     @property
     def needed(self) -> bool:
@@ -218,6 +225,7 @@ class HorizonCameraFeed:
             self._strings(time_ns),
             self._response,
             self._structure,
+            self.earth_only,
         )
 
     def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
@@ -234,6 +242,8 @@ class HorizonCameraFeed:
             None if one is None else VectorObservation(one.direction, reference, one.covariance + self._lens)
             for one, reference in ((found.sun, sun), (found.nadir, down))
         ]
+        if self.compare is not None:
+            self.compare(time_ns, seen[0], seen[1], self._field_sight(time_ns))
         if not self._filter.runs or self._against >= CONTRADICTED:
             began = self._begin(time_ns, [one for one in seen if one is not None])
             return began and seen[0] is not None, began and seen[1] is not None
@@ -338,7 +348,9 @@ def horizon_camera_feed(
         except UsageError:
             mask = structure_mask(one, of_file=False)
         structure[number] = StructureMap.of(mask)
-    return HorizonCameraFeed(cameras, error, filter_, environment, sun, response, structure)
+    feed = HorizonCameraFeed(cameras, error, filter_, environment, sun, response, structure)
+    feed.earth_only = frozenset(number for number, one in enumerate(sections) if not one.sun)
+    return feed
 
 
 def _spread(

@@ -605,6 +605,29 @@ DIRECTIONS = Packet(
     ),
 )
 
+SEPARATE_ATTITUDES = Packet(
+    "separate_attitudes",
+    0x144,
+    "each round of the wide cameras, with `estimation.compare` only",
+    "Attitudes determined as by Meller et al., for comparison; quaternions rotate ICRS into body axes",
+    (
+        Field("middle_ns", "i8", "ns", "mission time of the attitudes"),
+        Field("cameras", "f8", "-", "attitude by Sun and nadir, scalar last; NaN if unknown", 4),
+        Field("cameras_sigma", "f4", "rad", "standard deviation of the attitude by Sun and nadir per axis"),
+        Field("magnetometer", "f8", "-", "attitude by the magnetometer, scalar last; NaN if unknown", 4),
+        Field(
+            "magnetometer_sigma", "f4", "rad", "standard deviation of the magnetometer's attitude per axis"
+        ),
+        Field("fused", "f8", "-", "mean of both attitudes, scalar last; NaN if unknown", 4),
+        Field("fused_sigma", "f4", "rad", "standard deviation of the mean of both attitudes per axis"),
+        Field("filtered", "f8", "-", "attitude of the filter with the gyros, scalar last; NaN if unknown", 4),
+        Field("filtered_sigma", "f4", "rad", "standard deviation of the filter's attitude per axis"),
+        Field("gyro_bias", "f8", "rad/s", "gyro bias that the filter estimates, body axes", 3),
+        Field("flown", "f8", "-", "attitude of the filter that is flown, scalar last; NaN if unknown", 4),
+        Field("flown_sigma", "f4", "rad", "standard deviation of the attitude that is flown per axis"),
+    ),
+)
+
 ORBIT_TRUTH = Packet(
     "orbit_truth",
     0x141,
@@ -880,7 +903,7 @@ JOB_TIMING = Packet(
 
 PACKETS: tuple[Packet, ...] = (
     RUN, IMU, CONTROL, ATTITUDE, COIL_CURRENTS, SPIN, NAVIGATION, DESCRIPTION, FIX, GPS_LINK, DIRECTIONS,
-    TARGET, MODE, PLAN, STREAK, STARS, SIGHTINGS, TRACK, EVENT, HOUSEKEEPING, HEALTH, COMMAND, PARAMETERS,
-    LINK, VERIFICATION, TRANSFER, TRUTH, TRUE_COIL_CURRENTS, ORBIT_TRUTH, TRUE_DESCRIPTION, CYCLE_TIMING,
-    RATE_GROUP, JOB_TIMING,
+    SEPARATE_ATTITUDES, TARGET, MODE, PLAN, STREAK, STARS, SIGHTINGS, TRACK, EVENT, HOUSEKEEPING, HEALTH,
+    COMMAND, PARAMETERS, LINK, VERIFICATION, TRANSFER, TRUTH, TRUE_COIL_CURRENTS, ORBIT_TRUTH,
+    TRUE_DESCRIPTION, CYCLE_TIMING, RATE_GROUP, JOB_TIMING,
 )  # fmt: skip

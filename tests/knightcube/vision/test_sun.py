@@ -20,7 +20,15 @@ from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.horizon.initial_guess import shortest_turn
 from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, SolarStringModel, coarse_sun
-from knightcube.vision.sun import LINEAR, SunSettings, SunStatus, find_sun, sample, sun_of_cameras
+from knightcube.vision.sun import (
+    LINEAR,
+    SunSettings,
+    SunStatus,
+    cameras_by_sun,
+    find_sun,
+    sample,
+    sun_of_cameras,
+)
 from sim_hal.assembly import wide_model
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.sim_hal.earth_camera.scenes import LOW, pointing, random_sun_scene
@@ -318,3 +326,27 @@ def test_a_strip_is_sampled_bilinearly_up_to_its_border() -> None:
     line = sample(strip[:1, :1], 0, np.array([[0.0, 0.0], [0.5, 0.0]]))
     assert line[0] == 100.0
     assert np.isnan(line[1])
+
+
+def test_strings_in_one_plane_leave_the_cameras_above_and_below_it_possible() -> None:
+    """Six side panels give the Sun's azimuth, and their error along the open angle is without bound."""
+    direction, basis = np.array([1.0, 0.0, 0.0]), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    coarse = CoarseSun(CoarseSunStatus.FOUND, direction, basis, np.diag([1e-4, 1e6]))
+    lens = Pinhole.from_field_of_view(128, 128, np.radians(40.0))
+
+    def camera(elevation: float, azimuth: float) -> MountedCamera:
+        """Return a camera whose boresight has these angles (deg) from x."""
+        up, side = np.radians([elevation, azimuth])
+        boresight = np.array([np.cos(up) * np.cos(side), np.cos(up) * np.sin(side), np.sin(up)])
+        right = np.array([-np.sin(side), np.cos(side), 0.0])
+        return MountedCamera(lens, from_matrix(np.array([right, np.cross(boresight, right), boresight])))
+
+    mounted = [
+        camera(0.0, 0.0),
+        camera(45.0, 0.0),
+        camera(-60.0, 5.0),
+        camera(0.0, 180.0),
+        camera(30.0, 90.0),
+    ]
+    possible = {choice.index for choice in cameras_by_sun(coarse, mounted) if choice.possible}
+    assert possible == {0, 1, 2}

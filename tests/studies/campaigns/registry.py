@@ -19,6 +19,7 @@ from tests.studies.campaigns.frames import FRAMES_CAMPAIGN
 from tests.studies.campaigns.gyro_dead import GYRO_DEAD
 from tests.studies.campaigns.horizon_methods import HORIZON_METHODS
 from tests.studies.campaigns.installer_kill import INSTALLER_KILL
+from tests.studies.campaigns.ionf import IONF
 from tests.studies.campaigns.knowledge import AGED_ELEMENTS, CALENDAR
 from tests.studies.campaigns.link_start import LINK_START
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
@@ -94,6 +95,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         COVERAGE,
         ORBIT_ATTITUDE,
         ORBIT_FRAMES,
+        IONF,
         DETUMBLE,
         SAFE_SUN,
         WORLD_COMPARISON,

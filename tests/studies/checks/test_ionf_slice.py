@@ -1,0 +1,52 @@
+"""A few seconds of an ION-F satellite with two cameras: the separate attitudes are recorded and honest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.schema import reader as configuration
+from flight.schema.document import FOLDER
+from flight.schema.orbit import as_orbit
+from sim_hal.settings import Simulation
+from tests.studies.campaigns.ionf import METHODS, SATELLITES, judged
+from tests.support.flights import fly
+from tests.support.sensor_suite import load
+
+SECONDS, PIXELS = 6.0, 320
+
+
+@pytest.mark.parametrize("name", SATELLITES)
+def test_each_satellite_flies_the_cameras_of_its_sensor_file(name: str) -> None:
+    suite = load(FOLDER / "sensors" / f"{name}.yaml")
+    flown = as_orbit(configuration.load(FOLDER / f"{SATELLITES[name]}.yaml"))
+    assert flown.craft.mass == 15.0
+    assert flown.craft.inertia == suite.inertia
+    assert len(flown.wide_cameras) == len(suite.cameras)
+    for camera, wanted in zip(flown.wide_cameras, suite.cameras, strict=True):
+        assert camera.mounting == pytest.approx(wanted.mounting, abs=1e-8)
+        assert (camera.columns, camera.rows, camera.sun) == (wanted.columns, wanted.rows, wanted.sun)
+        assert (camera.field_of_view_deg, 1.0 / camera.period) == (67.0, suite.camera_rate_hz)
+
+
+def test_cameras_and_magnetometer_give_attitudes_beside_the_flown_one(tmp_path: Path) -> None:
+    path = FOLDER / "ionf.yaml"
+    config = as_orbit(configuration.load(path))
+    small = tuple(
+        configuration.replace(one, columns=PIXELS, rows=PIXELS, lens_error_deg=0.1)
+        for one in (config.wide_cameras[0], config.wide_cameras[2])
+    )
+    config = configuration.replace(config, wide_cameras=small, duration=SECONDS)
+    section = configuration.simulation_section(path.read_text(encoding="utf-8"), str(path), Simulation)
+    run = fly(config, tmp_path / "flown", section=section)
+    rows = run["separate_attitudes"]
+    assert len(rows) >= 3, "about two rounds a second once the first fix gives the position"
+    assert np.median(np.diff(rows["middle_ns"])) == pytest.approx(0.5e9, abs=0.03e9)
+    found = judged(run, 3.0)
+    assert found["cameras"]["share"] > 0.9
+    for method in ("cameras", "fused", "filtered", "flown"):
+        assert found[method]["rms_deg"] < min(2.0, 4.0 * found[method]["claim_deg"])
+    assert found["magnetometer"]["share"] == 0.0, "the field has hardly turned in some seconds"
+    assert set(METHODS) < set(rows.dtype.names or ())
