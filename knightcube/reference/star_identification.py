@@ -68,6 +68,7 @@ from knightcube.reference.star_tables import (
     TriangleTable,
     angles,
     cells_of,
+    cosine_sigma,
     measured_planar_shape,
     measured_spherical_shape,
     members,
@@ -104,6 +105,8 @@ class ClassicalSettings:
         verified: maximum number of candidates of a pattern that are verified with all observed stars.
         scale_step: relative half width of the interval of image scales that one search covers.
         scales: maximum number of searched image scales; a field that needs more is rejected.
+        cosine_limits: whether the limits of an angle are those of its cosine, whose variance is given by
+            Michalski, eq. 31, instead of the limits of the angle itself.
         verification: conditions for the acceptance of a candidate.
     """
 
@@ -116,6 +119,7 @@ class ClassicalSettings:
     verified: int = 4
     scale_step: float = 0.002
     scales: int = 9
+    cosine_limits: bool = False
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
@@ -140,6 +144,7 @@ class ScaledField:
         sigma: (n,) standard deviations of the directions, rad.
         slack: relative error of angles that the uncertainty of the scale causes.
         stars: number of the brightest observed stars from which patterns are formed.
+        cosine_limits: whether the limits of angles are computed from their cosines.
     """
 
     field: StarField
@@ -148,14 +153,15 @@ class ScaledField:
     sigma: FloatArray
     slack: float
     stars: int
+    cosine_limits: bool = False
 
     def angles(
         self, one: IntArray, other: IntArray, tolerance: float
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the angles (k,) between observed stars, with lower and upper limits (k,) of the true angles.
 
-        The limits allow for the error of the scale, and for `tolerance` standard deviations of the angle
-        (Michalski, eq. 31).
+        The limits allow for the error of the scale, and for `tolerance` standard deviations of the angle, or
+        of its cosine (Michalski, eq. 31) if `cosine_limits` is set.
 
         Args:
             one: (k,) indices of the first observed stars.
@@ -163,6 +169,11 @@ class ScaledField:
             tolerance: tolerance of the angles in standard deviations.
         """
         angle = angles(self.direction[one], self.direction[other])
+        if self.cosine_limits:
+            cosine = np.cos(angle)
+            reach = tolerance * cosine_sigma(cosine, self.sigma[one], self.sigma[other])
+            low, high = (np.arccos(np.clip(cosine + off, -1.0, 1.0)) for off in (reach, -reach))
+            return angle, low - self.slack * angle, high + self.slack * angle
         off = tolerance * np.hypot(self.sigma[one], self.sigma[other]) + self.slack * angle
         return angle, angle - off, angle + off
 
@@ -191,6 +202,7 @@ def views(field: StarField, settings: ClassicalSettings) -> Iterator[ScaledField
             field.sigma * scale,
             0.5 * (high - low) / steps,
             min(settings.brightest, len(field)),
+            settings.cosine_limits,
         )
 
 

@@ -210,6 +210,22 @@ def angles(one: FloatArray, other: FloatArray) -> FloatArray:
     return np.asarray(2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(one - other, axis=-1), 1.0)))
 
 
+def cosine_sigma(cosine: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the standard deviations (k,) of the measured cosines of angles (Michalski, eq. 26 to 31).
+
+    With the covariance R = sigma^2 (I - b b^T) of a direction b (eq. 25b), the variance of eq. 31 becomes
+    (sigma_1^2 + sigma_2^2) sin^2 + sigma_1^2 sigma_2^2 (1 + cos^2). The second term is the trace of R1 R2; it
+    matters only for stars that are about as close as their errors.
+
+    Args:
+        cosine: (k,) cosines of the angles between two stars.
+        one: (k,) standard deviations of the directions of the first stars, rad.
+        other: (k,) standard deviations of the directions of the second stars, rad.
+    """
+    first, second, square = one**2, other**2, cosine**2
+    return np.asarray(np.sqrt((first + second) * (1.0 - square) + first * second * (1.0 + square)))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleShape:
     """Shape parameters of t triangles, with standard deviations.

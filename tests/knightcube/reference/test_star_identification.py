@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from knightcube.reference.star_identification import (
     propose_pyramids,
     search,
     shared_rate,
+    views,
 )
 from knightcube.reference.star_tables import KnownSky, side_lengths
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarMatch
@@ -76,6 +78,21 @@ def test_the_stars_of_a_clean_list_are_all_found(name: str) -> None:
         answer = METHODS[name].identify(drawn.field(), _sky())
         assert _right(answer, drawn)
         assert np.mean(answer.star >= 0) > 0.9
+
+
+def test_limits_of_cosines_admit_the_pairs_that_limits_of_angles_admit() -> None:
+    """Michalski, eq. 31: the same to 1 % for pairs 30 errors apart or more; wider for two blended stars."""
+    drawn = _drawn(_kind(noise_px=0.3), 6)[0]
+    view = next(views(drawn.field(), DEFAULT))
+    one, other = (np.array(index) for index in zip(*combinations(range(view.stars), 2), strict=True))
+    angle, low, high = view.angles(one, other, 3.0)
+    _, cosine_low, cosine_high = replace(view, cosine_limits=True).angles(one, other, 3.0)
+    assert np.all(angle > 30.0 * view.sigma.max())
+    assert cosine_high - cosine_low == pytest.approx(high - low, rel=0.01)
+    same = np.zeros(1, dtype=int)
+    assert replace(view, cosine_limits=True).angles(same, same, 3.0)[2][0] > 0.0
+    answer = search(drawn.field(), _sky(), propose_angles, replace(DEFAULT, cosine_limits=True))
+    assert _right(answer, drawn)
 
 
 @pytest.mark.parametrize("name", CLASSICAL)

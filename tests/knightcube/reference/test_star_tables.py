@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.reference import star_tables
-from knightcube.reference.star_tables import PairTable
+from knightcube.reference.star_tables import PairTable, cosine_sigma
 from knightcube.vision.startracker.index.sky_index import GuideStars
 
 _KEYS = arrays(
@@ -127,3 +127,18 @@ def test_the_magnitude_limit_gives_the_wanted_number_of_stars_in_a_field() -> No
     limit = star_tables.faintest_for(stars, 4.0 * np.pi / 30.0, 5.0)
     assert len(stars.brighter_than(limit)) == 150
     assert len(stars.brighter_than(star_tables.faintest_for(stars, 0.01, 50.0))) == 300
+
+
+@pytest.mark.parametrize("degrees", [0.01, 0.1, 5.0, 90.0])
+def test_the_variance_of_a_cosine_is_that_of_drawn_pairs(degrees: float) -> None:
+    """Pairs as close as their errors included; 20,000 draws give a standard deviation to 1.5 % (3 sigma)."""
+    rng = np.random.default_rng(4)
+    sigma = np.radians([0.02, 0.05])
+    first, second = np.array([1.0, 0.0, 0.0]), np.array([np.cos(np.radians(degrees)), 0.0, 0.0])
+    second[1] = np.sin(np.radians(degrees))
+    noise = [s * rng.standard_normal((20_000, 3)) for s in sigma]
+    across = [n - (n @ b)[:, None] * b for n, b in zip(noise, (first, second), strict=True)]
+    measured = np.sum((first + across[0]) * (second + across[1]), axis=1)
+    cosine = np.array([first @ second])
+    expected = cosine_sigma(cosine, sigma[:1], sigma[1:])[0]
+    assert np.std(measured) == pytest.approx(expected, rel=0.03)

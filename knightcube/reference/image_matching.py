@@ -1,0 +1,79 @@
+"""Attitude of a star camera by matching of two images, after Delabie's AIM (named in Michalski, section 3.4).
+
+Attitude estimation using image matching (AIM; Delabie, De Schutter & Vandenbussche, Journal of Guidance,
+Control, and Dynamics 36, 2013) projects the catalogue's stars into an image with a prior attitude. The
+rotation and translation that move this image onto the observed image with the least squared distances have a
+closed form. The rotation in the image is a rotation about the boresight, and the translation is a tilt of
+the boresight. The source thesis only names the method; the formulas here were derived again.
+
+A tilt of the camera moves stars far from the boresight by more than stars at the boresight, so that the
+closed form leaves an error in proportion to the error of the prior attitude and to the squared field angle.
+Each further step projects the catalogue's stars again and removes most of this error.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.wahba import (
+    AttitudeError,
+    AttitudeFix,
+    attitude_of_pair,
+    best_pair,
+    sightings,
+    upright,
+)
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
+
+STEPS = 4
+"""Default number of steps, which leaves less than 0.01 arcsec of a prior error of 1 deg in a 20 deg field."""
+
+
+def solve(
+    observed: FloatArray,
+    reference: FloatArray,
+    sigma: FloatArray,
+    prior: FloatArray | None = None,
+    steps: int = STEPS,
+) -> AttitudeFix:
+    """Return the attitude that matches the image of the reference stars to the observed image.
+
+    Raises AttitudeError if the directions do not determine an attitude, or if the prior attitude puts a star
+    behind the camera.
+
+    Args:
+        observed: (n, 3) observed unit vectors in camera axes, boresight +z.
+        reference: (n, 3) reference unit vectors.
+        sigma: (n,) standard deviations of the observed directions, rad.
+        prior: (4,) prior attitude, reference frame to camera; by default TRIAD's attitude of the best pair.
+        steps: number of projections with the newest attitude.
+    """
+    seen = sightings(observed, reference, sigma)
+    attitude = attitude_of_pair(seen, *best_pair(seen, sigma)) if prior is None else prior
+    for _ in range(steps):
+        attitude = multiply(_match(observed, reference @ attitude_matrix(attitude).T, seen.weight), attitude)
+    attitude = upright(attitude)
+    return AttitudeFix(attitude, seen.covariance, seen.loss(attitude))
+
+
+def _match(observed: FloatArray, predicted: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the rotation (4,) of the camera that moves the predicted image onto the observed image.
+
+    Args:
+        observed: (n, 3) observed unit vectors in camera axes.
+        predicted: (n, 3) unit vectors of the same stars for the prior attitude, in camera axes.
+        weight: (n,) weights of the stars with a sum of one.
+    """
+    if min(observed[:, 2].min(), predicted[:, 2].min()) <= 0.0:
+        raise AttitudeError("image matching needs all stars in front of the camera, seen and predicted")
+    image, catalogue = (vectors[:, :2] / vectors[:, 2:] for vectors in (observed, predicted))
+    image_centre, catalogue_centre = weight @ image, weight @ catalogue
+    u, v = image - image_centre, catalogue - catalogue_centre
+    turn = np.arctan2(weight @ (v[:, 0] * u[:, 1] - v[:, 1] * u[:, 0]), weight @ np.sum(u * v, axis=1))
+    cosine, sine = np.cos(turn), np.sin(turn)
+    x, y = image_centre - np.array([[cosine, -sine], [sine, cosine]]) @ catalogue_centre
+    shift = float(np.hypot(x, y))
+    tilt = (np.arctan(shift) / shift if shift > 0.0 else 1.0) * np.array([y, -x, 0.0])
+    # The camera turns against the motion of the stars in the image.
+    return multiply(from_rotation_vector(tilt), from_rotation_vector(np.array([0.0, 0.0, -turn])))
