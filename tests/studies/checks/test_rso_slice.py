@@ -10,14 +10,21 @@ import pytest
 from ground.campaigns.runner import Case
 from tests.studies.campaigns.rso import by_magnitude, ends_error
 from tests.studies.campaigns.rso_orbits import (
+    BRIGHTEST,
+    ESTIMATORS,
     MAGNITUDES,
     RSO_ORBITS,
+    TABLE_MAGNITUDE,
     THESIS,
+    faintest,
     flown,
+    mean_errors,
     one_frame,
+    rate_error,
     star_streaks,
     weakest,
 )
+from tests.support.scenes import catalogue
 
 SEED = 8
 
@@ -31,13 +38,37 @@ def test_the_orbits_give_the_thesis_s_opportunities_and_the_hardest_is_found() -
     assert frame["error_px"] < 0.5
     assert frame["false"] == 0
     assert np.array(frame["strict"]).shape == np.array(THESIS).shape
+    # The thesis prints less than 1 % and 0.4 deg over the ten orbits, by Harris's corners.
+    for name in ESTIMATORS:
+        assert abs(frame[name][0]) < 0.01
+        assert frame[name][1] < 0.8
     facts = RSO_ORBITS.summarise([{"run": 0, "magnitude": 4.0, "frames": []}], Path()).facts
-    assert facts["judge"] == [0, 0, 0]
+    assert facts["skies"]["whole"]["judge"] == [0, 0, 0]
     assert facts["weakest_at_95"] is None
     ends, _ = star_streaks(scenario, times[11])
     # The stars go along the rows at 0.05 rad/s: 73 px in half a second at the field's middle.
     middle = np.abs(ends - 512.0).max(axis=(1, 2)) < 100.0
     assert np.all(np.abs(np.linalg.norm(ends[middle, 1] - ends[middle, 0], axis=1) - 73.0) < 2.0)
+
+
+def test_fewer_stars_are_the_brightest_and_table_4_4_counts_them_apart() -> None:
+    """A first frame of the 7,000 brightest: the object is all that any rule singles out."""
+    stars, limit = catalogue(faintest(BRIGHTEST))[0], faintest(None)
+    # Magnitudes have two decimals, so that several stars share the last.
+    assert BRIGHTEST <= len(stars.magnitude) < 1.02 * BRIGHTEST
+    assert stars.magnitude.max() < 6.5 < limit
+    tables = [case for case in RSO_ORBITS.cases(1, SEED) if case.parameters["stars"] == BRIGHTEST]
+    assert [case.parameters["magnitude"] for case in tables] == [TABLE_MAGNITUDE]
+    scenario, times = flown(tables[0].seed, 0)
+    frame = one_frame(scenario, times[0], tables[0], 0)
+    facts = RSO_ORBITS.summarise([{**tables[0].parameters, "frames": [frame]}], Path()).facts
+    table = facts["skies"]["brightest 7000"]
+    assert table["judge"] == [1, 0, 0]
+    assert facts["frames"] == 0
+    assert table["harris"]["magnitude_percent"] < 1.0
+    assert mean_errors([]) == {"rates": 0, "magnitude_percent": None, "axis_deg": None}
+    assert rate_error(1.02 * np.array([0.0, 0.0, 0.05]))[0] == pytest.approx(0.02)
+    assert rate_error(np.array([0.0, 0.0, 0.05]))[1] == pytest.approx(90.0)
 
 
 def test_another_run_starts_elsewhere() -> None:
