@@ -5,7 +5,8 @@ and overshoots of 1 % at most, on a thread of 1e-5 N m/rad that no controller kn
 (angle, integral, rate, weight of the target), adaptive control three (bandwidth, adaptation, reference
 bandwidth). The search (Nelder and Mead from several starts) flies body and controller alone, without noise,
 with the loop's delay of one cycle; `tests.studies.campaigns controllers` flies what it finds on the whole
-loop. The margins below the limits leave room for noise.
+loop. The margins below the limits leave room for noise; `--settling` and `--overshoot` set other limits, and
+`--stiffness` another thread.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from knightcube.gnc.control.one_axis import AngleController
-from knightcube.gnc.guidance.one_axis.plant import PathSample, angle_of
+from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant, angle_of
 from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
 from tests.support.thread_loop import BELIEVED, PERIOD
 
@@ -43,15 +44,23 @@ class Flown:
     settling: float
     overshoot: float
 
-    @property
-    def loss(self) -> float:
-        """The power in mW, with a penalty for what the criterion forbids."""
-        slow, over = max(0.0, self.settling - SETTLED_S), max(0.0, self.overshoot - OVERSHOOT)
-        return 1e3 * self.power + _PENALTY * (slow + 100.0 * over)
+
+@dataclass(frozen=True, slots=True)
+class Criterion:
+    """The true body, and the limits of settling (s) and overshoot (a share) for which a baseline is tuned."""
+
+    true: SingleAxisPlant = TRUE
+    settling: float = SETTLED_S
+    overshoot: float = OVERSHOOT
+
+    def loss(self, flown: Flown) -> float:
+        """Return the power in mW, with a penalty for what the criterion forbids."""
+        slow, over = max(0.0, flown.settling - self.settling), max(0.0, flown.overshoot - self.overshoot)
+        return 1e3 * flown.power + _PENALTY * (slow + 100.0 * over)
 
 
-def fly(controller: AngleController) -> Flown:
-    """Fly the steps with perfect measurements."""
+def fly(controller: AngleController, true: SingleAxisPlant = TRUE) -> Flown:
+    """Fly the steps of a true body with perfect measurements."""
     (angle, rate), current, energy = RELEASE, 0.0, 0.0
     slowest = furthest = 0.0
     for q2 in TARGETS:
@@ -61,10 +70,10 @@ def fly(controller: AngleController) -> Flown:
         for _ in range(round(STEP / PERIOD)):
             errors.append((wanted.angle - angle) / size)
             made = controller.command(wanted, angle, rate)
-            middle = rate + 0.5 * PERIOD * TRUE.acceleration(angle, rate, current)
+            middle = rate + 0.5 * PERIOD * true.acceleration(angle, rate, current)
             there = angle + 0.5 * PERIOD * rate
-            angle, rate = angle + PERIOD * middle, rate + PERIOD * TRUE.acceleration(there, middle, current)
-            energy += PERIOD * TRUE.resistance * current * current
+            angle, rate = angle + PERIOD * middle, rate + PERIOD * true.acceleration(there, middle, current)
+            energy += PERIOD * true.resistance * current * current
             current = made.current
         outside = np.flatnonzero(np.abs(errors) > _BAND)
         slowest = max(slowest, PERIOD * (outside[-1] + 1) if outside.size else 0.0)
@@ -90,13 +99,15 @@ STARTS: dict[str, tuple[Callable[[Sequence[float]], AngleController], tuple[tupl
 }
 
 
-def tune(name: str, progress: Callable[[str], object] = lambda _: None) -> tuple[tuple[float, ...], Flown]:
+def tune(
+    name: str, criterion: Criterion, progress: Callable[[str], object] = lambda _: None
+) -> tuple[tuple[float, ...], Flown]:
     """Return the best variables of a baseline, and the flight with them."""
     make, starts = STARTS[name]
     best: tuple[float, tuple[float, ...]] | None = None
     for start in starts:
         found = minimize(
-            lambda x: fly(make(x)).loss,
+            lambda x: criterion.loss(fly(make(x), criterion.true)),
             start,
             method="Nelder-Mead",
             options={"maxfev": 800, "xatol": 1e-3, "fatol": 1e-3},
@@ -105,7 +116,7 @@ def tune(name: str, progress: Callable[[str], object] = lambda _: None) -> tuple
         if best is None or found.fun < best[0]:
             best = float(found.fun), tuple(found.x.tolist())
     assert best is not None
-    return best[1], fly(make(best[1]))
+    return best[1], fly(make(best[1]), criterion.true)
 
 
 def named(name: str, x: Sequence[float]) -> dict[str, float]:
@@ -123,10 +134,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Tune and print; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.tune_controllers", description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--stiffness", type=float, default=TRUE.stiffness, help="of the thread, N m/rad")
+    parser.add_argument("--settling", type=float, default=SETTLED_S, help="s, default %(default)s")
+    parser.add_argument("--overshoot", type=float, default=OVERSHOOT, help="a share, default %(default)s")
     options = parser.parse_args(arguments)
+    true = replace(TRUE, stiffness=options.stiffness)
+    criterion = Criterion(true, options.settling, options.overshoot)
     facts = {}
     for name in STARTS:
-        x, flown = tune(name, sys.stderr.write)
+        x, flown = tune(name, criterion, sys.stderr.write)
         facts[name] = {
             **named(name, x),
             "power_w": flown.power,
