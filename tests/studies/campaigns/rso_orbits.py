@@ -81,7 +81,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 @lru_cache(maxsize=4)
 def faintest(stars: int | None) -> float:
-    """Return the magnitude below which the catalogue has at least so many stars; None stands for all."""
+    """Return the magnitude below which the catalogue has at least `stars` stars; None stands for all."""
     if stars is None:
         return STAR_LIMIT
     return float(np.nextafter(np.sort(catalogue(STAR_LIMIT)[0].magnitude)[stars - 1], np.inf))
