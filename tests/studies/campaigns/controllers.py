@@ -12,6 +12,10 @@ Two powers are given (`knightcube.gnc.guidance.one_axis.plant`): V |I|, which th
 their supply of 3.4 V and which compares with the thesis's consumption, and R I^2 of the mean current, the
 cost that the paths minimise.
 
+The thesis names no stiffness of its thread. On a thread of 4.2e-5 N m/rad its own loop draws the 0.10 W that
+it printed (R I^2), so the controllers of `STIFF` are also flown on this thread, with PID and adaptive control
+tuned for it.
+
 The floor is the clairvoyant optimum: the whole plant known, each target reached at rest 10 s after its
 command and held, by direct collocation (tests.support.collocation_oracle). What reaches its targets later
 may lie below.
@@ -30,6 +34,7 @@ from flight.schema import reader as configuration
 from flight.schema.testbed import PidGains, TestbedConfig
 from ground import report
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from sim_hal.settings import Simulation, Thread
 from tests.support.flights import demo_config, demo_world, fly, thesis_config
 from tests.support.ideal_power import clairvoyant_power
 
@@ -80,6 +85,26 @@ def pid() -> TestbedConfig:
     return towards_steps(tracker="pid", gains=gains, target_weight=0.187)
 
 
+def limit_pid() -> TestbedConfig:
+    """Return the demonstration under PID control tuned without margins below the criterion's limits.
+
+    The gains are those of `tune_controllers --settling 9 --overshoot 0.01` [2026-11-26].
+    """
+    gains = PidGains(proportional=0.462, integral=0.08826, derivative=1.0)
+    return towards_steps(tracker="pid", gains=gains, target_weight=0.1871)
+
+
+def stiff_pid() -> TestbedConfig:
+    """Return PID control with the gains of `tune_controllers --stiffness 4.2e-5` [2026-11-26]."""
+    gains = PidGains(proportional=0.4475, integral=0.09449, derivative=0.9996)
+    return towards_steps(tracker="pid", gains=gains, target_weight=0.1707)
+
+
+def stiff_adaptive() -> TestbedConfig:
+    """Return adaptive control with gains of the same command; it cannot settle within 9 s on this thread."""
+    return towards_steps(tracker="adaptive", bandwidth=0.9991, adaptation=363.2, reference_bandwidth=0.526)
+
+
 def placed_pid() -> TestbedConfig:
     """Return the demonstration under PID control with three poles in one place."""
     return towards_steps(tracker="pid", bandwidth=0.76)
@@ -101,26 +126,50 @@ CONTROLLERS: dict[str, Callable[[], TestbedConfig]] = {
     "thesis": thesis_loop,
     "thesis, raw readings": raw_thesis_loop,
     "pid": pid,
+    "pid, at the limits": limit_pid,
     "pid, three poles": placed_pid,
     "adaptive": adaptive,
     "adaptive, bandwidth": by_bandwidth,
 }
 
+STIFF: dict[str, Callable[[], TestbedConfig]] = {
+    "this loop": this_loop,
+    "thesis": thesis_loop,
+    "pid": stiff_pid,
+    "adaptive": stiff_adaptive,
+}
+STIFF_THREAD = Thread(stiffness=4.2e-5, damping=2e-6)
+"""Thread on which the thesis's loop draws 0.10 W of R I^2."""
+OURS, THICK = "", "stiff "
+THREADS = {OURS: CONTROLLERS, THICK: STIFF}
+
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return every controller on each of `runs` seeds."""
+    """Return every controller on each of `runs` seeds, and those of `STIFF` on the stiff thread."""
+    drawn = [(thread, name) for thread, names in THREADS.items() for name in names]
     return [
-        Case(f"{name}/{run}", (seed, run), {"controller": name, "flight_seed": seed + run})
+        Case(
+            f"{thread}{name}/{run}",
+            (seed, run),
+            {"controller": name, "thread": thread, "flight_seed": seed + run},
+        )
         for run in range(runs)
-        for name in CONTROLLERS
+        for thread, name in drawn
     ]
+
+
+def world(thread: str, seed: int = 1) -> Simulation:
+    """Return the demonstration's world with one of the two threads."""
+    simulated = configuration.replace(demo_world(), seed=seed)
+    return simulated if thread == OURS else configuration.replace(simulated, thread=STIFF_THREAD)
 
 
 def run(case: Case) -> Result:
     """Fly one demonstration."""
-    config = CONTROLLERS[case.parameters["controller"]]()
+    thread = case.parameters["thread"]
+    config = THREADS[thread][case.parameters["controller"]]()
     with tempfile.TemporaryDirectory() as place:
-        flown = fly(config, Path(place) / "run", seed=case.parameters["flight_seed"])
+        flown = fly(config, Path(place) / "run", section=world(thread, case.parameters["flight_seed"]))
         summary = report.summarise(flown)
     rows = summary["steps"]
     return {
@@ -140,23 +189,34 @@ def _worst(rows: Sequence[dict[str, Any]], key: str) -> float:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return each controller's mean power and worst figures over the seeds, beside the floor."""
-    floor = clairvoyant_power(this_loop(), demo_world())
-    facts: dict[str, Any] = {"clairvoyant_w": floor, "controllers": {}}
-    for name in CONTROLLERS:
-        own = [result for result in results if result["controller"] == name]
-        heat = float(np.mean([result["heat_w"] for result in own]))
-        supply = float(np.mean([result["supply_w"] for result in own]))
-        worst = {key: float(max(result[key] for result in own)) for key in FIGURES}
-        facts["controllers"][name] = {
-            "seeds": len(own),
-            "supply_w": supply,
-            "thesis_w": THESIS_W.get(name),
-            "heat_w": heat,
-            "over_floor": heat / floor,
-            **{key: value if np.isfinite(value) else None for key, value in worst.items()},
-        }
+    """Return each controller's mean power and worst figures over the seeds, beside the floor, by thread."""
+    facts: dict[str, Any] = {}
+    for thread, names in THREADS.items():
+        if own := [result for result in results if result["thread"] == thread]:
+            floor = clairvoyant_power(this_loop(), world(thread))
+            facts[f"{thread}clairvoyant_w"] = floor
+            facts[f"{thread}controllers"] = {name: _figures(own, name, floor) for name in names}
     return summary(facts)
+
+
+def _figures(results: Sequence[Result], name: str, floor: float) -> dict[str, Any]:
+    """Return a controller's figures on one thread; its power over this loop's is a factor."""
+    own = [result for result in results if result["controller"] == name]
+    if not own:
+        return {"seeds": 0}
+    heat = float(np.mean([result["heat_w"] for result in own]))
+    seeds = {result["flight_seed"] for result in own}
+    ours = [r["heat_w"] for r in results if r["controller"] == "this loop" and r["flight_seed"] in seeds]
+    worst = {key: float(max(result[key] for result in own)) for key in FIGURES}
+    return {
+        "seeds": len(own),
+        "supply_w": float(np.mean([result["supply_w"] for result in own])),
+        "thesis_w": THESIS_W.get(name),
+        "heat_w": heat,
+        "over_floor": heat / floor,
+        "over_this_loop": heat / float(np.mean(ours)) if ours else None,
+        **{key: value if np.isfinite(value) else None for key, value in worst.items()},
+    }
 
 
 CONTROLLERS_CAMPAIGN = Campaign(

@@ -26,11 +26,31 @@ def test_the_clairvoyant_optimum_is_the_one_that_was_computed_elsewhere(
 
 
 def test_every_controller_flies_its_own_configuration() -> None:
-    configs = {name: make() for name, make in controllers.CONTROLLERS.items()}
+    configs = {name: make() for names in controllers.THREADS.values() for name, make in names.items()}
     assert {config.control.tracker for config in configs.values()} == {"lq", "thesis", "pid", "adaptive"}
     for config in configs.values():
         assert config.steps == configs["this loop"].steps
         assert config.camera is None
+
+
+def test_both_threads_are_flown_and_reported_apart() -> None:
+    """Two made-up flights on the stiff thread; only the stiffness of its world differs from ours."""
+    cases = controllers.CONTROLLERS_CAMPAIGN.cases(2, 1)
+    stiff = [case for case in cases if case.parameters["thread"] == controllers.THICK]
+    assert len(stiff) == 2 * len(controllers.STIFF)
+    assert len({case.key for case in cases}) == len(cases)
+    ours = controllers.world(controllers.OURS, 7)
+    thread = configuration.replace(ours.thread, stiffness=4.2e-5)
+    assert controllers.world(controllers.THICK, 7) == configuration.replace(ours, thread=thread)
+    drawn = {name: 1.0 for name in controllers.FIGURES} | {"supply_w": 0.2}
+    results = [
+        {**drawn, "controller": name, "thread": controllers.THICK, "flight_seed": 1, "heat_w": heat}
+        for name, heat in (("this loop", 0.10), ("pid", 0.101))
+    ]
+    facts = controllers.CONTROLLERS_CAMPAIGN.summarise(results, Path()).facts
+    assert "controllers" not in facts
+    assert facts["stiff controllers"]["pid"]["over_this_loop"] == pytest.approx(1.01)
+    assert facts["stiff controllers"]["adaptive"] == {"seeds": 0}
 
 
 def test_worlds_differ_and_stay_within_their_bounds() -> None:
