@@ -118,7 +118,7 @@ def one_frame(scenario: Scenario, at: Opportunity, case: Case, number: int) -> R
     truth = np.array([at.first, at.last])
     found = match(report, truth)
     result = {"magnitude": magnitude, "error_px": found.error, "false": found.false, "seconds": seconds}
-    result["harris"] = rate_error(_corner_rate(pixels, camera))
+    result["harris"] = rate_error(corner_rate(pixels, camera, RATE))
     result["likelihood"] = rate_error(None if report is None else report.rotation / EXPOSURE)
     if report is not None:
         stars = star_streaks(scenario, at, limit)
@@ -131,10 +131,10 @@ def one_frame(scenario: Scenario, at: Opportunity, case: Case, number: int) -> R
     return result
 
 
-def _corner_rate(pixels: Image, camera: StarCameraModel) -> FloatArray | None:
-    """Return the rate (3,) by Harris's corners and OLAE, None if the frame has none."""
+def corner_rate(pixels: Image, camera: StarCameraModel, prior: FloatArray) -> FloatArray | None:
+    """Return the rate (3,) by Harris's corners and OLAE with the sign of `prior`, or None without a rate."""
     settings = StreakSettings.of("harris", saturation=float(camera.highest_count), gain=camera.gain)
-    return estimate_rate(pixels, camera.pinhole, EXPOSURE, settings, RATE, 0.0).rate
+    return estimate_rate(pixels, camera.pinhole, EXPOSURE, settings, prior, 0.0).rate
 
 
 def rate_error(rate: FloatArray | None, truth: FloatArray = RATE) -> list[float] | None:
