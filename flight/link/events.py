@@ -85,7 +85,7 @@ CONTROL_LOST = _fault(
     20, "control-lost", "the coils are set to zero because there is no valid estimate", Reaction.COILS_OFF
 )
 CONTROL_REGAINED = _info(21, "control-regained", "the estimate is valid again")
-BLIND = _fault(22, "blind", "there has been no valid estimate for too long", Reaction.SAFE)
+BLIND = _fault(22, "blind", "there has been no valid or accurate estimate for too long", Reaction.SAFE)
 TUMBLING = _warning(
     23, "tumbling", "the body rotates too fast for any mode but detumbling", Reaction.DETUMBLE
 )

@@ -8,6 +8,7 @@ the configuration as `module:object`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -373,6 +374,24 @@ class BodyEstimation(Protocol):
         The default method does nothing, for a body whose estimation does not depend on the allocation.
         """
         del used
+
+    def is_accurate(self, estimate: Estimate) -> bool:
+        """Return whether an estimate without a gyro is accurate enough for driving the coils."""
+        return True
+
+    def rate_without_gyro(self, time_ns: int) -> FloatArray | None:
+        """Return the rate (3,), rad/s, that replaces the gyro's rate, or None without an accurate rate.
+
+        The default method returns None, for a body whose control laws without an estimate need no rate.
+        """
+        return None
+
+    def fastest_by_field(self) -> float:
+        """Return the largest likely body rate (rad/s) by the magnetometer, while there is no gyro.
+
+        The default method returns infinity, for a body whose rate is not estimated from the magnetometer.
+        """
+        return math.inf
 
     def knowledge(self) -> Knowledge:
         """Return how well the attitude is known now."""

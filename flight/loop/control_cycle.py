@@ -136,8 +136,9 @@ class ControlCycle:
         overdue = None
         if estimate is not None and self._target is not None:
             overdue = control.targets.error_when_due(estimate, self._target, now_ns)
-        rate = tasks.navigation.speed if record.readings else None
-        record.mode = tasks.modes.step(estimate, rate, overdue, not record.coils.error, now_ns)
+        speed, accurate = tasks.navigation.speed, tasks.navigation.is_accurate(estimate)
+        rate = speed if record.readings and math.isfinite(speed) else None
+        record.mode = tasks.modes.step(estimate, rate, overdue, not record.coils.error, now_ns, accurate)
         target = tasks.modes.target(now_ns - self._recorder.epoch_ns)
         if target is not self._target:
             self._target = target

@@ -466,6 +466,7 @@ class ModeControl:
         overdue: float | None,
         coils_answer: bool,
         now_ns: int,
+        accurate: bool = True,
     ) -> Mode:
         """Check the conditions of the present mode, and return the mode for this cycle.
 
@@ -475,14 +476,19 @@ class ModeControl:
             overdue: angle (rad) between body and due attitude, or None while no attitude is due.
             coils_answer: whether the PWM chip acknowledges commands.
             now_ns: time (ns) of the cycle.
+            accurate: whether the estimate is accurate enough for driving the coils.
         """
-        # A body that acquires its attitude needs a measured rate, but no estimate.
-        measured = rate is not None if Mode.ACQUIRE in self._modes else estimate is not None
+        # A body that acquires its attitude needs a known rate, but an estimate only for steering.
+        measured = estimate is not None and accurate
+        if Mode.ACQUIRE in self._modes:
+            measured = rate is not None and (measured or estimate is None or self.mode not in STEERING)
         self._measured_ns = now_ns if measured else self._measured_ns
         if self.mode is Mode.BOOT:
             self._boot(measured and coils_answer, now_ns)
         blind = (now_ns - self._measured_ns) * 1e-9
         text = f"no estimate for {blind:.0f} s"
+        if estimate is not None:
+            text = f"no estimate accurate enough to steer by for {blind:.0f} s"
         self._facts.update(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
         if self.mode is Mode.DETUMBLE and rate is not None:
             self._brake(estimate, rate, now_ns)

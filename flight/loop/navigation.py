@@ -34,7 +34,7 @@ from hal.interfaces.devices import (
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Estimate
+from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 
 _AT_A_TIME = 16
@@ -42,9 +42,6 @@ _AT_A_TIME = 16
 
 Repeating the filter updates of one second takes a few control cycles.
 """
-
-_LARGEST_ANGLE_SIGMA, _LARGEST_RATE_SIGMA = 0.0035, 0.01
-"""Largest standard deviations (rad, rad/s) of an estimate by which the coils are driven without a gyro."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +141,11 @@ class Navigation:
         self._available = estimation.coil_monitor.available
         self._has_rate = True
         self.speed = 0.0
-        """Body rate (rad/s) of the newest reading, including the gyro bias; without a gyro, the estimate."""
+        """Body rate (rad/s) of the newest reading, including the gyro bias.
+
+        Without a gyro, the value is the rate of the estimate, or the largest likely rate by the magnetometer,
+        or infinity while the rate is unknown.
+        """
 
     def begin(self, time_ns: int) -> None:
         """Ignore readings made before the release of the body at `time_ns`."""
@@ -209,13 +210,13 @@ class Navigation:
 
         The newest reading that agreed with the estimate must stay within its age limit until the next cycle.
         An estimate that is only propagated by the model is recorded, but not used for steering. Without a
-        gyro, the covariance of the estimate must also be small enough.
+        gyro, the estimate must also be accurate enough for the body.
         """
-        if estimate is None or not self._is_fresh(self._agreed_ns, now_ns):
-            return False
-        angle, rate = (float(estimate.covariance.diagonal()[part].max()) for part in (ATTITUDE, RATE))
-        accurate = angle <= _LARGEST_ANGLE_SIGMA**2 and rate <= _LARGEST_RATE_SIGMA**2
-        return self._has_rate or accurate
+        return self.is_accurate(estimate) and self._is_fresh(self._agreed_ns, now_ns)
+
+    def is_accurate(self, estimate: Estimate | None) -> bool:
+        """Return whether there is an estimate that, without a gyro, is accurate enough for control."""
+        return estimate is not None and (self._has_rate or self._estimation.is_accurate(estimate))
 
     def _is_usable(self, reading: ImuReading, now_ns: int) -> bool:
         """Return whether the filter can use a reading, and report a reading without a valid rate."""
@@ -232,6 +233,7 @@ class Navigation:
         """Return the present estimate, measured or propagated by the model, or None without an estimate."""
         # During a long silence, the propagated estimate becomes inaccurate and slow to compute.
         if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
+            self.speed = self.speed if self._has_rate else self._estimation.fastest_by_field()
             return None
         estimate = self._filter.at(now_ns)
         if not self._has_rate:

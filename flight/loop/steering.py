@@ -232,6 +232,7 @@ class Steering:
         self._body = body
         self._drive = drive
         self._facts = services.facts
+        self._has_rate = True  # whether the newest reading had a rate, or another rate replaced it
 
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
         """Follow the path or hold its end. The estimate must be None unless it is based on measurements.
@@ -280,15 +281,24 @@ class Steering:
         acquisition = self._body.control.sun_acquisition
         if acquisition is None:
             return self.rest(now_ns)
-        return self._run_law(acquisition, readings, current, now_ns)
+        return self._run_law(acquisition, readings, current, now_ns, needs_rate=True)
 
     def _run_law(
-        self, law: WindowedLaw, readings: Sequence[ImuReading], current: bool, now_ns: int
+        self,
+        law: WindowedLaw,
+        readings: Sequence[ImuReading],
+        current: bool,
+        now_ns: int,
+        needs_rate: bool = False,
     ) -> Steered:
-        """Command the coils by a control law that needs no estimate."""
+        """Command the coils by a control law that needs no estimate, but perhaps a rate."""
         for reading in readings:
-            law.sample(reading.time_ns, reading.field, reading.rate)
+            known = None if reading.has_rate else self._body.estimation.rate_without_gyro(now_ns)
+            self._has_rate = reading.has_rate or known is not None
+            law.sample(reading.time_ns, reading.field, reading.rate if known is None else known)
         text = "braking again" if current else "no reading fresh enough to brake by: coils to zero"
+        if current and needs_rate and not self._has_rate:
+            current, text = False, "neither gyro nor estimate gives the rate for turning: coils to zero"
         self._facts.update(facts.CONTROL_LOST, not current, now_ns, text)
         if not current:
             return self.rest(now_ns)

@@ -63,7 +63,7 @@ from knightcube.gnc.control.pointing_job import SlewRequest
 from knightcube.gnc.control.pointing_table import PointingWeights
 from knightcube.gnc.control.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.gnc.estimation.error_state import Role
-from knightcube.gnc.estimation.estimate import Estimate, Knowledge
+from knightcube.gnc.estimation.estimate import RATE, Estimate, Knowledge
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from knightcube.gnc.estimation.free_filter import FreeFilterSettings
 from knightcube.gnc.estimation.measurements import MeanRateMeasurement
@@ -198,6 +198,8 @@ _BELOW = 0.8
 class SatelliteEstimation(BodyEstimation):
     """Estimation of the satellite: attitude filter, orbit, Sun sensing and horizon cameras."""
 
+    uses_readings_without_rate = True
+
     def __init__(self, config: OrbitConfig, services: Services, learned: Mapping[str, Learned]) -> None:
         """Start from the slow states that an earlier boot learned."""
         try:
@@ -212,6 +214,7 @@ class SatelliteEstimation(BodyEstimation):
         self.coil_monitor = _coil_monitor(config)
         self._coils, self._errors = config.coils.map(), description_errors(config)
         self._field_bias = config.inertial_unit.accuracy.field_bias
+        self._low_rate, self._gyro_bias = config.detumble.low_rate, config.estimation.bias_start
         self._used = self.coil_monitor.available
         self._whole_body: Learned | None = None
         if COIL_FACTORS in learned:
@@ -284,6 +287,28 @@ class SatelliteEstimation(BodyEstimation):
     def orbit(self, time_ns: int) -> OrbitState | None:
         """Return the satellite's position and velocity (ICRS), or None while the orbit is unknown."""
         return self.environment.state(time_ns)
+
+    def is_accurate(self, estimate: Estimate) -> bool:
+        """Return whether the rate of an estimate is certain to a body that counts as detumbled."""
+        return float(estimate.covariance.diagonal()[RATE].max()) <= self._low_rate**2
+
+    def rate_without_gyro(self, time_ns: int) -> FloatArray | None:
+        """Return the rate (3,), rad/s, of the filter if it is as accurate as a gyro, and None otherwise."""
+        estimate = self.orbit_filter.at(time_ns) if self.orbit_filter.started else None
+        if estimate is None or estimate.covariance.diagonal()[RATE].max() > self._gyro_bias**2:
+            return None
+        return estimate.rate
+
+    def fastest_by_field(self) -> float:
+        """Return the largest likely body rate (rad/s) by the magnetometer: estimate plus one sigma.
+
+        The result is infinite while the magnetometer gives no rate.
+        """
+        found = self.orbit_filter.rate_by_field()
+        if found is None:
+            return math.inf
+        sigma = math.sqrt(float(np.linalg.eigvalsh(found.covariance)[-1]))
+        return float(np.linalg.norm(found.rate)) + sigma
 
     def velocity(self, time_ns: int) -> FloatArray | None:
         """Return the satellite's velocity (3,), m/s, relative to the Sun (ICRS), or None without an orbit."""

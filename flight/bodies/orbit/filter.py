@@ -10,8 +10,6 @@ filter returns to the beginning of the step that contains this time, and repeats
 
 from __future__ import annotations
 
-import bisect
-import dataclasses
 import itertools
 import math
 from collections import deque
@@ -21,6 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flight.bodies.orbit.environment import StuckFieldCheck
+from flight.bodies.orbit.steps import DipoleHistory, FilterStep, OpenStep, RateByField
 from flight.loop.body import ReadingAgreement
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
@@ -30,6 +29,7 @@ from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation import estimate as form
 from knightcube.gnc.estimation import free_filter as states
 from knightcube.gnc.estimation.estimate import FIELD_BIAS, Estimate, Knowledge, Parameters
+from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
 from knightcube.gnc.estimation.free_filter import (
     FilterEnvironment,
     FreeFilter,
@@ -45,161 +45,13 @@ from knightcube.gnc.estimation.measurements import (
     Measurement,
 )
 
-Floats = tuple[float, float, float]
-_NOTHING: Floats = (0.0, 0.0, 0.0)
-
-
-class DipoleHistory:
-    """Record of the commanded dipoles, in order of time."""
-
-    def __init__(self, history_ns: int) -> None:
-        self._history_ns = history_ns
-        self._times: list[int] = []
-        self._dipoles: list[Floats] = []
-        self._sums: list[Floats] = []  # integral of the dipole up to each time, A m^2 ns
-        self.unknown_ns = -1
-        """Last time (ns) at which the dipole was unknown; -1 if it was always known."""
-
-    def record(self, time_ns: int, dipole: Floats, known: bool) -> None:
-        """Record the dipole (A m^2) that is in force from `time_ns` on; calls must be in order of time."""
-        if not known:
-            self.unknown_ns = max(self.unknown_ns, time_ns)
-        if self._dipoles and dipole == self._dipoles[-1]:
-            return
-        time_ns = max(time_ns, self._times[-1]) if self._times else time_ns
-        self._sums.append(self._sum(time_ns))
-        self._times.append(time_ns)
-        self._dipoles.append(dipole)
-        oldest = bisect.bisect_right(self._times, time_ns - self._history_ns) - 1
-        if oldest > 64:  # discard the oldest entries in batches
-            del self._times[:oldest], self._dipoles[:oldest], self._sums[:oldest]
-
-    def total(self, time_ns: int) -> FloatArray:
-        """Return the integral (3,), A m^2 s, of the dipole up to a time, from an arbitrary origin."""
-        return np.array(self._sum(time_ns)) / SECOND_NS
-
-    def mean(self, from_ns: int, to_ns: int) -> FloatArray:
-        """Return the mean dipole (3,), A m^2, between two times; it is zero before the first record."""
-        if to_ns <= from_ns:
-            return np.array(self._dipoles[-1] if self._dipoles else _NOTHING)
-        return np.subtract(self._sum(to_ns), self._sum(from_ns)) / (to_ns - from_ns)
-
-    def impulse(self, from_ns: int, to_ns: int) -> FloatArray:
-        """Return the dipole integral (3,), A m^2 s, to the end of an interval, averaged over its start times.
-
-        The torque of this impulse is the difference of the angular momentum at the end of the interval
-        `from_ns` to `to_ns` from its mean over the interval.
-        """
-        first, last = bisect.bisect_right(self._times, from_ns), bisect.bisect_left(self._times, to_ns)
-        knots = np.array([from_ns, *self._times[first:last], to_ns])
-        sums = np.array([self._sum(time_ns) for time_ns in knots.tolist()])
-        mean = np.diff(knots) @ (0.5 * (sums[1:] + sums[:-1])) / (to_ns - from_ns)
-        return np.asarray((sums[-1] - mean) / SECOND_NS)
-
-    def at_rest_since(self) -> int | None:
-        """Return the time (ns) since which the dipole is zero, or None if it is not zero."""
-        if not self._dipoles:
-            return 0
-        return self._times[-1] if self._dipoles[-1] == _NOTHING else None
-
-    def _sum(self, time_ns: int) -> Floats:
-        place = bisect.bisect_right(self._times, time_ns) - 1
-        if place < 0:
-            return self._sums[0] if self._sums else _NOTHING
-        since = time_ns - self._times[place]
-        (a, b, c), (x, y, z) = self._sums[place], self._dipoles[place]
-        return a + since * x, b + since * y, c + since * z
-
-
-@dataclass(slots=True, eq=False)
-class FilterStep:
-    """Coil commands and measurements between two times.
-
-    Attributes:
-        dipole: mean commanded dipole (3,), A m^2.
-        doubt: standard deviation of the error of `dipole`, A m^2 per axis, in addition to that of the coils'
-            matrix; zero for known dipoles of three coils.
-        gyro: mean angular rate (3,), rad/s, of `samples` gyro readings with the mean time `gyro_ns`.
-        impulse: time integral (3,), A m^2 s, of the dipole from a gyro reading to the end of the step,
-            averaged over the readings.
-        field: mean magnetic field (3,), T, of `fields` readings around `field_ns`, or None without a reading.
-        late: measurements whose time lies in the step, oldest first.
-        before: the estimate at the beginning of the step, or None without an estimate.
-    """
-
-    begin_ns: int
-    end_ns: int
-    dipole: FloatArray
-    doubt: float
-    around: FilterEnvironment
-    gyro: FloatArray
-    gyro_ns: int
-    samples: int
-    impulse: FloatArray
-    field: FloatArray | None
-    field_ns: int
-    fields: int
-    late: list[Measurement] = dataclasses.field(default_factory=list)
-    before: FreeMemory | None = None
-
-    @property
-    def seconds(self) -> float:
-        """Length of the step (s)."""
-        return (self.end_ns - self.begin_ns) / SECOND_NS
-
-
-class OpenStep:
-    """Collects the readings of the present, incomplete filter step."""
-
-    def __init__(self, begin_ns: int, acts: bool) -> None:
-        """Start a step at a time. The flag `acts` states whether the coils carry current during the step."""
-        self.begin_ns = self.end_ns = begin_ns
-        self._acts = acts
-        self._rates: list[FloatArray] = []
-        self._totals: list[FloatArray] = []
-        self._fields: list[FloatArray] = []
-        self._rates_ns = self._fields_ns = 0
-
-    def add(self, reading: ImuReading, total: FloatArray, listens: bool) -> None:
-        """Add a reading, with the integral `total` (3,), A m^2 s, of the dipole up to the reading.
-
-        The flag `listens` states whether the magnetic field of the reading is valid.
-        """
-        since = reading.time_ns - self.begin_ns
-        self.end_ns = reading.time_ns
-        self._rates.append(reading.rate)
-        self._totals.append(total)
-        self._rates_ns += since
-        if listens:
-            self._fields.append(reading.field)
-            self._fields_ns += since
-
-    def is_over(self, acts: bool, longest_ns: int) -> bool:
-        """Return whether the step has reached its full length, or the coils were switched on or off."""
-        return acts != self._acts or self.end_ns - self.begin_ns >= longest_ns
-
-    def close(self, dipole: FloatArray, doubt: float, around: FilterEnvironment) -> FilterStep:
-        """Return the finished step."""
-        samples, fields = len(self._rates), len(self._fields)
-        return FilterStep(
-            self.begin_ns,
-            self.end_ns,
-            dipole,
-            doubt,
-            around,
-            np.mean(self._rates, axis=0),
-            self.begin_ns + self._rates_ns // samples,
-            samples,
-            self._totals[-1] - np.mean(self._totals, axis=0),
-            np.mean(self._fields, axis=0) if fields else None,
-            self.begin_ns + self._fields_ns // max(fields, 1),
-            fields,
-        )
-
-
 FORGOTTEN_NS = 10_000_000_000
 """Time (ns) without a contradicting gyro after which the commanded dipoles are trusted again."""
 _LONGEST = 2.0
+_KNOWN_RATE = 0.01
+"""Largest standard deviation (rad/s) of the magnetometer's rate by which a direction is propagated."""
+_MEASURED_SIGMA = 0.7
+"""Largest standard deviation (rad) of the attitude for which the error is linear in a measured attitude."""
 _NEGLIGIBLE = 1e-9
 """Current (A) below which a coil is not driven."""
 _EYE: FloatArray = np.eye(3)
@@ -231,6 +83,16 @@ class OrbitFilterSettings:
     step_ns: int = SECOND_NS
     slow: SlowStates | None = None
     free: FreeFilterSettings = field(default_factory=FreeFilterSettings)
+
+    @property
+    def by_field(self) -> FieldRateSettings:
+        """Settings of the filter that estimates the rate from the magnetometer while there is no gyro."""
+        return FieldRateSettings(
+            inertia=self.inertia,
+            field_sigma=math.hypot(self.field_noise, self.free.magnet[0]),
+            torque_walk=math.sqrt(self.unknown_psd),
+            errors=self.free.errors,
+        )
 
     @property
     def dipole_limit(self) -> float:
@@ -349,6 +211,7 @@ class StepReplay:
             first.gyro,
             by_stars=attitude.by_stars,
             doubted=doubted,
+            spread=first.spread,
         )
         for k in range(place + 1):
             self.steps[k].before = None
@@ -387,7 +250,11 @@ class StepReplay:
         for step in self.steps:
             span_ns = min(step.end_ns, to_ns) - max(step.begin_ns, from_ns)
             if span_ns > 0:
-                turn = span_ns / SECOND_NS * (step.gyro - self.free.gyro_bias)
+                spread = step.spread
+                if spread is not None and float(np.linalg.eigvalsh(spread)[-1]) > _KNOWN_RATE**2:
+                    return None
+                bias = self.free.gyro_bias if spread is None else 0.0
+                turn = span_ns / SECOND_NS * (step.gyro - bias)
                 rotation, left_ns = multiply(from_rotation_vector(turn), rotation), left_ns - span_ns
         return rotation if left_ns == 0 else None
 
@@ -435,12 +302,14 @@ class StepReplay:
 
     def _end(self, step: FilterStep) -> None:
         """Apply the mean gyro and magnetometer readings of a step at its end."""
-        free, settings = self.free, self._settings
-        since = (step.end_ns - step.gyro_ns) / SECOND_NS
-        # A coil that acts only during a part of the step changes the rate unevenly.
-        change = self._rate_change(step, since, step.impulse - free.impulse(since))
-        spread = settings.free.coil_error**2 * float(change @ change) + settings.gyro_noise**2 / step.samples
-        refused = not free.gyro(step.gyro, spread * _EYE, change, since)
+        free, settings, refused = self.free, self._settings, False
+        if step.samples:
+            since = (step.end_ns - step.gyro_ns) / SECOND_NS
+            # A coil that acts only during a part of the step changes the rate unevenly.
+            change = self._rate_change(step, since, step.impulse - free.impulse(since))
+            noise = settings.gyro_noise**2 / step.samples
+            spread = settings.free.coil_error**2 * float(change @ change) + noise
+            refused = not free.gyro(step.gyro, spread * _EYE, change, since)
         self.refused_gyros = self.refused_gyros + 1 if refused else 0
         if step.field is not None:
             ago = (step.end_ns - step.field_ns) / SECOND_NS
@@ -591,6 +460,8 @@ class EstimatePropagation:
         )
 
 
+FIELD_STRENGTH = 5e-5
+"""Largest magnetic field (T) in a low orbit."""
 REFUSALS_TO_RESTART = 3
 """Number of contradicting attitudes in a row after which a fine estimate is restarted."""
 
@@ -626,6 +497,8 @@ class OrbitFilter:
         self._shifted = 0.0  # additional dipole error (A m^2) of redundant coils in the present step
         self._shares = settings.coils.linear_shares(np.ones(len(settings.coils.current_limits), dtype=bool))
         self._placed_ns = 0  # time of the last attitude that was used
+        self._by_field = FieldRate(settings.by_field)  # used while the gyro gives no rate
+        self._unknown_rate = settings.by_field.rate_start**2 * _EYE
         self.restarts = 0
         self.field_at_rest: tuple[int, float] | None = None
 
@@ -765,10 +638,31 @@ class OrbitFilter:
         settled = rest_ns is not None and reading.time_ns - rest_ns >= self._settings.settle_ns
         if settled and usable:
             self.field_at_rest = reading.time_ns, math.hypot(*reading.field.tolist())
+        if reading.has_rate:
+            self._by_field.restart()
+        else:
+            self._follow_field(reading, settled and usable)
         self._open.add(reading, self._dipoles.total(reading.time_ns), settled and usable)
         if self._open.is_over(self._acts(), self._settings.step_ns):
             self._close()
         return self.started and not self.doubts_commands
+
+    def _follow_field(self, reading: ImuReading, listens: bool) -> None:
+        """Estimate the rate from the magnetometer; `listens` states whether the field is valid."""
+        assert self._open is not None
+        since_ns, now_ns = self._open.end_ns, reading.time_ns
+        self._by_field.advance(self._dipoles.mean(since_ns, now_ns), (now_ns - since_ns) / SECOND_NS)
+        if listens:
+            self._by_field.measure(reading.field)
+
+    def rate_by_field(self) -> RateByField | None:
+        """Return the present rate by the magnetometer, or None while it is unknown or the gyro works."""
+        found, settings = self._by_field, self._settings
+        if not found.started:
+            return None
+        # The coils may change the rate by this amount (rad/s) during a step of a second.
+        change = settings.dipole_limit * FIELD_STRENGTH / float(np.linalg.eigvalsh(settings.inertia)[0])
+        return RateByField(found.rate, found.covariance[RATE, RATE] + change**2 * _EYE)
 
     def begin(self, attitude: AttitudeMeasurement, *, doubted: bool = False) -> bool:
         """Start from an attitude, and return whether the attitude was used.
@@ -780,6 +674,11 @@ class OrbitFilter:
         place = self._replay.place(attitude.time_ns)
         if place is None or not np.isfinite([*attitude.quaternion, *attitude.covariance.flat]).all():
             return False
+        step = self._steps[place]
+        if not (doubted or step.samples or step.before is None) and self.worst_sigma < _MEASURED_SIGMA:
+            # Two attitudes in a row show the rate, which a new start would discard.
+            self.measure_late([attitude], lambda _: None)
+            return True
         self.restarts += self._free.started
         self._replay.start(attitude, place, doubted)
         self._refused_attitudes, self._placed_ns = 0, attitude.time_ns
@@ -879,7 +778,9 @@ class OrbitFilter:
             return
         doubt = self._settings.dipole_limit if self._dipoles.unknown_ns >= begin_ns else self._shifted
         self._shifted = 0.0
-        step = gathered.close(self._dipoles.mean(begin_ns, end_ns), doubt, around)
+        dipole = self._dipoles.mean(begin_ns, end_ns)
+        unknown = RateByField(np.zeros(3), self._unknown_rate)
+        step = gathered.close(dipole, doubt, around, self.rate_by_field() or unknown)
         self._replay.add(step)
         self._replay.follow_gyro()
 

@@ -59,7 +59,7 @@ from knightcube.gnc.control.detumble import (
     share_in_rotating_field,
 )
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings, slow_prior
-from knightcube.gnc.estimation.estimate import Estimate, Parameters
+from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Estimate, Parameters
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
 from knightcube.gnc.estimation.rigid_body import RigidBody
 from knightcube.gnc.guidance.one_axis import vmc as plan_job
@@ -242,6 +242,16 @@ class TestbedEstimation(BodyEstimation):
         self.filter = filter_
         self.feed = UnitFeed(filter_, config, self._field_at)
         self.coil_monitor = coil_monitor(config, plant)
+        self._largest = np.array([config.modes.arrived_angle / 3.0, config.modes.arrived_rate])
+
+    def is_accurate(self, estimate: Estimate) -> bool:
+        """Return whether three standard deviations of the angle and one of the rate permit an arrival.
+
+        An error of the angle moves the body, while the noise of the rate averages out within seconds.
+        """
+        variances = estimate.covariance.diagonal()
+        largest = np.array([variances[ATTITUDE].max(), variances[RATE].max()])
+        return bool((largest <= self._largest**2).all())
 
     def field(self, estimate: Estimate) -> FloatArray:
         """Return the magnetic field (3,), T, in body axes."""

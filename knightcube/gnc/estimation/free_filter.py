@@ -419,9 +419,11 @@ class FreeFilter:
         *,
         by_stars: bool = False,
         doubted: bool = False,
+        spread: FloatArray | None = None,
     ) -> None:
         """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro rate (3,) rad/s.
 
+        If the rate was not measured by the gyro, its covariance is `spread` (3, 3), rad^2/s^2.
         With `by_stars` the attitude was measured by the star camera, otherwise by the horizon cameras. The
         slow states are kept. If the previous estimate was contradicted (`doubted`), the covariance of the
         slow states is reset to that of the settings, and implausible values of slow states are set to zero.
@@ -438,11 +440,15 @@ class FreeFilter:
         misaligned = CAMERA if by_stars else HORIZON
         self.quaternion = multiply(from_rotation_vector(-self._constants[misaligned]), quaternion)
         first[ATTITUDE, misaligned] = -_EYE
-        measured = gyro - self._constants[GYRO]
-        self.rate = np.asarray(np.linalg.solve(_EYE + self._matrix(GYRO_MATRIX), measured), dtype=float)
-        first[RATE, GYRO], first[RATE, GYRO_MATRIX] = -_EYE, -by_matrix(self.rate)
+        self.rate = gyro
         alone = np.zeros((6, 6))
         alone[ATTITUDE, ATTITUDE], alone[RATE, RATE] = covariance, self._settings.rate_start**2 * _EYE
+        if spread is None:
+            measured = gyro - self._constants[GYRO]
+            self.rate = np.asarray(np.linalg.solve(_EYE + self._matrix(GYRO_MATRIX), measured), dtype=float)
+            first[RATE, GYRO], first[RATE, GYRO_MATRIX] = -_EYE, -by_matrix(self.rate)
+        else:
+            alone[RATE, RATE] = spread
         self.covariance = joined(self.covariance, first, alone)
         self.begin_mean()
         self.started = True
@@ -600,9 +606,8 @@ class FreeFilter:
             found |= {name: self._constants[at].copy(), f"{name}_sigma": sigma[at]}
         rows = per_trace(found["inertia"] / self.motion.trace, found["coils"])
         variances = (rows @ self.covariance[_BODY, _BODY] @ rows.T).diagonal()
-        ratios = np.sqrt(
-            np.maximum(variances, 0.0)
-        )  # rounding can make the variance of a known ratio negative
+        # Rounding can make the variance of a known ratio negative.
+        ratios = np.sqrt(np.maximum(variances, 0.0))
         return found | {
             "camera_attitude_sigma": np.sqrt(self.camera_covariance.diagonal()),
             "inertia_ratio_sigma": ratios[:6],

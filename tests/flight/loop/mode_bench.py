@@ -110,9 +110,10 @@ class ModeBench:
         rate: float | None = 0.0,
         overdue: float | None = None,
         answers: bool = True,
+        accurate: bool = True,
         seconds: float = 1.0,
     ) -> Mode:
         """Run one cycle; the estimate's numbers are those of `targets`."""
         self.now_ns += round(seconds * SECOND_NS)
         estimate = cast(Any, object()) if known else None
-        return self.control.step(estimate, rate, overdue, answers, self.now_ns)
+        return self.control.step(estimate, rate, overdue, answers, self.now_ns, accurate)

@@ -110,6 +110,19 @@ def test_one_control_law_commands_the_coils(mode: Mode, flags: tuple[str, ...], 
     assert output.steered is getattr(steering, law).return_value
 
 
+@pytest.mark.parametrize(("speed", "rate"), [(0.5, 0.5), (math.inf, None)])
+def test_an_unknown_rate_and_an_inaccurate_estimate_are_passed_to_the_modes(
+    speed: float, rate: float | None
+) -> None:
+    bench = Bench(Mode.DETUMBLE)
+    bench.tasks.navigation.speed = speed
+    bench.tasks.navigation.is_accurate.return_value = False
+    bench.run()
+    args = bench.tasks.modes.step.call_args.args
+    assert args[1] == rate
+    assert args[-1] is False
+
+
 def test_an_estimate_without_measurements_does_not_steer() -> None:
     bench = Bench(Mode.HOLD)
     bench.tasks.navigation.is_measured.return_value = False
@@ -157,8 +170,9 @@ def test_a_new_target_is_announced_and_aimed_at_once() -> None:
     assert [call.args for call in overdue.call_args_list] == [
         (ESTIMATE, TARGET, slot * PERIOD_NS) for slot in (102, 103)
     ]
+    accurate = bench.tasks.navigation.is_accurate.return_value
     bench.tasks.modes.step.assert_called_with(
-        ESTIMATE, pytest.approx(0.5), overdue.return_value, True, bench.now_ns
+        ESTIMATE, pytest.approx(0.5), overdue.return_value, True, bench.now_ns, accurate
     )
 
 

@@ -13,7 +13,7 @@ from flight.loop.modes import AttitudeWatch, Trigger
 from flight.schema.document import ConfigError
 from flight.schema.sections import Modes
 from hal.interfaces.wires import SECOND_NS
-from tests.flight.loop.mode_bench import SATELLITE, ModeBench
+from tests.flight.loop.mode_bench import SATELLITE, TESTBED, ModeBench
 
 FAST, LOW, LOW_FOR = 0.02, 0.008, 3.0
 
@@ -152,6 +152,34 @@ def test_a_hold_takes_its_attitude_from_the_first_estimate() -> None:
     assert wanted is not None
     assert wanted.law.text == "here at 1000000000"
     assert bench.control.target(0) is wanted
+
+
+@pytest.mark.parametrize("modes", [TESTBED, SATELLITE], ids=["testbed", "satellite"])
+@pytest.mark.parametrize("recovers", [False, True])
+def test_coils_that_rest_because_the_estimate_is_inaccurate_end_in_safe(
+    modes: frozenset[Mode], recovers: bool
+) -> None:
+    bench = ModeBench(modes, Modes(initial="detumble", blind_limit=20.0, known_for=1.0))
+    command = Mode.POINT if modes is SATELLITE else Mode.HOLD
+    bench.step(rate=0.5)
+    for _ in range(10):
+        bench.step()
+    assert bench.mode() is command
+    for second in range(30):
+        bench.step(accurate=recovers and second == 15)
+    assert bench.mode() is (command if recovers else Mode.SAFE)
+    said = [text for name, text in zip(bench.events, bench.texts, strict=True) if name == "blind"]
+    assert said == ([] if recovers else ["no estimate accurate enough to steer by for 21 s"])
+
+
+def test_a_satellite_that_acquires_its_attitude_waits_for_an_accurate_estimate() -> None:
+    bench = ModeBench(SATELLITE, Modes(initial="detumble", blind_limit=5.0, acquired="acquire"))
+    for _ in range(20):
+        bench.step(accurate=False)
+    assert bench.mode() is Mode.ACQUIRE
+    for _ in range(20):
+        bench.step(rate=None)
+    assert bench.mode() is Mode.ACQUIRE
 
 
 def test_a_hold_with_a_large_error_is_impossible_after_its_patience() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.bodies.orbit.filter import REFUSALS_TO_RESTART, DipoleHistory, OrbitFilter, OrbitFilterSettings
+from flight.bodies.orbit.filter import REFUSALS_TO_RESTART, OrbitFilter, OrbitFilterSettings
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
@@ -75,6 +75,7 @@ class Flown:
         self.rests = False  # no dipole is commanded
         self.field: FloatArray | None = None  # what the magnetometer repeats
         self.magnet: FloatArray = np.zeros(3)  # T, added to the field
+        self.has_gyro = True
 
     def fly(self, seconds: float) -> None:
         """Fly on; with pulses the coils act for 0.8 s of each second."""
@@ -118,6 +119,7 @@ class Flown:
         field = attitude_matrix(self.attitude) @ FIELD + 1e-7 * noise[3:] + self.magnet
         field = field if self.field is None else self.field
         rate, nothing = self.rate + BIAS + 1e-4 * noise[:3], np.zeros(3)
+        rate = rate if self.has_gyro else np.full(3, np.nan)
         return ImuReading(self.time_ns, self.time_ns, self.time_ns, IDENTITY, rate, field, nothing)
 
 
@@ -252,17 +254,6 @@ def test_currents_that_may_not_have_flown_widen_the_claim() -> None:
     assert flown.filter.at(flown.time_ns).covariance[RATE, RATE].trace() > 2.0 * before
 
 
-def test_the_mean_dipole_is_that_on_the_wire() -> None:
-    history = DipoleHistory(10 * SECOND_NS)
-    assert history.at_rest_since() is not None
-    history.record(0, (0.0, 0.0, 0.0), True)
-    history.record(2 * SECOND_NS, (0.1, 0.0, 0.0), True)
-    assert history.at_rest_since() is None
-    history.record(3 * SECOND_NS, (0.0, 0.0, 0.0), True)
-    assert history.mean(SECOND_NS, 5 * SECOND_NS) == pytest.approx([0.025, 0.0, 0.0])
-    assert history.at_rest_since() == 3 * SECOND_NS
-
-
 def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_claim() -> None:
     """A coil carries nothing from the middle of a step on; the gyro tells."""
     flown = acquired(pulses=True)
@@ -376,19 +367,6 @@ def test_the_dipole_of_a_corrected_coil_is_unknown_in_the_steps_before() -> None
     assert not all(driven)
 
 
-def test_the_impulse_of_a_dipole_is_that_by_which_a_rate_differs_from_its_mean() -> None:
-    """The dipole acts in the last quarter of a second, of which the mean rate shows an eighth."""
-    history = DipoleHistory(10 * SECOND_NS)
-    history.record(0, (0.0, 0.0, 0.0), True)
-    history.record(3 * SECOND_NS // 4, (0.0, 0.08, 0.0), True)
-    found = history.impulse(0, SECOND_NS)
-    assert found == pytest.approx([0.0, 0.08 * (0.25 - 0.25**2 / 2.0), 0.0])
-    history.record(2 * SECOND_NS, (0.0, 0.0, 0.0), True)
-    assert history.impulse(SECOND_NS, 2 * SECOND_NS) == pytest.approx([0.0, 0.04, 0.0]), (
-        "half of a constant dipole"
-    )
-
-
 def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_less_certain() -> None:
     """The matrix of four coils holds for the least heat of all coils, or of those that are not isolated."""
     flown = acquired()
@@ -414,3 +392,63 @@ def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_les
         doubts.append(filter_._steps[0].doubt)
     expected = 0.2 * 0.02 * np.sqrt(12.0) / 3.0  # four coils of length sqrt(3) m^2 per ampere
     assert doubts == pytest.approx([0.0, expected, 0.0], abs=1e-12)
+
+
+TUMBLE = np.array([0.02, -0.05, 0.03])
+
+
+@pytest.mark.parametrize(("pulses", "every"), [(False, 5.0), (True, 5.0), (True, 2.0)])
+def test_star_fixes_give_attitude_and_rate_of_a_tumbling_body_without_a_gyro(
+    pulses: bool, every: float
+) -> None:
+    """The first fix has no rate about the field; the second one must not discard the first."""
+    flown = Flown(pulses)
+    flown.rate, flown.has_gyro = TUMBLE, False
+    flown.fly(3.0)
+    assert flown.filter.begin(flown.stars(flown.time_ns - 24 * PERIOD_NS))
+    for _ in range(round(20.0 / every)):
+        flown.fly(every)
+        if not flown.filter.started:
+            assert flown.filter.begin(flown.stars(flown.time_ns - 24 * PERIOD_NS))
+        else:
+            assert flown.see(24 * PERIOD_NS)
+    found = flown.filter.at(flown.time_ns)
+    error = np.concatenate(
+        (to_rotation_vector(multiply(flown.attitude, conjugate(found.quaternion))), flown.rate - found.rate)
+    )
+    sigma = np.sqrt(np.diag(found.covariance)[:6])
+    assert (np.abs(error) < 4.0 * sigma).all()
+    assert np.abs(error[3:]).max() < 2e-4
+    assert sigma[3:].max() < 1e-3
+    assert flown.filter.restarts == 0
+    assert flown.filter.refused == 0
+    assert not flown.filter.doubts_commands
+
+
+def test_a_gyro_that_dies_and_recovers_within_the_flight_leaves_an_honest_estimate() -> None:
+    flown = acquired(pulses=True)
+    for gyro in (False, True):
+        flown.has_gyro = gyro
+        flown.fly(5.4)
+        assert (flown.filter.rate_by_field() is None) is gyro
+        assert flown.see(24 * PERIOD_NS)
+    found = flown.filter.at(flown.time_ns)
+    off = (flown.rate - found.rate) / np.sqrt(np.diag(found.covariance)[RATE])
+    assert np.abs(off).max() < 4.0
+    assert flown.filter.refused == 0
+
+
+def test_the_magnetometer_gives_the_rate_while_nothing_else_does() -> None:
+    """A direction is propagated by the magnetometer's rate only once this rate is known."""
+    flown = Flown()
+    flown.rate, flown.has_gyro = TUMBLE, False
+    assert flown.filter.rate_by_field() is None
+    flown.fly(1.0)
+    early = flown.filter.rate_by_field()
+    assert early is not None
+    assert flown.filter.turned(0, SECOND_NS // 2) is None, "the rate along the field is unknown"
+    along = FIELD / np.linalg.norm(FIELD)
+    across = attitude_matrix(flown.attitude) @ along
+    off = flown.rate - early.rate
+    assert np.linalg.norm(off - across * (across @ off)) < 0.01
+    assert across @ early.covariance @ across > 0.1**2

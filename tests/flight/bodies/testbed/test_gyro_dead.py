@@ -10,6 +10,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from flight.bodies.testbed import body as body_module
 from flight.bodies.testbed.body import UnitFeed, attitude_filter, surrounding_field
 from flight.bodies.testbed.control import plant_of
 from flight.loop import facts
@@ -102,13 +103,13 @@ def test_an_estimate_that_the_resting_coils_field_refutes_is_discarded(current: 
     assert angle_about_axis_y(filter_.at(step * PERIOD_NS).quaternion) == pytest.approx(2.5, abs=0.1)
 
 
-def navigation(uses: bool, *polled: ImuReading) -> tuple[Navigation, Any, Any]:
+def navigation(uses: bool, *polled: ImuReading, accurate: Any = None) -> tuple[Navigation, Any, Any]:
     """Return the navigation of a body, the mocked feed and the mocked facts; the unit gives `polled`."""
     unit, estimation, services = Mock(), Mock(), Mock()
     unit.poll.return_value, services.recorder.epoch_ns = polled, 0
     link = Mock(bad_checksum=0, discarded_bytes=0, out_of_range=0, not_finite=0, last_byte_ns=0)
     unit.link.return_value = link
-    estimation.uses_readings_without_rate = uses
+    estimation.uses_readings_without_rate, estimation.is_accurate = uses, accurate
     settings = NavigationSettings(100_000_000, 1_200_000_000, PERIOD_NS)
     return Navigation(unit, estimation, settings, services), estimation.feed, services.facts
 
@@ -126,16 +127,18 @@ def test_a_body_that_needs_the_gyro_receives_no_reading_without_a_rate() -> None
 @pytest.mark.parametrize(
     ("rate", "angle_sigma", "rate_sigma", "allowed"),
     [
-        (math.nan, 0.003, 0.009, True),
-        (math.nan, 0.004, 0.001, False),
-        (math.nan, 0.001, 0.011, False),
-        (0.1, 0.011, 0.011, True),
+        (math.nan, 0.006, 0.019, True),
+        (math.nan, 0.007, 0.001, False),
+        (math.nan, 0.001, 0.021, False),
+        (0.1, 0.03, 0.03, True),
     ],
 )
-def test_without_a_gyro_the_covariance_decides_whether_coils_are_driven(
+def test_without_a_gyro_the_limits_of_an_arrival_decide_whether_coils_are_driven(
     rate: float, angle_sigma: float, rate_sigma: float, allowed: bool
 ) -> None:
-    found, feed, _ = navigation(True, reading(0, FIELD, rate))
+    modes = replace(CONFIG.modes, arrived_angle=0.02, arrived_rate=0.02)
+    estimation = body_module.TestbedEstimation(replace(CONFIG, modes=modes), {})
+    found, feed, _ = navigation(True, reading(0, FIELD, rate), accurate=estimation.is_accurate)
     feed.accept.return_value = Mock(holds=True, objection="")
     found.update(0)
     variance = np.zeros(6)
