@@ -462,6 +462,7 @@ def _tasks(
         round(config.inertial_unit.max_age * SECOND_NS),
         round(config.estimation.coast * SECOND_NS),
         round(SECOND_NS / CONTROL_RATE_HZ),
+        config.inertial_unit.has_gyro(),
     )
     navigation = Navigation(devices.unit, body.estimation, ages, services)
     imaging = _imaging(config, opened, navigation, body, services)

@@ -115,7 +115,7 @@ IMU_SILENT = Fact("imu-silent", events.IMU_SILENT, events.IMU_RECOVERED)
 IMU_UNUSABLE = Fact("imu-unusable", events.IMU_UNUSABLE, events.IMU_RECOVERED)
 IMU_LINE_LOST = Fact("imu-line-lost", events.IMU_LINE_LOST, events.IMU_RECOVERED)
 CONTROL_LOST = Fact("control-lost", events.CONTROL_LOST, events.CONTROL_REGAINED)
-BLIND = Fact("blind", events.BLIND, modes=_DRIVEN)
+BLIND = Fact("blind", events.BLIND, modes=_DRIVEN | {Mode.ACQUIRE})
 TUMBLING = Fact("tumbling", events.TUMBLING, after=8, modes=STEERING | {Mode.ACQUIRE})
 HOLD_IMPOSSIBLE = Fact(
     "hold-impossible", events.HOLD_IMPOSSIBLE, modes=frozenset({Mode.HOLD, Mode.TESTBED_DEMO})

@@ -487,7 +487,9 @@ class ModeControl:
             self._boot(measured and coils_answer, now_ns)
         blind = (now_ns - self._measured_ns) * 1e-9
         text = f"no estimate for {blind:.0f} s"
-        if estimate is not None:
+        if Mode.ACQUIRE in self._modes and rate is None:
+            text = f"no body rate for {blind:.0f} s"
+        elif estimate is not None:
             text = f"no estimate accurate enough to steer by for {blind:.0f} s"
         self._facts.update(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
         if self.mode is Mode.DETUMBLE and rate is not None:

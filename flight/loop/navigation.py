@@ -53,11 +53,13 @@ class NavigationSettings:
         coast_ns: longest propagation (ns) of the estimate without measurements; such an estimate is used for
             telemetry only.
         period_ns: period (ns) of the control cycle, during which a commanded current flows.
+        has_gyro: whether the unit measures the rate, so that a reading without a rate is a fault.
     """
 
     max_age_ns: int
     coast_ns: int
     period_ns: int
+    has_gyro: bool = True
 
 
 _UNSEEN_NS = 600_000_000
@@ -223,7 +225,8 @@ class Navigation:
         if reading.time_ns < self._since_ns:
             return False
         text = "the rate is valid again" if reading.has_rate else f"invalid: {self._unit.link().rejection}"
-        self._facts.update(facts.GYRO_LOST, not reading.has_rate, now_ns, text)
+        lost = self._settings.has_gyro and not reading.has_rate
+        self._facts.update(facts.GYRO_LOST, lost, now_ns, text)
         return reading.has_rate or self._estimation.uses_readings_without_rate
 
     def _is_fresh(self, time_ns: int, now_ns: int) -> bool:

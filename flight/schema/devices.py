@@ -96,6 +96,10 @@ class UnitSection(Section, frozen=True, kw_only=True):
     calibration: UnitCalibration = UnitCalibration()
     accuracy: UnitAccuracy = UnitAccuracy()
 
+    def has_gyro(self) -> bool:
+        """Return whether the unit measures the rate."""
+        return True
+
 
 class InertialUnitSection(UnitSection, frozen=True, kw_only=True):
     """The inertial unit, a VN-100, and its serial line."""
@@ -129,10 +133,15 @@ class SensorsSection(UnitSection, frozen=True, kw_only=True):
     """An inertial unit of separate gyro, magnetometer and accelerometer (driver `sensors`).
 
     The attitude follows from acceleration and magnetic field. Without an accelerometer the unit gives no
-    attitude, and flies in orbit only.
+    attitude, so that a unit with a gyro flies in orbit only. A magnetometer alone is a unit without a gyro:
+    the body then flies by star attitudes, streak rates, the magnetic field and the dynamic model.
     """
 
     sensors: Annotated[tuple[Sensor, ...], Meta(min_length=1, max_length=4)]
+
+    def has_gyro(self) -> bool:
+        """Return whether a sensor measures the rate."""
+        return any("gyro" in sensor.measures for sensor in self.sensors)
 
 
 class Winding(Section, frozen=True, kw_only=True):

@@ -1,5 +1,7 @@
 """Inertial unit of separate sensors, each with a driver that has the properties of CircuitPython drivers.
 
+A unit without a gyro gives readings without a rate.
+
 CircuitPython drivers of motion sensors have the properties `gyro` (rad/s), `magnetic` (microtesla) and
 `acceleration` (m/s^2), take an I2C bus with the methods of `busio.I2C`, and sleep while they start. All
 sensors are started before the flight, and read by a periodic job of their own, never by the control loop.
@@ -25,6 +27,7 @@ _FAILURES = 3
 """Number of consecutive failures after which the sensors are started again."""
 _ALIKE = 10
 """Number of consecutive equal samples that are accepted; working sensors have noise."""
+_NO_RATE = np.full(3, math.nan)
 _FREE_FALL = 1.0
 """Specific force (m/s^2) below which the vertical is unknown."""
 
@@ -197,6 +200,8 @@ class SensorUnit:
                 return False
         largest = {"gyro": settings.rate_range, "magnetic": settings.field_range / TESLA_PER_UNIT}
         for name, bound in largest.items():
+            if name not in values:
+                continue
             if np.abs(values[name]).max() > bound or self._alike >= _ALIKE:
                 self._out_of_range += 1
                 self._rejection = f"{name} = {values[name].tolist()}"
@@ -212,7 +217,7 @@ class SensorUnit:
             arrival_ns=self._last_ns,
             device_time_ns=time_ns,
             quaternion=level_attitude(field, acceleration),
-            rate=self._rate_map @ values["gyro"],
+            rate=self._rate_map @ values.get("gyro", _NO_RATE),
             field=field,
             acceleration=acceleration,
         )

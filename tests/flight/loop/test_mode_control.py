@@ -177,9 +177,10 @@ def test_a_satellite_that_acquires_its_attitude_waits_for_an_accurate_estimate()
     for _ in range(20):
         bench.step(accurate=False)
     assert bench.mode() is Mode.ACQUIRE
-    for _ in range(20):
+    for _ in range(7):
         bench.step(rate=None)
-    assert bench.mode() is Mode.ACQUIRE
+    assert bench.mode() is Mode.SAFE
+    assert bench.texts[-2] == "no body rate for 6 s"
 
 
 def test_a_hold_with_a_large_error_is_impossible_after_its_patience() -> None:

@@ -1,9 +1,14 @@
-"""Campaign `gyro-dead`: the step demonstration of the testbed while the gyro gives no valid rate.
+"""Campaign `gyro-dead`: the testbed's step demonstration, and an orbit, while the gyro gives no valid rate.
 
 The gyro fails at a random time in the first minute, in every third flight before the start. The coils disturb
-the magnetometer by 5e-4 T/A. With the camera the flight has star attitudes and streak rates, without it only
-the magnetometer and the plant model. A step is reached if the true angle stays within 0.5 deg of the target
-in the last 70 s of the step.
+the magnetometer by 5e-4 T/A. With the camera the flight of the testbed has star attitudes and streak rates,
+without it only the magnetometer and the plant model. A step is reached if the true angle stays within 0.5 deg
+of the target in the last 70 s of the step.
+
+The cells `orbit` are flights of `config/orbit.yaml` from a tumble of 3 deg/s to nadir, at a random place of
+the orbit, with a body, coils and sensors that differ from the configuration within the stated accuracies.
+They have neither horizon cameras nor solar cells, so that star attitudes, streak rates, the magnetometer and
+the dynamic model carry the flight. The nadir axis is judged from the end of the slew.
 """
 
 from __future__ import annotations
@@ -16,13 +21,20 @@ from typing import Any
 
 import numpy as np
 
+from flight.link import events
+from flight.link.modes import Mode
 from flight.schema import reader as configuration
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.report.orbit import attitude_errors, pointing_errors
+from ground.report.signals import seconds
 from ground.telemetry import Run
 from sim_hal.settings import FaultEntry
 from tests.support.flights import demo_config, demo_world, event_names, fly
+from tests.support.unlike_body import configured
 
 LIMIT = math.radians(0.5)
+ORBIT_SECONDS = 1_100.0
+"""Duration (s) of a flight in orbit, in which the slew to nadir ends."""
 SETTLED = 30.0
 """Time (s) after the start of a step from which the error counts."""
 _COILS = ((5e-4, 0.0, 0.0), (0.0, 5e-4, 0.0), (0.0, 0.0, 5e-4))
@@ -34,6 +46,8 @@ def cases(runs: int, seed: int) -> list[Case]:
     for number in range(runs):
         draw = np.random.default_rng((seed, number))
         at = 0.0 if number % 3 == 0 else float(draw.uniform(1.0, 60.0))
+        place = {"at": at, "duration": ORBIT_SECONDS, "place_deg": float(draw.uniform(0.0, 360.0))}
+        found.append(Case(f"orbit/{number}", (seed, number, 2), place))
         for camera in (True, False):
             parameters = {"camera": camera, "at": at, "duration": 700.0}
             name = "camera" if camera else "dark"
@@ -44,12 +58,74 @@ def cases(runs: int, seed: int) -> list[Case]:
 def run(case: Case) -> Result:
     """Fly the demonstration once, and compare the estimate with the truth."""
     given = case.parameters
+    if "place_deg" in given:
+        return {**given, **in_orbit(case)}
     entry = FaultEntry(fault="imu: gyro-dead", at=given["at"])
     seed = int(np.random.default_rng(case.seed).integers(1, 2**31))
     section = configuration.replace(demo_world(), seed=seed, coil_field=_COILS, faults=(entry,))
     with tempfile.TemporaryDirectory() as place:
         config = demo_config(given["duration"], camera=given["camera"])
         return {**given, **judged(fly(config, Path(place) / "run", section=section), given["at"])}
+
+
+def in_orbit(case: Case) -> Result:
+    """Fly the satellite once, and compare attitude, rate and nadir axis with the truth."""
+    given = case.parameters
+    config, world = configured("orbit")
+    nadir = configuration.replace(config.targets[-1], at=0.0)
+    config = configuration.replace(
+        config,
+        elements=None,
+        duration=given["duration"],
+        targets=(nadir,),
+        wide_cameras=(),
+        solar_strings=None,
+    )
+    body = world.free_body
+    assert body is not None
+    body = configuration.replace(
+        body,
+        orbit=configuration.replace(body.orbit, true_anomaly_deg=given["place_deg"]),
+        release=configuration.replace(body.release, speed=math.radians(given.get("speed_deg", 3.0))),
+    )
+    world = configuration.replace(
+        world,
+        seed=int(np.random.default_rng(case.seed).integers(1, 2**31)),
+        free_body=body,
+        orbit_devices=configuration.replace(world.orbit_devices, gps_start=1.0),
+        faults=(FaultEntry(fault="imu: gyro-dead", at=given["at"]),),
+    )
+    with tempfile.TemporaryDirectory() as place:
+        return judged_in_orbit(fly(config, Path(place) / "run", section=world), given["at"])
+
+
+def judged_in_orbit(flown: Run, at: float) -> Result:
+    """Return the errors of an orbit flight whose gyro fails at `at` s; NEES are those of an axis."""
+    packets, truth, names = flown["attitude"], flown["truth"], event_names(flown)
+    known = np.isfinite(packets["rate"][:, 0]) & (seconds(packets) > at + 1.0)
+    rate = np.column_stack([np.interp(seconds(packets), seconds(truth), one) for one in truth["rate"].T])
+    off_rate = ((packets["rate"] - rate) / packets["rate_sigma"])[known]
+    errors, pointing = attitude_errors(flown), pointing_errors(flown)
+    blind = errors.times > at + 1.0
+    ends = seconds(flown["event"][flown["event"]["code"] == events.SLEW_ENDED.code])
+    arrived = bool(len(ends)) and bool(len(pointing.times)) and pointing.times[-1] > ends[0]
+    nadir = np.degrees(np.linalg.norm(pointing.error[:, :2], axis=1))
+    modes = flown["mode"]
+    slowed = seconds(modes)[modes["before"] == int(Mode.DETUMBLE)]
+    return {
+        "detumbled_s": float(slowed[0]) if len(slowed) else math.nan,
+        "arrived": arrived,
+        "nadir_rms_deg": float(np.sqrt(np.mean(nadir[pointing.times > ends[0]] ** 2))) if arrived else 180.0,
+        "lost": not len(nadir) or bool(nadir[-1] > 30.0) or modes["mode"][-1] == int(Mode.SAFE),
+        "error_rms_deg": math.degrees(float(np.sqrt(np.mean(np.sum(errors.error[blind] ** 2, axis=1))))),
+        "nees_attitude": float(np.mean((errors.error[blind] / errors.sigma[blind]) ** 2)),
+        "nees_rate": float(np.mean(off_rate**2)),
+        "rates": int(flown["streak"]["accepted"].sum()),
+        "stars": int(flown["stars"]["accepted"].sum()),
+        "safe": bool(np.isin(int(Mode.SAFE), modes["mode"])),
+        "reported": "gyro-lost" in names,
+        "failed": names.count("task-failed"),
+    }
 
 
 def judged(flown: Run, at: float) -> Result:
@@ -88,22 +164,29 @@ def judged(flown: Run, at: float) -> Result:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return a row for the flights with the camera and a row for those without it."""
+    """Return a row for the testbed's flights with camera, one for those without, and one for the orbits."""
     del folder
     rows: list[dict[str, Any]] = []
     for camera in (True, False):
-        own = [result for result in results if result["camera"] is camera]
+        own = [result for result in results if result.get("camera") is camera]
         if own:
             sums = {key: sum(one[key] for one in own) for key in ("steps", "reached", "reported", "failed")}
             keys = ("worst_deg", "nees_angle", "nees_rate", "error_rms_deg", "off_share", "pauses")
             largest = {key: max(one[key] for one in own) for key in keys}
             rows.append({"camera": camera, "flights": len(own), **sums, **largest})
+    if own := [result for result in results if "place_deg" in result]:
+        keys = ("arrived", "lost", "safe", "reported", "failed", "rates", "stars")
+        sums = {key: sum(one[key] for one in own) for key in keys}
+        errors = ("detumbled_s", "nadir_rms_deg", "error_rms_deg", "nees_attitude", "nees_rate")
+        largest = {key: max(one[key] for one in own) for key in errors}
+        means = {f"mean_{key}": float(np.mean([one[key] for one in own])) for key in errors[3:]}
+        rows.append({"orbit": True, "flights": len(own), **sums, **largest, **means})
     return summary({"rows": rows})
 
 
 GYRO_DEAD = Campaign(
     "gyro-dead",
-    "the step demonstration without a gyro, with and without the camera: steps reached, errors, NEES",
+    "steps of the testbed and nadir in orbit without a gyro: steps reached, lost flights, errors, NEES",
     cases,
     run,
     summarise,
