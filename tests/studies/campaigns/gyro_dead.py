@@ -108,15 +108,15 @@ def judged_in_orbit(flown: Run, at: float) -> Result:
     errors, pointing = attitude_errors(flown), pointing_errors(flown)
     blind = errors.times > at + 1.0
     ends = seconds(flown["event"][flown["event"]["code"] == events.SLEW_ENDED.code])
-    arrived = bool(len(ends)) and bool(len(pointing.times)) and pointing.times[-1] > ends[0]
+    arrived = bool(len(ends) and len(pointing.times) and pointing.times[-1] > ends[0])
     nadir = np.degrees(np.linalg.norm(pointing.error[:, :2], axis=1))
     modes = flown["mode"]
     slowed = seconds(modes)[modes["before"] == int(Mode.DETUMBLE)]
     return {
-        "detumbled_s": float(slowed[0]) if len(slowed) else math.nan,
+        "detumbled_s": float(slowed[0] if len(slowed) else seconds(packets)[-1]),
         "arrived": arrived,
         "nadir_rms_deg": float(np.sqrt(np.mean(nadir[pointing.times > ends[0]] ** 2))) if arrived else 180.0,
-        "lost": not len(nadir) or bool(nadir[-1] > 30.0) or modes["mode"][-1] == int(Mode.SAFE),
+        "lost": bool(not len(nadir) or nadir[-1] > 30.0 or modes["mode"][-1] == int(Mode.SAFE)),
         "error_rms_deg": math.degrees(float(np.sqrt(np.mean(np.sum(errors.error[blind] ** 2, axis=1))))),
         "nees_attitude": float(np.mean((errors.error[blind] / errors.sigma[blind]) ** 2)),
         "nees_rate": float(np.mean(off_rate**2)),
@@ -175,8 +175,8 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
             largest = {key: max(one[key] for one in own) for key in keys}
             rows.append({"camera": camera, "flights": len(own), **sums, **largest})
     if own := [result for result in results if "place_deg" in result]:
-        keys = ("arrived", "lost", "safe", "reported", "failed", "rates", "stars")
-        sums = {key: sum(one[key] for one in own) for key in keys}
+        counted = ("arrived", "lost", "safe", "reported", "failed", "rates", "stars")
+        sums = {key: sum(one[key] for one in own) for key in counted}
         errors = ("detumbled_s", "nadir_rms_deg", "error_rms_deg", "nees_attitude", "nees_rate")
         largest = {key: max(one[key] for one in own) for key in errors}
         means = {f"mean_{key}": float(np.mean([one[key] for one in own])) for key in errors[3:]}
