@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from flight.schema.devices import Camera, UnitCalibration, WideCamera
+from flight.schema.devices import Camera, UnitCalibration, WideCamera, driver_of
 from flight.schema.devices import camera_model as lens_of
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig
@@ -44,6 +44,7 @@ from sim_hal.worlds.world import (
 
 if TYPE_CHECKING:
     from sim_hal.earth_camera import EarthCameraModel, EarthScene
+    from sim_hal.emulators.power import EmulatedPower
     from sim_hal.star_camera import SourceTrack, StarCameraModel
     from sim_hal.star_camera.objects import SkyObjects
 
@@ -84,6 +85,7 @@ class Hardware:
     orbit: OrbitDevices
     objects: SkyObjects | None
     utc_offset_ns: int | None
+    power: EmulatedPower | None = None
 
     @property
     def bus(self) -> EmulatedI2cBus:
@@ -138,14 +140,33 @@ def assemble(
         emulated(replace(given, kind="solar_strings", generator=currents)),
         _horizon_cameras(config, section, world, now_ns, expose_wide or inline_wide),
     )
-    faults = FaultTimeline()
+    faults, power = FaultTimeline(), _power(given, camera)
     if truth is not None:
         truth.watch(world, _true_description(config, section, world))
+        truth.power = power
     # Devices with events at the same time run in the order of this list.
-    devices = [unit, camera, orbit.gps, *orbit.wide, faults, truth, circuit, monitor, orbit.cells]
+    devices = [unit, camera, orbit.gps, *orbit.wide, faults, power, truth, circuit, monitor, orbit.cells]
     timed = [device for device in devices if hasattr(device, "next_event_ns")]
     simulation, others = TimedSimulation(world.advance_to, timed), (faults, orbit, objects, utc_offset_ns)
-    return Hardware(simulation, world, wires, unit, circuit, monitor, camera, truth, *others)
+    return Hardware(simulation, world, wires, unit, circuit, monitor, camera, truth, *others, power)
+
+
+def _power(given: Emulation, camera: EmulatedCamera | None) -> EmulatedPower | None:
+    """Return the power system with its monitors. Raises ConfigError for panels without an orbit."""
+    section, truth = given.config.power, given.section.power
+    if section is None:
+        return None
+    from sim_hal.emulators.power import EmulatedPower  # noqa: PLC0415 - only with a power system
+
+    world = orbiting(given.world, "simulation.power.panels") if truth.panels else None
+    power = EmulatedPower(section.battery, truth, world, given.supply, camera, given.start_ns)
+    for (key, monitor), rail in zip(section.monitors().items(), power.rails, strict=False):
+        driver = driver_of("power_monitor", monitor, f"{key}.driver")
+        if driver.emulate is None:
+            raise ConfigError(f"{key}.driver", f"is {monitor.driver!r}, which registers no emulator")
+        rail.monitor = driver.emulate(replace(given, supply=rail.measure), monitor)
+        rail.bus = given.wires.i2c(monitor.bus)
+    return power
 
 
 def _star_camera(

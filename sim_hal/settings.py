@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from flight.schema.devices import Winding
+from flight.schema.devices import Battery, Winding
 from flight.schema.values import Inertia, NotNegative, Positive, Quaternion, Section
 from hal.interfaces.devices import MOST_COILS
 
@@ -255,6 +255,32 @@ class OrbitDeviceTruth(Section, frozen=True, kw_only=True):
     albedo: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.3
 
 
+class SolarPanel(Section, frozen=True, kw_only=True):
+    """A solar panel on a face with the outward `normal` (3,), body axes, of any length.
+
+    `peak` (W) is the electrical power at perpendicular sunlight at one astronomical unit.
+    """
+
+    normal: Vector
+    peak: Positive
+
+
+class PowerTruth(Section, frozen=True, kw_only=True):
+    """The true power system of a configuration with a section `power`.
+
+    The battery starts at the state of charge `charge`. `battery` is the true battery, by default the
+    configured one. `load` (W) is the constant power of board, sensors and radio, and `frame` (J) the energy
+    that the star camera and its processing use for one frame. The coils draw their current from 5 V. The
+    `panels` need a world with an orbit.
+    """
+
+    charge: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.8
+    battery: Battery | None = None
+    load: NotNegative = 0.8
+    frame: NotNegative = 2.0
+    panels: Annotated[tuple[SolarPanel, ...], Meta(max_length=32)] = ()
+
+
 class FaultEntry(Section, frozen=True, kw_only=True):
     """A fault that begins at mission time `at` (s, by default 0) and lasts `for` s (by default to the end).
 
@@ -287,5 +313,6 @@ class Simulation(Section, frozen=True, kw_only=True):
     free_body: FreeBodySection | None = None
     cage: CageTruth | None = None
     orbit_devices: OrbitDeviceTruth = OrbitDeviceTruth()
+    power: PowerTruth = PowerTruth()
     latency: Latency = Latency()
     faults: tuple[FaultEntry, ...] = ()

@@ -140,7 +140,10 @@ def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """The open devices; devices that the configuration does not have are None or empty."""
+    """The open devices; devices that the configuration does not have are None or empty.
+
+    The monitors `supply` of the power system begin with that of the battery.
+    """
 
     unit: InertialUnit
     coils: TorqueCoils
@@ -149,6 +152,7 @@ class Devices:
     gps: GpsReceiver | None = None
     strings: SolarStrings | None = None
     horizon_cameras: tuple[FrameSource, ...] = ()
+    supply: tuple[PowerMonitor, ...] = ()
 
 
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:
@@ -171,15 +175,19 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
             stack.callback(source.close)
     gps: GpsReceiver | None = opened("gps", config, _dated(rig, config), stack)
     strings: SolarStrings | None = opened("solar_strings", config, rig, stack)
-    return Devices(unit, coils, power, frames[0], gps, strings, tuple(filter(None, frames[1:])))
+    supply = [] if config.power is None else config.power.monitors().items()
+    monitors = tuple(_opened("power_monitor", one, rig, stack, key) for key, one in supply)
+    return Devices(unit, coils, power, frames[0], gps, strings, tuple(filter(None, frames[1:])), monitors)
 
 
 def opened(kind: str, config: Config, rig: Rig, stack: ExitStack) -> Any:
     """Return the open device of a section through its driver, or None if it is not configured."""
     section = getattr(config, kind)
-    if section is None:
-        return None
-    device = driver_of(kind, section).open(rig, section)
+    return None if section is None else _opened(kind, section, rig, stack, kind)
+
+
+def _opened(kind: str, section: Any, rig: Rig, stack: ExitStack, key: str) -> Any:
+    device = driver_of(kind, section, f"{key}.driver").open(rig, section)
     stack.callback(device.close)
     return device
 
@@ -195,18 +203,20 @@ def _dated(rig: Rig, config: Config) -> Rig:
 
 def check_settings(config: Config) -> None:
     """Raise ConfigError, with the permitted range, for a value that a driver does not accept."""
-    for kind in DRIVERS:
-        section = getattr(config, kind)
-        if section is None or kind == "camera":
+    sections = [(kind, kind, getattr(config, kind)) for kind in DRIVERS if kind != "camera"]
+    if config.power is not None:
+        sections += [("power_monitor", key, one) for key, one in config.power.monitors().items()]
+    for kind, name, section in sections:
+        if section is None:
             continue
         try:
-            driver_of(kind, section).check(section)
+            driver_of(kind, section, f"{name}.driver").check(section)
         except OutOfRange as error:
             key = error.quantity.removeprefix("coil ").replace(" ", "_")
             known = hasattr(section, key)
             problem = f"{error.value!r}: must be {error.low:g} to {error.high:g} {error.unit}".rstrip()
             raise ConfigError(
-                f"{kind}.{key}" if known else kind, f"is {problem}" if known else f"{key} is {problem}"
+                f"{name}.{key}" if known else name, f"is {problem}" if known else f"{key} is {problem}"
             ) from error
 
 
@@ -417,7 +427,13 @@ files_drv8830: Callable[[Coils], Sequence[str]] = files_pca9685
 
 def open_ina219(rig: Rig, monitor: PowerMonitorSection) -> Ina219:
     """Return the driver of an INA219."""
-    return Ina219(rig.wires.i2c(monitor.bus), monitor.address, rig.clock, monitor.shunt)
+    bus, largest = rig.wires.i2c(monitor.bus), monitor.maximum_current
+    return Ina219(bus, monitor.address, rig.clock, monitor.shunt, maximum_current=largest)
+
+
+def check_ina219(monitor: PowerMonitorSection) -> int:
+    """Return the range bits of the current monitor. Raises OutOfRange if no range covers its current."""
+    return ina219.range_for(monitor.maximum_current, monitor.shunt)
 
 
 def probe_ina219(rig: Rig, monitor: PowerMonitorSection) -> str:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from shutil import rmtree
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -88,6 +89,9 @@ from knightcube.vision.startracker.index.build import ensure_default_index
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import SolveSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
+
+if TYPE_CHECKING:
+    from flight.loop.power import PowerTask
 
 
 def open_flight(
@@ -505,7 +509,19 @@ def _tasks(
         health=health,
         housekeeping=housekeeping,
         commanding=commanding,
+        power=_power(config, devices, drive, imaging, services),
     )
+
+
+def _power(
+    config: Config, devices: Devices, drive: CoilDrive, imaging: Imaging | None, services: Services
+) -> PowerTask | None:
+    if config.power is None:
+        return None
+    from flight.loop.power import PowerTask, Sheddable  # noqa: PLC0415 - only with a power system
+
+    loads = Sheddable(drive.limit, imaging.rest if imaging is not None else lambda _: None)
+    return PowerTask(config.power, devices.supply, loads, services)
 
 
 def _positioning(

@@ -19,6 +19,7 @@ import os
 import socket
 import stat
 import struct
+import zlib
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -28,7 +29,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from flight.link.modes import COMMANDABLE, Mode
-from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, Field, Packet, crc_of
+from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, Field, Packet
 from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
@@ -49,6 +50,27 @@ _NUMBERS = (
     "ascension and declination of the search, rad, or NaN to search along the camera's boresight"
 )
 _GOALS = tuple((int(goal), goal.label) for goal in Goal)
+
+
+def crc_of(values: Sequence[float]) -> int:
+    """Return the CRC-32 of parameter values, encoded as big-endian doubles in table order."""
+    return zlib.crc32(struct.pack(f">{len(PARAMETER_FIELDS)}d", *values))
+
+
+def problem_of(values: Mapping[str, float]) -> str:
+    """Return the problem of a parameter table, or an empty text if the table is valid.
+
+    A problem is a missing key, an unknown key or a value out of range.
+    """
+    if lacking := [key for key in PARAMETER_KEYS if key not in values]:
+        return f"{lacking[0]} is missing: a table is loaded as a whole"
+    if unknown := sorted(set(values) - set(PARAMETER_KEYS)):
+        return f"{unknown[0]} is not a parameter: use {', '.join(PARAMETER_KEYS)}"
+    for key, parameter in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True):
+        low, high = parameter.valid or (-math.inf, math.inf)
+        if not low <= values[key] <= high:  # NaN compares false
+            return f"{key} = {values[key]:g} must lie within {low:g} to {high:g} {parameter.unit}"
+    return ""
 
 
 def telecommand(name: str, apid: int, meaning: str, *fields: Field, hazard: str = "") -> Packet:

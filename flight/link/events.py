@@ -24,6 +24,7 @@ class Reaction(IntEnum):
     DETUMBLE = 4
     SAFE = 5
     RESTART = 6
+    RETURN = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,6 +235,26 @@ OBJECT_ESCAPES = _warning(
 SUN_FOUND = _info(140, "sun-found", "the Sun was detected in safe mode and the body turns towards it")
 SUN_MISSED = _warning(141, "sun-missed", "no Sun was detected in safe mode, so the body is only held still")
 ASTRAY = _warning(142, "astray", "the body is far from its path and is slowed down before a new plan")
+
+BATTERY_LOW = _warning(160, "battery-low", "the battery is low, so the currents of the coils are limited")
+BATTERY_VERY_LOW = _warning(
+    161, "battery-very-low", "the battery is very low, so the star camera takes fewer frames"
+)
+BATTERY_CRITICAL = _fault(162, "battery-critical", "the battery is almost empty", Reaction.SAFE)
+BATTERY_RECOVERED = _info(163, "battery-recovered", "the battery is charged above a limit again")
+BATTERY_CHARGED = EventKind(
+    164,
+    "battery-charged",
+    Severity.INFORMATION,
+    "the battery is no longer critical, so a flight that it brought to safe mode continues",
+    Reaction.RETURN,
+)
+POWER_SENSOR_LOST = _warning(
+    165, "power-sensor-lost", "a monitor of battery or bus is silent, stuck or contradicted, and is not used"
+)
+POWER_SENSOR_RECOVERED = _info(
+    166, "power-sensor-recovered", "the monitors of battery and bus are used again"
+)
 
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)

@@ -31,6 +31,8 @@ from flight.link.commands import (
     Ping,
     Point,
     Slew,
+    crc_of,
+    problem_of,
     unpack,
 )
 from flight.link.modes import Mode
@@ -39,8 +41,6 @@ from flight.link.telemetry.definitions import (
     PARAMETER_FIELDS,
     PARAMETER_KEYS,
     PARAMETERS,
-    crc_of,
-    problem_of,
 )
 from flight.link.telemetry.packets import Packer
 from flight.loop.executive import Cycle

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from flight.loop.imaging import Imaging
 from flight.loop.modes import ModeControl
 from flight.loop.navigation import CoilKnowledge, CurrentValidity, Navigation, Positioning, SunSensing
 from flight.loop.steering import CoilDrive, Steering
+
+if TYPE_CHECKING:  # only flights with a section `power` load this module
+    from flight.loop.power import PowerTask
 from hal.interfaces.devices import MOST_COILS, CoilState, ImuReading
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.estimation.estimate import ATTITUDE as ATTITUDE_ERROR
@@ -52,6 +56,7 @@ class LoopTasks:
     health: HealthWatch
     housekeeping: Housekeeping
     commanding: CommandTask | None
+    power: PowerTask | None
 
 
 @dataclass(slots=True, eq=False)

@@ -167,6 +167,17 @@ COILS_BROKEN = (
 """Facts that a coil is broken, in the order of the coils."""
 FIELD_EXTRAPOLATED = Fact("field-extrapolated", events.FIELD_EXTRAPOLATED)
 GYRO_LOST = Fact("gyro-lost", events.GYRO_LOST, events.GYRO_RECOVERED, after=4, mended_after=4)
+BATTERY_LOW = Fact("battery-low", events.BATTERY_LOW, events.BATTERY_RECOVERED, after=3, mended_after=3)
+BATTERY_VERY_LOW = Fact(
+    "battery-very-low", events.BATTERY_VERY_LOW, events.BATTERY_RECOVERED, after=3, mended_after=3
+)
+BATTERY_CRITICAL = Fact(
+    "battery-critical", events.BATTERY_CRITICAL, events.BATTERY_CHARGED, after=3, mended_after=3
+)
+BATTERY_MONITOR_LOST, BUS_MONITOR_LOST = (
+    Fact(name, events.POWER_SENSOR_LOST, events.POWER_SENSOR_RECOVERED, after=3, mended_after=3)
+    for name in ("battery-monitor-lost", "bus-monitor-lost")
+)
 
 FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isinstance(value, Fact))
 

@@ -65,6 +65,7 @@ class FlightEnding:
         coils_left_out: axes of the coils that were excluded because they are broken.
         coils_at_zero: whether the last command that the PWM chip acknowledged was zero current.
         coil_error: why the last write to the PWM chip failed; empty if it succeeded.
+        power: state of charge and energies of the battery; empty without a section `power`.
     """
 
     mission_time: float = 0.0
@@ -77,6 +78,7 @@ class FlightEnding:
     coils_left_out: tuple[str, ...] = ()
     coils_at_zero: bool = False
     coil_error: str = "the flight did not begin"
+    power: str = ""
 
 
 HEALTH_PERIOD_NS = SECOND_NS // 4
@@ -197,6 +199,7 @@ class FlightLoop:
             ),
             coils_at_zero=not coils.error and not coils.current.any(),
             coil_error=coils.error,
+            power=self._tasks.power.summary() if self._tasks.power is not None else "",
         )
 
     def _begin(self, epoch_ns: int, label: RunLabel) -> None:
@@ -206,7 +209,7 @@ class FlightLoop:
         tasks.navigation.begin(epoch_ns)
         if tasks.imaging is not None:
             tasks.imaging.begin(epoch_ns)
-        for sensing in (tasks.positioning, tasks.sun, tasks.horizon_cameras):
+        for sensing in (tasks.positioning, tasks.sun, tasks.horizon_cameras, tasks.power):
             if sensing is not None:
                 sensing.begin(epoch_ns)
         if tasks.commanding is not None:
@@ -293,14 +296,14 @@ class FlightLoop:
         self._supervisors.beat()
 
     def _keep_house(self, cycle: Cycle) -> None:
-        now_ns, output = cycle.start_ns, self._output
+        now_ns, output, tasks = cycle.start_ns, self._output, self._tasks
         state = output.steered.state if output is not None else SteeringState.OFF
-        for sensing in (self._tasks.positioning, self._tasks.sun):
+        for sensing in (tasks.positioning, tasks.sun, tasks.power):
             if sensing is not None:
                 sensing.run(now_ns)
         if not self._has_fast_cameras():
             self._run_horizon_cameras(cycle)
-        self._tasks.housekeeping.run(cycle, state)
+        tasks.housekeeping.run(cycle, state)
         self._correct_label(now_ns)
         self._keep_state(now_ns)
         self._record_performance(now_ns)

@@ -451,6 +451,7 @@ class Imaging:
         self._last_checksum: int | None = None
         self._last_frame_ns = 0
         self._triggered_ns = -settings.fine_rest_ns
+        self._rest_ns = 0
         self._ordered: tuple[int, int] | None = None  # start and duration (ns) of an ordered exposure
         self._due_ns: int | None = None  # time (ns) after which the oldest trigger's frame is late
         self._rows = RepeatedRows()
@@ -467,6 +468,11 @@ class Imaging:
         """Return the time (ns) at which the worker received its present frame, or None while it is idle."""
         return None if self._frame is None else self._busy_since_ns
 
+    def rest(self, seconds: float) -> None:
+        """Leave at least `seconds` s between two exposures, because the battery is low."""
+        # Half a second is subtracted, so that the trigger after a late trigger is not skipped.
+        self._rest_ns = round((seconds - 0.5) * 1e9)
+
     def begin(self, time_ns: int) -> None:
         """Measure the age of the newest frame from `time_ns` on."""
         self._last_frame_ns = time_ns
@@ -474,16 +480,15 @@ class Imaging:
     def trigger(self, cycle: Cycle) -> None:
         """Order the next exposure of the star camera, if one may be made now.
 
-        No exposure is made while the body rotates faster than permitted. Exposures are less frequent while
-        the attitude is fine and the body rotates slowly. An exposure starts when no coil will switch until
-        its end, so that the body rate is nearly constant.
+        No exposure is made while the body rotates faster than permitted, or too soon while the battery is
+        low. Exposures are less frequent while the attitude is fine and the body rotates slowly. An exposure
+        starts when no coil will switch until its end, so that the body rate is nearly constant.
         """
-        speed = self._navigation.speed
-        if speed > self._settings.max_rate:
+        speed, rested_ns = self._navigation.speed, cycle.start_ns - self._triggered_ns
+        if speed > self._settings.max_rate or rested_ns < self._rest_ns:
             self._last_frame_ns = cycle.start_ns
             self._streams.note("camera", cycle.start_ns)  # the pause is intended, so the camera is not stale
             return
-        rested_ns = cycle.start_ns - self._triggered_ns
         fine = self._settings.knowledge() is Knowledge.FINE and not self._settings.seeks()
         if rested_ns < self._settings.fine_rest_ns and fine and speed <= FAST:
             return

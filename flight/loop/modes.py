@@ -55,6 +55,9 @@ class Trigger(Enum):
     KNOWN_SUN = "attitude known, to the sun"
     KNOWN_POINT = "attitude known"
     LOST = "attitude lost"
+    CHARGED_ACQUIRE = "battery charged, acquire"
+    CHARGED_HOLD = "battery charged, hold"
+    CHARGED_DEMO = "battery charged, testbed-demo"
 
 
 STARTS = {
@@ -109,13 +112,16 @@ TRANSITIONS: Table = {
         Trigger.COMMAND_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
     },
-    Mode.SAFE: {  # SAFE is left only by command; a command to point starts the acquisition first
+    Mode.SAFE: {  # SAFE is left by command, or if a low battery was its cause; pointing needs an acquisition
         **_USUAL,
         Trigger.COMMAND_SUN: Mode.ACQUIRE,
         Trigger.COMMAND_POINT: Mode.ACQUIRE,
         Trigger.COMMAND_SAFE: TriggerAnswer.STAY,
         Trigger.REACT_SAFE: TriggerAnswer.STAY,
         Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
+        Trigger.CHARGED_ACQUIRE: Mode.ACQUIRE,
+        Trigger.CHARGED_HOLD: Mode.HOLD,
+        Trigger.CHARGED_DEMO: Mode.TESTBED_DEMO,
     },
     Mode.DETUMBLE: {  # a command to point takes effect after the rate is low and the attitude known
         **_USUAL,
@@ -412,6 +418,7 @@ class ModeControl:
         self.restart = ""
         self.wanted: Target | None = None
         self._pointed: Target | None = None
+        self._returns: Trigger | None = None  # trigger that leaves a SAFE whose cause is the battery
         services.events.react_by(self.react)
 
     @property
@@ -522,6 +529,7 @@ class ModeControl:
         if answer is TriggerAnswer.REFUSE:
             return f"not while in {self.mode.label}"
         if answer is TriggerAnswer.STAY and mode not in POINTING:
+            self._returns = None if mode is Mode.SAFE else self._returns
             return ""
         if self.mode is Mode.SAFE and (barred := _barred(self._facts)):
             return barred
@@ -551,8 +559,21 @@ class ModeControl:
         elif reaction is Reaction.RESTART:
             self.restart = f"{kind.name}: {text}"
             self._stop(f"restart wanted: {self.restart}")
+        elif reaction is Reaction.RETURN:
+            if self._returns is not None and not _barred(self._facts):
+                self._fire(self._returns, kind.name, time_ns)
         elif reaction in SAFING_REACTIONS:
+            before = self.mode
             self._fire(SAFING_REACTIONS[reaction], kind.name, time_ns)
+            if kind is events.BATTERY_CRITICAL and self.mode is not before:
+                self._returns = self._return_to(before)
+
+    def _return_to(self, before: Mode) -> Trigger:
+        """Return the trigger that continues the flight after a low battery has ended the mode `before`."""
+        if Mode.ACQUIRE in self._modes:
+            return Trigger.CHARGED_ACQUIRE
+        demo = before is Mode.TESTBED_DEMO or (before is Mode.BOOT and self._initial is Mode.TESTBED_DEMO)
+        return Trigger.CHARGED_DEMO if demo else Trigger.CHARGED_HOLD
 
     def _boot(self, good: bool, now_ns: int) -> None:
         waited = (now_ns - self._machine.since_ns) * 1e-9
@@ -596,6 +617,7 @@ class ModeControl:
     def _enter(self, change: ModeChange, reason: str, now_ns: int) -> None:
         """Enter a mode: reset timers, discard an old path, and set the coils to zero without steering."""
         self._facts.enter(change.after)
+        self._returns = None
         for timer in (self._slow, self._arrived, self._pointing, self._attitude):
             timer.reset()
         if change.before not in STEERING | {Mode.BOOT}:

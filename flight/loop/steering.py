@@ -73,6 +73,7 @@ class CoilDrive:
         self._braked = NO_AXES
         self.available = watch.available
         self._nothing: FloatArray = np.zeros(len(settings.limits))
+        self._limits, self._share = settings.limits, 1.0
         self.command = self._nothing
 
     def state(self) -> CoilState:
@@ -87,6 +88,10 @@ class CoilDrive:
     def correction(self) -> CoilCorrection:
         """Signs and gains of the coils, as estimated by the coil monitor."""
         return self._watch.correction
+
+    def limit(self, share: float) -> None:
+        """Use at most the fraction `share` of the current limits, because the battery is low."""
+        self._limits, self._share = share * self._settings.limits, share
 
     def off(self) -> None:
         """Switch all coils off at the end of the flight."""
@@ -174,9 +179,10 @@ class CoilDrive:
         watch, settings = self._watch, self._settings
         usable = self.available & ~watch.resting
         factors = np.abs(watch.correction.factors)
-        limits = settings.limits * factors
+        limits = self._limits * factors
         # A weak coil reaches its limit at a smaller effective current.
-        beyond = bool((factors < 1.0).any() and (np.abs(currents) > limits).any())
+        limited = self._share < 1.0 or bool((factors < 1.0).any())
+        beyond = limited and bool((np.abs(currents) > limits).any())
         if (beyond or not all(usable.tolist())) and currents.any():
             # The usable axes share the torque that was commanded for all axes.
             # While the field is unknown, each usable axis keeps its own current.

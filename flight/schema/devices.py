@@ -33,6 +33,7 @@ from flight.schema.values import (
     Positive,
     Quaternion,
     Section,
+    Share,
     Sign,
     SignedAxis,
     Vector,
@@ -273,15 +274,83 @@ class Coils(Section, frozen=True, kw_only=True):
 
 
 class PowerMonitorSection(Section, frozen=True, kw_only=True):
-    """The INA219, which measures voltage and current of the coils' supply.
+    """An INA219, which measures voltage and current of a supply with the resistance `shunt` (ohm).
 
-    The chip is on the I2C bus `bus`, by default the bus of the coils.
+    The chip is on the I2C bus `bus`, by default the bus of the coils. The chip measures currents up to
+    `maximum_current` (A) in both directions.
     """
 
     driver: DriverName = "ina219"
     bus: Bus | None = None
     address: Address = 0x45
     shunt: Positive = 0.1
+    maximum_current: Positive = 0.8
+
+
+class Battery(Section, frozen=True, kw_only=True):
+    """The battery: `cells` lithium-ion cells in series, with a capacity of `capacity` (A h).
+
+    The internal resistance of all cells together is `resistance` (ohm). The open-circuit voltage of a cell
+    (V) is given by `open_circuit` for states of charge at equal intervals from 0 to 1, and is interpolated
+    linearly.
+    """
+
+    capacity: Annotated[float, Meta(gt=0.0, le=1000.0)]
+    cells: Annotated[int, Meta(ge=1, le=3)] = 2
+    resistance: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
+    open_circuit: Annotated[
+        tuple[Annotated[float, Meta(gt=1.0, lt=5.0)], ...], Meta(min_length=2, max_length=101)
+    ] = (3.0, 3.45, 3.55, 3.6, 3.65, 3.7, 3.78, 3.87, 3.96, 4.06, 4.18)
+
+    def voltage(self, charge: float) -> float:
+        """Return the open-circuit voltage (V) of the battery at a state of charge from 0 to 1."""
+        known = self.open_circuit
+        place = min(max(charge, 0.0), 1.0) * (len(known) - 1)
+        index = min(int(place), len(known) - 2)
+        return self.cells * (known[index] + (place - index) * (known[index + 1] - known[index]))
+
+    def charge(self, voltage: float) -> float:
+        """Return the state of charge from 0 to 1 at an open-circuit voltage (V) of the battery."""
+        steps = np.linspace(0.0, 1.0, len(self.open_circuit))
+        return float(np.interp(voltage / self.cells, self.open_circuit, steps))
+
+
+class LowBattery(Section, frozen=True, kw_only=True):
+    """The states of charge below which the flight application sheds loads, in the order of the keys.
+
+    Below `low`, the coils carry at most the fraction `coil_share` of their current limits. Below `very_low`,
+    the star camera takes a frame every `camera_period` s at most. Below `critical`, the mode changes to safe.
+    A load is switched on again when the state of charge exceeds its limit by `hysteresis`; above `critical`,
+    the flight then leaves the mode safe by itself.
+    """
+
+    low: Share = 0.4
+    very_low: Share = 0.3
+    critical: Share = 0.2
+    hysteresis: Annotated[float, Meta(ge=0.01, le=0.5)] = 0.1
+    coil_share: Share = 0.3
+    camera_period: Annotated[float, Meta(gt=0.0, le=3600.0)] = 60.0
+
+
+class Power(Section, frozen=True, kw_only=True):
+    """The power system: a battery on an unregulated bus, which solar panels charge.
+
+    The INA219 `battery_monitor` measures the current out of the battery, which is negative while the battery
+    is charged. The INA219 `bus_monitor` measures the current of all loads; without it (`null`), a stuck
+    `battery_monitor` is not detected.
+    """
+
+    battery: Battery
+    battery_monitor: PowerMonitorSection = PowerMonitorSection(address=0x41, maximum_current=2.0)
+    bus_monitor: PowerMonitorSection | None = PowerMonitorSection(address=0x44, maximum_current=2.0)
+    low_battery: LowBattery = LowBattery()
+
+    def monitors(self) -> dict[str, PowerMonitorSection]:
+        """Return the sections of the current monitors by their dotted keys, the battery's monitor first."""
+        found = {"power.battery_monitor": self.battery_monitor}
+        if self.bus_monitor is not None:
+            found["power.bus_monitor"] = self.bus_monitor
+        return found
 
 
 class CameraLens(Section, frozen=True, kw_only=True):
@@ -643,7 +712,7 @@ DRV8830 = _ours(
     check=later("flight.app.devices:coil_settings"),
     off=later("flight.app.devices:off_drv8830"),
 )
-INA219 = _ours("power_monitor", PowerMonitorSection, "ina219")
+INA219 = _ours("power_monitor", PowerMonitorSection, "ina219", check=later("flight.app.devices:check_ina219"))
 UBLOX = _ours("gps", Gps, "ublox")
 NMEA = _ours("gps", Gps, "nmea")
 ADS1115 = _ours("solar_strings", SolarStringsSection, "ads1115")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from ipaddress import IPv4Address, IPv4Network
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,6 +20,7 @@ from flight.schema.devices import (
     AravisDevice,
     Camera,
     Coils,
+    Power,
     SolarStringsSection,
     V4l2Device,
     structure_mask,
@@ -102,8 +104,7 @@ def check_consistency(config: Config, document: Document) -> None:
                     f"wide_cameras[{index}].{name}",
                     f"is {value!r}: must be equal for all wide-angle cameras, the first has {wanted!r}",
                 )
-    if config.solar_strings is not None:
-        _check_strings(config, config.solar_strings, refuse)
+    _check_supplies(config, refuse)
 
 
 def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
@@ -241,6 +242,38 @@ def _check_strings(config: Config, strings: SolarStringsSection, refuse: Refuse)
             refuse(f"{place}.normal", f"has length {math.hypot(*string.normal):.6g}: give a unit vector")
 
 
+def _check_supplies(config: Config, refuse: Refuse) -> None:
+    if config.solar_strings is not None:
+        _check_strings(config, config.solar_strings, refuse)
+    if config.power is not None:
+        _check_power(config, config.power, refuse)
+
+
+def _check_power(config: Config, power: Power, refuse: Refuse) -> None:
+    curve, limits = power.battery.open_circuit, power.low_battery
+    if any(after <= before for before, after in pairwise(curve)):
+        refuse("power.battery.open_circuit", "must rise from each state of charge to the next")
+    if not limits.critical < limits.very_low < limits.low:
+        order = f"{limits.critical:g}, {limits.very_low:g}, {limits.low:g}"
+        refuse("power.low_battery", f"has {order} as critical, very_low and low: must be in rising order")
+    if limits.low + limits.hysteresis > 1.0:
+        top = f"is {limits.low:g}: with the hysteresis {limits.hysteresis:g}"
+        refuse("power.low_battery.low", f"{top} the charge would have to exceed 1")
+    if config.camera is not None and limits.camera_period < config.camera.period:
+        period = f"is {limits.camera_period:g} s: must be at least `camera.period`"
+        refuse("power.low_battery.camera_period", f"{period}, {config.camera.period:g} s")
+    bus, strings = config.coils.bus, config.solar_strings
+    used = {(bus, config.coils.address)}
+    if config.power_monitor is not None:
+        used.add((config.power_monitor.bus or bus, config.power_monitor.address))
+    if strings is not None:
+        used |= {(strings.bus or bus, string.address) for string in strings.strings}
+    for key, monitor in power.monitors().items():
+        if (monitor.bus or bus, monitor.address) in used:
+            refuse(f"{key}.address", f"is 0x{monitor.address:02x}, the address of another chip on the bus")
+        used.add((monitor.bus or bus, monitor.address))
+
+
 def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
     norm = math.sqrt(sum(c * c for c in quaternion))
     if abs(norm - 1.0) > 1e-6:
@@ -372,7 +405,7 @@ def load(path: Path) -> Config:
 def parse(text: str, name: str = "configuration") -> Config:
     """Validate a configuration text. Error messages name the file `name`. Raises ConfigError."""
     document = read_document(text, name)
-    for optional in ("camera", "power_monitor", "gps", "solar_strings"):
+    for optional in ("camera", "power_monitor", "power", "gps", "solar_strings"):
         if document.values.get(optional) == "none":
             document.values[optional] = None
     # A body defined outside this repository uses the sections of the testbed.

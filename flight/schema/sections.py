@@ -17,6 +17,7 @@ from flight.schema.devices import (
     Coils,
     Gps,
     InertialUnitSection,
+    Power,
     PowerMonitorSection,
     SolarStringsSection,
     WideCamera,
@@ -257,6 +258,7 @@ class Config(Section, frozen=True, kw_only=True):
     inertial_unit: InertialUnitSection
     coils: Coils
     power_monitor: PowerMonitorSection | None = None
+    power: Power | None = None
     camera: Camera | None
     gps: Gps | None = None
     solar_strings: SolarStringsSection | None = None

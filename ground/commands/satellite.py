@@ -31,6 +31,8 @@ from flight.link.commands import (
     Ping,
     Point,
     command_of,
+    crc_of,
+    problem_of,
     words_of,
 )
 from flight.link.files.store import Store, files_folder
@@ -66,8 +68,6 @@ from flight.link.telemetry.definitions import (
     VERIFICATION,
     Field,
     Packet,
-    crc_of,
-    problem_of,
 )
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY_LAYOUTS
 from flight.link.telemetry.packets import TelemetryError

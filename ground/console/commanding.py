@@ -19,7 +19,16 @@ import numpy as np
 
 from flight.app.run import utc_ns
 from flight.link import commands
-from flight.link.commands import CLEAR, LAYOUTS, LOAD_PARAMETERS, MODE, CommandError, CommandPacker, Ping
+from flight.link.commands import (
+    CLEAR,
+    LAYOUTS,
+    LOAD_PARAMETERS,
+    MODE,
+    CommandError,
+    CommandPacker,
+    Ping,
+    crc_of,
+)
 from flight.link.events import EVENTS
 from flight.link.files.store import Store
 from flight.link.modes import Mode
@@ -28,7 +37,7 @@ from flight.link.process.commanding import Report, Stage, utc_of
 from flight.link.process.directives import LIST, SCHEDULE
 from flight.link.process.downlink import LIVE
 from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
-from flight.link.telemetry.definitions import VERIFICATION, Field, crc_of
+from flight.link.telemetry.definitions import VERIFICATION, Field
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import Layout, Packer, PacketArray, TelemetryError
 from flight.schema.document import merged_text, read_text

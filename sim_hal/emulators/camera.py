@@ -87,6 +87,11 @@ class EmulatedCamera:
         self.one_of = 1
         self._unanswered = 0
 
+    @property
+    def exposures(self) -> int:
+        """Number of exposures since the start."""
+        return self._sequence
+
     def trigger(self, exposure_ns: int) -> None:
         """Start an exposure and abandon an exposure in progress, as the reset of a camera does."""
         if self.fault == "off":

@@ -470,6 +470,32 @@ def _dead(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
     return hold(cells, "dead", dead, np.zeros(len(dead), dtype=bool))
 
 
+def _power_part(attribute: str, value: Callable[[Parameters], object], sound: object) -> Begin:
+    """Return the fault that holds an attribute of the power system, or of one of its two monitors."""
+
+    def begin(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
+        power = bench.hardware.power
+        if power is None:
+            return no_removal
+        part: object = power
+        if fault.device in _RAILS:
+            part = power.rails[_RAILS.index(fault.device)]
+        return hold(part, attribute, value(given), sound)
+
+    return begin
+
+
+def _monitor_off(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
+    power = bench.hardware.power
+    rail = None if power is None else power.rails[_RAILS.index(fault.device)]
+    if rail is None or rail.bus is None:
+        return no_removal
+    bus, monitor = rail.bus, rail.monitor
+    monitor.brown_out()
+    bus.detach(monitor)
+    return partial(bus.attach, monitor)
+
+
 def _killed(bench: Bench, *_: object) -> Removal:
     if bench.flight_process is not None:
         os.kill(bench.flight_process, signal.SIGKILL)
@@ -494,6 +520,7 @@ def _worker_faults(device: str) -> tuple[FaultKind, ...]:
     )
 
 
+_RAILS = ("battery-monitor", "bus-monitor")
 _EACH_BIT = "each bit flips with this probability"
 _EACH_FIELD = f", {FIELD_BITS} to each of its fields"
 _LOW_AT_TIMES = "the clock line is held low intermittently"
@@ -568,6 +595,33 @@ _ALL = (
     _fault("strings: garbage", "reads return random bytes", _random_reads),
     # `camera` is the number of a camera in the order of the configuration; 0 means all.
     *_frame_faults("wide", "torn", "slow", camera=_count(0.0, 0.0, 6.0)),
+    *(
+        fault
+        for device in _RAILS
+        for fault in (
+            _fault(f"{device}: off", "no power: the chip does not acknowledge", _monitor_off),
+            _fault(f"{device}: stuck", "always the same values", _power_part("stuck", lambda _: True, False)),
+            _fault(
+                f"{device}: wrong",
+                "measured values are multiplied by gain",
+                _power_part("gain", lambda given: given["gain"], 1.0),
+                {"gain": _gain(0.5)},
+            ),
+        )
+    ),
+    _fault("battery: cell-lost", "a cell gives no voltage", _power_part("cells_lost", lambda _: 1, 0)),
+    _fault(
+        "battery: weak",
+        "the capacity is divided by factor, the resistance is multiplied",
+        _power_part("weakness", lambda given: given["factor"], 1.0),
+        {"factor": Parameter(4.0, 1.0, 100.0)},
+    ),
+    _fault(
+        "panels: lost",
+        "this panel gives no power; 0: all panels",
+        _power_part("lost_panel", lambda given: round(given["panel"]), None),
+        {"panel": _count(1.0, 0.0, 32.0)},
+    ),
     *_worker_faults("planner"),
     *_worker_faults("vision"),
     _fault("process: killed", "kill -9 of the flight process", _killed, momentary=True, where=Where.REALTIME),

@@ -166,6 +166,7 @@ _SECTIONS = {
     "gps": "gps",
     "strings": "solar_strings",
     "wide": "wide_cameras",
+    **dict.fromkeys(("battery", "battery-monitor", "bus-monitor", "panels"), "power"),
 }
 """Optional configuration section of each device that can be absent."""
 _EMULATED = {

@@ -15,7 +15,13 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from flight.link.telemetry.definitions import ORBIT_TRUTH, TRUE_COIL_CURRENTS, TRUE_DESCRIPTION, TRUTH
+from flight.link.telemetry.definitions import (
+    ORBIT_TRUTH,
+    TRUE_COIL_CURRENTS,
+    TRUE_DESCRIPTION,
+    TRUE_POWER,
+    TRUTH,
+)
 from flight.link.telemetry.packets import Packer
 from flight.schema.document import ConfigError, imported
 from flight.schema.sections import Config
@@ -228,13 +234,25 @@ class PacketLog(Protocol):
         """Append a packet."""
 
 
+class RecordedPower(Protocol):
+    """A simulated power system whose state is recorded."""
+
+    def truth(self) -> Mapping[str, float]:
+        """Return the fields of the packet `true_power`."""
+
+
 class TruthRecorder:
-    """Recorder that writes the true state to a packet log, at 40 Hz for the body and 1 Hz for the orbit."""
+    """Recorder that writes the true state to a packet log, at 40 Hz for the body and 1 Hz for the orbit.
+
+    Attributes:
+        power: power system whose state is recorded once a second, or None.
+    """
 
     def __init__(self, log: PacketLog) -> None:
         self._log = log
         self._packer = Packer()
         self._world: World | None = None
+        self.power: RecordedPower | None = None
         self._description: Mapping[str, FloatArray] | None = None
         self._epoch_ns = 0
         self._due_ns = NEVER
@@ -278,6 +296,8 @@ class TruthRecorder:
         if len(truth.current) > 3:
             padded = [*truth.current.tolist(), *[math.nan] * (MOST_COILS - len(truth.current))]
             self._log.write(self._packer.pack(TRUE_COIL_CURRENTS, since_ns, current=padded))
+        if since_ns % ORBIT_PERIOD_NS == 0 and self.power is not None:
+            self._log.write(self._packer.pack(TRUE_POWER, since_ns, **self.power.truth()))
         if since_ns % ORBIT_PERIOD_NS != 0 or not isinstance(world, OrbitingWorld):
             return
         orbit = world.orbit_truth()

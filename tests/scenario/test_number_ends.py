@@ -88,6 +88,8 @@ def test_every_integer_of_the_testbed_may_pass_its_end(
         "fix",
         "gps_link",
         "directions",
+        "power",
+        "true_power",
         "truth",
         "orbit_truth",
         "link",

@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from flight.link.commands import CommandPacker, DumpParameters, LoadParameters
-from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, crc_of
+from flight.link.commands import CommandPacker, DumpParameters, LoadParameters, crc_of
+from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS
 from flight.link.telemetry.packets import to_text
 from ground.telemetry import decode
 from tests.scenario.answers import said

@@ -48,6 +48,7 @@ def probe(config: Config) -> list[Probed]:
     """Return the result of each device, file and folder that the configuration needs."""
     sections = [(kind, getattr(config, kind)) for kind in DRIVERS if kind != "camera"]
     sections += [("camera", config.camera)]
+    sections += config.power.monitors().items() if config.power is not None else ()
     sections += [(f"wide_cameras[{number}]", camera) for number, camera in enumerate(config.wide_cameras)]
     return [_probed(config, *named) for named in sections if named[1] is not None] + list(_files(config))
 
@@ -55,7 +56,7 @@ def probe(config: Config) -> list[Probed]:
 def _probed(config: Config, name: str, section: Any) -> Probed:
     """Ask one device for a sign of life, with connections of its own."""
     camera = isinstance(section, Camera | WideCamera)
-    kind = "camera" if camera else name
+    kind = "camera" if camera else "power_monitor" if name.startswith("power.") else name
     driver = driver_of(kind, section.device if camera else section)
     place = ", ".join(driver.files(section) or driver_of("coils", config.coils).files(config.coils))
     place = getattr(section.device, "name", "") or place if camera else place
@@ -244,6 +245,7 @@ def _text(verdict: CheckResult) -> str:
         ending = result.ending
         noticed = f"{counts_text(ending.faults, 'faults')}; {counts_text(ending.warnings, 'warnings')}"
         lines.append(("flown", f"{ending.mission_time:.0f} s in lock-step; mode {ending.mode}"))
+        lines += [("battery", ending.power)] if ending.power else []
         lines.append(("noticed", noticed))
         lines += [("", with_cause(name, ending)) for name in sorted(ending.warnings)]
         if result.faults:

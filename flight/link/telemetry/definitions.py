@@ -10,9 +10,6 @@ configuration schema.
 from __future__ import annotations
 
 import math
-import struct
-import zlib
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -109,13 +106,7 @@ PARAMETER_FIELDS: tuple[Field, ...] = (
     _parameter("modes.tumble_rate", "rad/s", 1e-3, 10.0, "rate above which the body is detumbled"),
     _parameter("modes.blind_limit", "s", 1.0, 1e5, "time without an estimate after which the mode is safe"),
     _parameter("modes.known_for", "s", 0.1, 3600.0, "time with an attitude after which acquisition ends"),
-    _parameter(
-        "modes.lost_for",
-        "s",
-        0.1,
-        3600.0,
-        "time without an attitude after which acquisition starts",
-    ),
+    _parameter("modes.lost_for", "s", 0.1, 3600.0, "time without an attitude after which acquisition starts"),
     _parameter("health.cpu_share", "-", 0.01, 64.0, "largest processor load of the control process"),
     _parameter("health.memory", "B", 1e6, 1e12, "largest memory of all flight processes"),
     _parameter("health.memory_slope", "B/h", 1e3, 1e12, "largest growth of the memory of all processes"),
@@ -129,27 +120,6 @@ PARAMETER_FIELDS: tuple[Field, ...] = (
 
 PARAMETER_KEYS: tuple[str, ...] = tuple(parameter.name.replace("_", ".", 1) for parameter in PARAMETER_FIELDS)
 """Configuration keys of the parameters, in the order of `PARAMETER_FIELDS`."""
-
-
-def crc_of(values: Sequence[float]) -> int:
-    """Return the CRC-32 of parameter values, encoded as big-endian doubles in table order."""
-    return zlib.crc32(struct.pack(f">{len(PARAMETER_FIELDS)}d", *values))
-
-
-def problem_of(values: Mapping[str, float]) -> str:
-    """Return the problem of a parameter table, or an empty text if the table is valid.
-
-    A problem is a missing key, an unknown key or a value out of range.
-    """
-    if lacking := [key for key in PARAMETER_KEYS if key not in values]:
-        return f"{lacking[0]} is missing: a table is loaded as a whole"
-    if unknown := sorted(set(values) - set(PARAMETER_KEYS)):
-        return f"{unknown[0]} is not a parameter: use {', '.join(PARAMETER_KEYS)}"
-    for key, parameter in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True):
-        low, high = parameter.valid or (-math.inf, math.inf)
-        if not low <= values[key] <= high:  # NaN compares false
-            return f"{key} = {values[key]:g} must lie within {low:g} to {high:g} {parameter.unit}"
-    return ""
 
 
 TABLES: States = ((0, "configuration"), (1, "loaded"))
@@ -167,10 +137,14 @@ COILS: States = tuple(enumerate(COIL_NAMES))
 STAGES: States = tuple(enumerate(("accepted", "refused", "started", "completed", "failed", "repeated"), 1))
 """Stages of a command (`flight.link.process.commanding.Stage`)."""
 
+SHED: States = tuple(enumerate(("nothing", "coils-limited", "camera-slower", "safe")))
+"""Loads that a low battery sheds, each state with those of the states before it (`flight.loop.power`)."""
+
 SAFE_ALARM: Alarms = ((int(Mode.SAFE), "warning"),)
 SEVERITY_ALARMS: Alarms = ((int(Severity.WARNING), "warning"), (int(Severity.FAULT), "fault"))
 STREAM_ALARMS: Alarms = ((1, "fault"), (2, "fault"), (3, "fault"), (4, "warning"))
 LOST_ALARM: Alarms = ((0, "warning"),)
+SHED_ALARMS: Alarms = ((1, "warning"), (2, "warning"), (3, "fault"))
 
 _NAMES = """
     boot-waits task-failing! no-progress! imu-silent! imu-unusable! imu-line-lost! control-lost! blind!
@@ -179,7 +153,8 @@ _NAMES = """
     memory-high! disk-low hot too-hot! imu-poor field-poor coils-poor power-poor camera-poor
     service-failing! camera-late vision-slow gps-lost gps-poor strings-lost sun-unclear clock-off
     field-refused wide-lost wide-false coil-4-broken! coil-5-broken! coil-6-broken!
-    field-extrapolated gyro-lost!
+    field-extrapolated gyro-lost! battery-low battery-very-low battery-critical! battery-monitor-lost
+    bus-monitor-lost
 """
 _FACTS: tuple[tuple[str, Level], ...] = tuple(
     (name.rstrip("!"), "fault" if name.endswith("!") else "warning") for name in _NAMES.split()
@@ -208,12 +183,7 @@ RUN = Packet(
         Field("control_period_ns", "u8", "ns", "period of the control rate group"),
         Field("duration", "f8", "s", "planned duration of the run; NaN for an unlimited run"),
         Field("coil_resistance", "f8", "ohm", "resistance of the first three coils; NaN if not fitted", 3),
-        Field(
-            "supply_voltage",
-            "f8",
-            "V",
-            "configured supply voltage of the coils after the losses of the bridges",
-        ),
+        Field("supply_voltage", "f8", "V", "configured coil supply voltage, after the losses of the bridges"),
         Field("current_limit", "f8", "A", "largest permitted current of a coil"),
     ),
 )
@@ -301,6 +271,23 @@ COMMAND = Packet(
 )
 
 
+_DRAWN = "%s; positive while the battery is discharged"
+POWER = Packet(
+    "power",
+    0x134,
+    "1 Hz, only with a section power",
+    "Battery and bus: measurements, state of charge and shed loads; NaN if unknown",
+    (
+        Field("shed", "u1", "-", "loads that are shed", states=SHED, alarms=SHED_ALARMS),
+        Field("charge", "f4", "-", "state of charge", limits=Limits((0.4, 1.0), (0.2, 1.0))),
+        Field("battery_voltage", "f4", "V", "voltage of the battery"),
+        Field("battery_current", "f4", "A", _DRAWN % "current out of the battery"),
+        Field("bus_voltage", "f4", "V", "voltage of the bus"),
+        Field("bus_current", "f4", "A", "current of all loads"),
+        Field("energy_in", "f8", "J", "energy into the battery since start"),
+        Field("energy_out", "f8", "J", "energy out of the battery since start"),
+    ),
+)
 MAX_NODES = 40
 """Maximum number of path nodes in a plan packet."""
 
@@ -444,6 +431,21 @@ TRUTH = Packet(
     ),
 )
 
+TRUE_POWER = Packet(
+    "true_power",
+    0x145,
+    "1 Hz, simulation only, only with a section power",
+    "True power system, which sim_hal writes",
+    (
+        Field("charge", "f4", "-", "state of charge"),
+        Field("battery_voltage", "f4", "V", "voltage of the battery and the bus"),
+        Field("battery_current", "f4", "A", _DRAWN % "current out of the battery"),
+        Field("solar_power", "f4", "W", "power of the solar panels that is used"),
+        Field("load_power", "f4", "W", "power of all loads"),
+        Field("coil_power", "f4", "W", "power of the coils at their supply"),
+    ),
+)
+
 TRUE_COIL_CURRENTS = Packet(
     "true_coil_currents",
     0x143,
@@ -511,13 +513,7 @@ DESCRIPTION = Packet(
         Field("field_sigma", "f4", "-", _ONE_SIGMA + "field", 9),
         Field("camera", "f8", "rad", _CAMERA, 3),
         Field("camera_sigma", "f4", "rad", _ONE_SIGMA + "camera", 3),
-        Field(
-            "camera_attitude_sigma",
-            "f4",
-            "rad",
-            "standard deviations of the attitude of the star camera about the body axes",
-            3,
-        ),
+        Field("camera_attitude_sigma", "f4", "rad", _ONE_SIGMA + "the star camera's attitude, body axes", 3),
         Field("inertia_ratio_sigma", "f4", "-", _ONE_SIGMA + "inertia divided by its trace", 6),
         Field(
             "coils_ratio_sigma",
@@ -586,21 +582,11 @@ DIRECTIONS = Packet(
         Field("frames", "u1", "-", "bit mask of the cameras whose frames were read"),
         Field("sun", "f8", "-", "direction of the Sun, body axes; NaN if unknown", 3),
         Field("sun_sigma", "f4", "rad", "standard deviation of the Sun's direction per axis; NaN if unknown"),
-        Field(
-            "sun_cameras",
-            "u1",
-            "-",
-            "bit mask of the cameras that show the Sun; 0 for a direction from the solar strings",
-        ),
+        Field("sun_cameras", "u1", "-", "cameras that show the Sun, as bits; 0 if from the solar strings"),
         flag("sun_used", "whether the estimate used the Sun's direction"),
         Field("nadir", "f8", "-", "direction of nadir, body axes; NaN if unknown", 3),
         Field("nadir_sigma", "f4", "rad", "standard deviation of nadir per axis; NaN if unknown"),
-        Field(
-            "nadir_cameras",
-            "u1",
-            "-",
-            "bit mask of the cameras that show the limb; 0 for a nadir from the brightness of all",
-        ),
+        Field("nadir_cameras", "u1", "-", "cameras that show the limb, as bits; 0 if from all brightnesses"),
         flag("nadir_used", "whether the estimate used the nadir"),
     ),
 )
@@ -664,6 +650,7 @@ TRUE_DESCRIPTION = Packet(
 )
 
 
+_COVARIANCE = "covariance xx yy zz xy xz yz, body axes; NaN if unknown"
 STREAK = Packet(
     "streak",
     0x121,
@@ -678,13 +665,7 @@ STREAK = Packet(
         Field("used", "u2", "-", "streaks used in the rate"),
         Field("length", "f8", "px", "median length of the streaks"),
         Field("rate", "f8", "rad/s", "mean body rate over the exposure, body axes; NaN if unknown", 3),
-        Field(
-            "covariance",
-            "f8",
-            "rad^2/s^2",
-            "covariance xx yy zz xy xz yz of the rate, body axes; NaN if unknown",
-            6,
-        ),
+        Field("covariance", "f8", "rad^2/s^2", _COVARIANCE, 6),
         Field("residual", "f8", "rad", "rms residual of the end points; NaN without a result"),
         flag("accepted", "whether the estimate used the rate"),
     ),
@@ -707,13 +688,7 @@ STARS = Packet(
         Field(
             "quaternion", "f8", "-", "rotation of reference frame into body, scalar last; NaN if unknown", 4
         ),
-        Field(
-            "covariance",
-            "f8",
-            "rad^2",
-            "covariance xx yy zz xy xz yz of the attitude, body axes; NaN if unknown",
-            6,
-        ),
+        Field("covariance", "f8", "rad^2", _COVARIANCE, 6),
         Field(
             "log10_false_alarm", "f8", "-", "log10 of the expected number of chance matches in the whole sky"
         ),
@@ -751,10 +726,7 @@ TRACK = Packet(
         Field("sightings", "u4", "-", "sightings since the start of the track"),
         Field("measured", "f8", "-", "measured direction in this frame; NaN if not detected", 3),
         Field(
-            "measured_sigma",
-            "f8",
-            "rad",
-            "standard deviation of the direction per axis, with the attitude error; NaN if none",
+            "measured_sigma", "f8", "rad", "standard deviation per axis, with the attitude error; NaN if none"
         ),
         Field("direction", "f8", "-", "estimated direction to the object", 3),
         Field("rate", "f8", "rad/s", "rate of change of the direction", 3),
@@ -904,6 +876,6 @@ JOB_TIMING = Packet(
 PACKETS: tuple[Packet, ...] = (
     RUN, IMU, CONTROL, ATTITUDE, COIL_CURRENTS, SPIN, NAVIGATION, DESCRIPTION, FIX, GPS_LINK, DIRECTIONS,
     SEPARATE_ATTITUDES, TARGET, MODE, PLAN, STREAK, STARS, SIGHTINGS, TRACK, EVENT, HOUSEKEEPING, HEALTH,
-    COMMAND, PARAMETERS, LINK, VERIFICATION, TRANSFER, TRUTH, TRUE_COIL_CURRENTS, ORBIT_TRUTH,
-    TRUE_DESCRIPTION, CYCLE_TIMING, RATE_GROUP, JOB_TIMING,
+    POWER, COMMAND, PARAMETERS, LINK, VERIFICATION, TRANSFER, TRUTH, TRUE_COIL_CURRENTS, ORBIT_TRUTH,
+    TRUE_DESCRIPTION, TRUE_POWER, CYCLE_TIMING, RATE_GROUP, JOB_TIMING,
 )  # fmt: skip

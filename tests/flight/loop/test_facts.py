@@ -64,6 +64,8 @@ PERSISTENCE = {
     "clock-off": (2, 1, ""),
     "wide-false": (3, 1, ""),
     "gyro-lost": (4, 4, ""),
+    **{f"battery-{level}": (3, 3, "") for level in ("low", "very-low", "critical")},
+    **{f"{rail}-monitor-lost": (3, 3, "") for rail in ("battery", "bus")},
 } | {f"{stream}-poor": (4, 8, "") for stream in ("imu", "field", "coils", "power", "camera", "gps")}
 """Updates until a fact counts and until it ends, None for a latching fact, and the modes that watch it.
 
@@ -89,6 +91,12 @@ EVENTS_OF = {
     "wide-lost": ("wide-lost", "wide-recovered"),
     "wide-false": ("wide-false", "wide-trusted"),
     "gyro-lost": ("gyro-lost", "gyro-recovered"),
+    "battery-low": ("battery-low", "battery-recovered"),
+    "battery-very-low": ("battery-very-low", "battery-recovered"),
+    "battery-critical": ("battery-critical", "battery-charged"),
+    **{
+        f"{rail}-monitor-lost": ("power-sensor-lost", "power-sensor-recovered") for rail in ("battery", "bus")
+    },
     **{f"coil-{axis}-broken": ("coil-broken", None) for axis in "xyz456"},
     **{name: (name, "resource-normal") for name in ("cpu-high", "memory-grows", "disk-low", "hot")},
     **{

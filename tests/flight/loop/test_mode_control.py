@@ -390,3 +390,41 @@ def test_a_satellite_that_tumbles_while_it_acquires_is_detumbled() -> None:
         assert bench.step(known=False, rate=1.01 * FAST) is Mode.ACQUIRE
     bench.step(known=False, rate=1.01 * FAST)
     assert bench.mode() is Mode.DETUMBLE
+
+
+@pytest.mark.parametrize(
+    ("modes", "initial", "mode", "after"),
+    [
+        (SATELLITE, "detumble", Mode.DETUMBLE, Mode.ACQUIRE),
+        (TESTBED, "testbed-demo", Mode.TESTBED_DEMO, Mode.TESTBED_DEMO),
+        (TESTBED, "hold", Mode.HOLD, Mode.HOLD),
+    ],
+)
+def test_a_charged_battery_ends_only_a_safe_mode_that_the_battery_caused(
+    modes: frozenset[Mode], initial: Any, mode: Mode, after: Mode
+) -> None:
+    bench = ModeBench(modes, Modes(initial=initial))
+    assert bench.step() is mode
+
+    def battery(critical: bool) -> Mode:
+        for _ in range(3):
+            bench.facts.update(facts.BATTERY_CRITICAL, critical, bench.now_ns, "charge")
+        return bench.mode()
+
+    assert battery(True) is Mode.SAFE
+    assert bench.records[-1]["reason"] == "battery-critical"
+    assert battery(False) is after
+    assert battery(True) is Mode.SAFE
+    bench.control.command(Mode.SAFE, bench.now_ns)
+    assert battery(False) is Mode.SAFE, "the operator wants safe"
+    assert battery(True) is battery(False) is Mode.SAFE, "the mode was safe before"
+
+
+def test_a_charged_battery_does_not_end_a_safe_mode_with_another_latched_fault() -> None:
+    bench = ModeBench(SATELLITE, Modes(initial="detumble"))
+    bench.step()
+    for critical in (True, False):
+        for _ in range(3):
+            bench.facts.update(facts.BATTERY_CRITICAL, critical, bench.now_ns, "charge")
+            bench.facts.update(facts.TOO_HOT, True, bench.now_ns, "99 degrees")
+    assert bench.mode() is Mode.SAFE

@@ -89,9 +89,12 @@ def test_only_commands_are_ever_refused_and_only_while_booting() -> None:
     assert refused == {(Mode.BOOT, trigger) for trigger in set(COMMANDS.values()) - {Trigger.COMMAND_SAFE}}
 
 
-def test_nothing_but_a_command_leads_out_of_safe() -> None:
+def test_nothing_but_a_command_or_a_charged_battery_leads_out_of_safe() -> None:
     leads_out = {t for t, to in TRANSITIONS[Mode.SAFE].items() if isinstance(to, Mode)}
-    assert leads_out == set(COMMANDS.values()) - {Trigger.COMMAND_SAFE}
+    charged = {Trigger.CHARGED_ACQUIRE, Trigger.CHARGED_HOLD, Trigger.CHARGED_DEMO}
+    assert leads_out == set(COMMANDS.values()) - {Trigger.COMMAND_SAFE} | charged
+    for mode in set(Mode) - {Mode.SAFE}:
+        assert not any(isinstance(TRANSITIONS[mode][trigger], Mode) for trigger in charged)
 
 
 def test_boot_is_for_the_start_only() -> None:

@@ -7,7 +7,8 @@ from typing import Any, cast
 
 import pytest
 
-from flight.link.telemetry.definitions import PARAMETER_KEYS, crc_of
+from flight.link.commands import crc_of
+from flight.link.telemetry.definitions import PARAMETER_KEYS
 from flight.loop.commanding import OnboardParameters
 from flight.loop.facts import EventLog
 from flight.loop.state import KeptTable

@@ -12,8 +12,8 @@ import pytest
 from msgspec.structs import replace
 
 from flight.app.cli import main
-from flight.link.commands import LoadParameters, unpack
-from flight.link.telemetry.definitions import COMMAND, PARAMETER_KEYS, PARAMETERS, crc_of
+from flight.link.commands import LoadParameters, crc_of, unpack
+from flight.link.telemetry.definitions import COMMAND, PARAMETER_KEYS, PARAMETERS
 from flight.link.telemetry.log import Recorder
 from flight.link.telemetry.packets import Packer
 from flight.loop.commanding import OnboardParameters

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import pytest
 
-from flight.link.commands import ChangeMode, Ping, Point, Slew, command_of_words, unpack
+from flight.link.commands import ChangeMode, Ping, Point, Slew, command_of_words, crc_of, unpack
 from flight.link.files.store import Store
 from flight.link.files.transfer import Progress
 from flight.link.modes import Mode
@@ -40,7 +40,6 @@ from flight.link.telemetry.definitions import (
     PARAMETERS,
     VERIFICATION,
     Packet,
-    crc_of,
 )
 from flight.link.telemetry.packets import Packer
 from ground.commands import satellite

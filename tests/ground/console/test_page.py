@@ -16,7 +16,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from flight.link import events
-from flight.link.telemetry.definitions import EVENT, FACTS, HEALTH, PARAMETER_FIELDS, PARAMETERS, crc_of
+from flight.link.commands import crc_of
+from flight.link.telemetry.definitions import EVENT, FACTS, HEALTH, PARAMETER_FIELDS, PARAMETERS
 from flight.link.telemetry.packets import Packer
 from tests.flight.link.telemetry.samples import plain_contents
 from tests.ground.report.synthetic import CURRENT, Recipe, make_run

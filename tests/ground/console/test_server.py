@@ -15,9 +15,9 @@ from aiohttp import WSServerHandshakeError
 from aiohttp.test_utils import TestClient
 
 from flight.link import commands
-from flight.link.commands import COMMANDS, POINT, Command
+from flight.link.commands import COMMANDS, POINT, Command, crc_of
 from flight.link.modes import Mode
-from flight.link.telemetry.definitions import PARAMETER_FIELDS, crc_of
+from flight.link.telemetry.definitions import PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
 from ground.console.commanding import CommandForms
 from ground.console.history import History

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flight.schema import reader as configuration
+from flight.schema.devices import Battery, Power
 from hal.drivers.pca9685 import PRE_SCALE
 from hal.interfaces.errors import NotResponding
 from sim_hal.clock import NEVER, SimClock
@@ -22,13 +23,14 @@ OUTSIDE = [kind for kind in CATALOGUE.values() if kind.begin is not None and kin
 SECOND_NS = 1_000_000_000
 
 
-IN_ORBIT = {"gps", "strings", "wide"}
+IN_ORBIT = {"gps", "strings", "wide", "battery-monitor", "bus-monitor", "battery", "panels"}
 
 
 @pytest.fixture(scope="module")
 def orbit() -> LockStep:
     """Return the devices of an orbit; every fault leaves them as they were."""
-    return build_lockstep(orbit_config(), orbit_world(), None, SimClock())
+    config = configuration.replace(orbit_config(), power=Power(battery=Battery(capacity=2.6)))
+    return build_lockstep(config, orbit_world(), None, SimClock())
 
 
 @pytest.fixture
@@ -70,8 +72,12 @@ def orbit_is_sound(lock: LockStep) -> bool:
     assert gps is not None
     assert strings is not None
     assert lock.gps_line is not None
+    power = lock.hardware.power
+    assert power is not None
     return (
-        lock.gps_line.to_host.faults == SOUND
+        not any(rail.stuck or rail.gain != 1.0 or rail.monitor not in bus._parts for rail in power.rails)
+        and (power.cells_lost, power.weakness, power.lost_panel) == (0, 1.0, None)
+        and lock.gps_line.to_host.faults == SOUND
         and gps.next_event_ns() < NEVER
         and not (gps.blind or gps.frozen or gps.clock_ns or gps.shift.any())
         and not (strings.frozen or strings.dead.any() or strings.gain != 1.0)

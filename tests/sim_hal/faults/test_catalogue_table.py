@@ -43,6 +43,10 @@ PARAMETERS = {
     "gps: bits": "chance 0.001 1e-06..1",
     "gps: delayed": "delay 2 0.001..60 s",
     "gps: intermittent": TURNS,
+    "battery-monitor: wrong": "gain 0.5 0..10",
+    "bus-monitor: wrong": "gain 0.5 0..10",
+    "battery: weak": "factor 4 1..100",
+    "panels: lost": "panel 1 0..32 whole",
     "strings: dead": "string 1 0..4 whole",
     "strings: wrong": "gain 0.5 0..10",
     **{
@@ -63,6 +67,7 @@ pwm: wrong,
 monitor: off, monitor: nack, monitor: garbage, monitor: brown-out, monitor: stuck, bus: off,
 bus: arbitration, bus: hang, camera: off, camera: black, camera: saturated, camera: blinded, camera: frozen,
 camera: torn, camera: garbage, camera: wrong, gps: off, gps: silent, gps: no-fix, gps: stuck, gps: garbage,
+battery-monitor: off, battery-monitor: stuck, bus-monitor: off, bus-monitor: stuck, battery: cell-lost,
 strings: off, strings: stuck, strings: garbage, planner: nan, planner: exception, planner: endless,
 planner: killed, vision: nan, vision: exception, vision: endless, vision: killed, process: killed,
 process: stopped, disk: full, disk: failing

@@ -18,6 +18,10 @@ from tests.support.flights import CONFIG, TEXT, demo_config
 
 DEVICES = {
     "imu",
+    "battery",
+    "battery-monitor",
+    "bus-monitor",
+    "panels",
     "magnetometer",
     "pwm",
     "monitor",
@@ -214,6 +218,7 @@ def checked(*texts: str, **changed: object) -> None:
         ("vision: nan", {"camera": None}, "`camera` section"),
         ("monitor: stuck", {"power_monitor": None}, "`power_monitor` section"),
         ("gps: silent", {}, "`gps` section"),
+        ("battery-monitor: off", {}, "`power` section"),
         ("strings: dead", {}, "`solar_strings` section"),
         ("wide: blinded", {}, "`wide_cameras` section"),
         ("imu: baud (rate=115200)", {}, "another rate"),
