@@ -134,11 +134,11 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
 
 def check_elements(request: SimulationRequest, config: Config) -> None:
     """Raise ConfigError if the two-line elements of a configuration do not fit its simulated orbit."""
-    from sim_hal.worlds.orbit import distance_from  # noqa: PLC0415 - loads SciPy
-
     section = request.section()
     if section.free_body is None or not isinstance(config, OrbitConfig) or config.elements is None:
         return
+    from sim_hal.worlds.orbit import distance_from  # noqa: PLC0415 - loads SciPy
+
     cure = "`knightcube elements --config FILE` makes elements of the simulated orbit"
     try:
         distance = distance_from(config.elements, section.free_body.orbit, section.utc)

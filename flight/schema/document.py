@@ -7,6 +7,7 @@ Aliases, duplicate keys, application tags, infinite numbers and NaN are rejected
 
 from __future__ import annotations
 
+import copy
 import difflib
 import importlib
 import math
@@ -15,7 +16,8 @@ import re
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -272,6 +274,12 @@ def _merged(base: Any, own: Any, dotted: str, lines: dict[str, int]) -> Any:
 
 def _read_single(text: str, name: str) -> Document:
     """Return the values of a YAML text without those of a file that it extends. Raises ConfigError."""
+    read = _read_once(text, name)
+    return replace(read, values=copy.deepcopy(read.values), lines=dict(read.lines))
+
+
+@lru_cache(maxsize=8)  # a command reads a text up to seven times, and PyYAML needs 30 ms for each
+def _read_once(text: str, name: str) -> Document:
     lines: dict[str, int] = {}
     try:
         loader = _Loader(text)
