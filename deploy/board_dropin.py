@@ -1,9 +1,10 @@
-"""Print the systemd drop-in that gives a service access to the devices and networks of a configuration.
+"""Makes the systemd drop-ins that give the services access to the devices and networks of a configuration.
 
-The script install.sh runs board_dropin.py [--safe | --link] CONFIG with the installed Python. By default the
-script prints the drop-in of knightcube.service, with --safe that of knightcube-safe.service, and with --link
-that of knightcube-link.service. If the configuration has no link, the script prints an
-empty text for --link. For an invalid configuration, the script prints one line and exits with status 2.
+The script install.sh runs board_dropin.py CONFIG FOLDER with the installed Python. The drop-in of
+knightcube.service is written to the file `flight` of the folder, that of knightcube-safe.service to `safe`,
+and that of knightcube-link.service to `link`. The file `link` is empty if the configuration has no link. The
+file `tracker` is made if the star tracker needs the default sky index. Without FOLDER, the script prints the
+drop-in of knightcube.service. For an invalid configuration, it prints one line and exits with status 2.
 """
 
 from __future__ import annotations
@@ -176,15 +177,21 @@ def check_single(path: Path) -> None:
 
 
 def main(words: list[str]) -> int:
-    """Print the drop-in for the configuration file in the arguments, and return the exit status."""
-    make = {"--safe": safe_dropin, "--link": link_dropin}.get(words[0], dropin)
+    """Make the drop-ins for the configuration file in the arguments, and return the exit status."""
+    path, folder = Path(words[0]), Path(words[1]) if words[1:] else None
     try:
-        path = Path(words[-1])
         check_single(path)
         config = load(path)
         with placing(read_text(path), str(path)):
             check_values(config)
-        sys.stdout.write(make(config))
+        if folder is None:
+            sys.stdout.write(dropin(config))
+        else:
+            for name, make in (("flight", dropin), ("safe", safe_dropin), ("link", link_dropin)):
+                (folder / name).write_text(make(config), encoding="utf-8")
+            tracker = config.camera.star_tracker if config.camera is not None else None
+            if tracker is not None and tracker.index is None:
+                (folder / "tracker").touch()
     except UsageError as error:
         sys.stderr.write(f"install: {error}\n")
         return 2

@@ -221,10 +221,8 @@ install_settings() {
     fi
     made=$(mktemp -d)
     trap 'rm -rf "$made"' EXIT
-    # These come first because they reject a wrong configuration.
-    "$python" "$deploy/board_dropin.py" "$flown" >"$made/flight" || exit 2
-    "$python" "$deploy/board_dropin.py" --safe "$flown" >"$made/safe" || exit 2
-    "$python" "$deploy/board_dropin.py" --link "$flown" >"$made/link" || exit 2
+    # This comes first because it rejects a wrong configuration.
+    "$python" "$deploy/board_dropin.py" "$flown" "$made" || exit 2
     place 644 "$flown" "$settings/flight.yaml"
     sum_of "$flown" >"$made/sum"
     place 644 "$made/sum" "$settings/flight.yaml.sha256"
@@ -238,6 +236,7 @@ install_settings() {
     else
         remove_link
     fi
+    [ -e "$made/tracker" ] || return 0
     wanted=$(XDG_CACHE_HOME="$cache" "$python" "$deploy/sky_index.py" --wanted "$flown")
     if [ -n "$wanted" ]; then
         run install -d "$cache" # systemd hands it to the service's user
