@@ -508,9 +508,11 @@ class CoilResponse:
         settings, gain, sigma = self._settings, float(self.gain[axis]), float(self.sigma[axis])
         judged = possible and abs(gain) <= float(self.largest[axis])
         sure = judged and sigma < settings.sure
-        wrong = is_reversed
         weak = alone and gain + _SIGMAS * sigma < _WEAK_GAIN and gain < settings.highest_feeble
         exact = judged and alone and is_steady and sigma < _EXACT
+        # The dipole of a coil that was corrected before may be several times the assumed one.
+        corrected = float(self.largest[axis]) > LARGEST_GAIN
+        wrong = is_reversed or (corrected and exact and gain + 3.0 * sigma < -LEAST_GAIN)
         findings = {
             Finding.REVERSED: wrong,
             Finding.FEEBLE: wrong or (sure and weak),

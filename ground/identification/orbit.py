@@ -27,7 +27,7 @@ from knightcube.astro.inertia import inertia_problem
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.errors import InputError
 from knightcube.gnc.estimation import free_filter as states
-from knightcube.gnc.estimation.rigid_body import BodyErrors, inertia_covariance, tensor
+from knightcube.gnc.estimation.rigid_body import BodyErrors, inertia_covariance, per_trace, tensor
 
 LEARNED = 0.5
 """Maximum ratio of estimated to configured standard deviation (rms) at which a quantity counts as learned."""
@@ -104,7 +104,7 @@ def learned_description(run: Run, config: OrbitConfig) -> LearnedDescription:
     scale = trace / float(of("inertia")[:3].sum())
     body, eye = slice(states.INERTIA.start, states.COILS.stop), np.eye(3).ravel()
     elements = inertia[(0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)]
-    rows = states.per_trace(elements / trace, eye)
+    rows = per_trace(elements / trace, eye)
     ratios = np.sqrt(np.maximum((rows @ prior[body, body] @ rows.T).diagonal(), 0.0))
     none = np.zeros(3)
     found = [
@@ -216,7 +216,7 @@ def _inertia_accuracy(found: LearnedDescription) -> tuple[float, float]:
     one, accuracy = found.quantities["inertia"], found.config.craft.accuracy
     inertia = tensor(one.value)
     trace = float(np.trace(inertia))
-    rows = states.per_trace(one.value / trace, np.zeros(9))[:6, :6]
+    rows = per_trace(one.value / trace, np.zeros(9))[:6, :6]
     best, least = (accuracy.moments, accuracy.axes_deg), math.inf
     for moments, axes_deg in itertools.product(_FRACTIONS, _FRACTIONS):
         tried = accuracy.moments * moments, accuracy.axes_deg * axes_deg

@@ -16,7 +16,7 @@ import numpy as np
 from flight.bodies.orbit.coarse_attitude import CoarseSunFeed, horizon_camera_feed
 from flight.bodies.orbit.control import FieldDetumblingLaw, PointingTracker, SunAcquisitionLaw, expected_field
 from flight.bodies.orbit.environment import LATEST_WITNESS_NS, EstimatedEnvironment, Witness
-from flight.bodies.orbit.filter import OrbitFeed, OrbitFilter, OrbitFilterSettings
+from flight.bodies.orbit.filter import OrbitFilter, OrbitFilterSettings
 from flight.bodies.orbit.guidance import (
     LearnedBody,
     ObjectAim,
@@ -38,6 +38,7 @@ from flight.loop.body import (
     BodyKind,
     ControlOutput,
     FlightBody,
+    ReadingAgreement,
     ReadingFeed,
     Target,
 )
@@ -50,7 +51,7 @@ from flight.schema.devices import SolarStringsSection, camera_model
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import CONTROL_RATE_HZ, Config
-from hal.interfaces.devices import GpsReading, StringReading
+from hal.interfaces.devices import GpsReading, ImuReading, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitState, TwoLineElements
@@ -66,7 +67,7 @@ from knightcube.gnc.estimation.error_state import Role
 from knightcube.gnc.estimation.estimate import RATE, Estimate, Knowledge
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from knightcube.gnc.estimation.free_filter import FreeFilterSettings
-from knightcube.gnc.estimation.measurements import MeanRateMeasurement
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.gnc.estimation.rigid_body import BodyErrors
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.tracker import Track
@@ -99,6 +100,7 @@ class OrbitView:
         self._facts = services.facts
         self._knowledge = Knowledge.LOST
         self._is_clock_doubted = False
+        self._contradictions = 0  # number of reported contradictions of learned states
         self._detumbler = detumbling.detumbler
         self._recorder = services.recorder
 
@@ -128,6 +130,9 @@ class OrbitView:
             text = f"{self._knowledge.value} -> {known.value}"
             self._events.report(events.ATTITUDE_KNOWLEDGE, now_ns, text)
             self._knowledge = known
+        for text in found.contradictions[self._contradictions :]:
+            self._events.report(events.LEARNED_REFUSED, now_ns, text)
+        self._contradictions = len(found.contradictions)
         if output.cycle.slot % DESCRIPTION_EVERY == 0 and estimate is not None:
             self._record_description(now_ns)
         if output.cycle.slot % NAVIGATION_EVERY:
@@ -187,6 +192,21 @@ class OrbitView:
         if rate is None:
             return mode.label
         return f"{mode.label} {math.degrees(float(np.linalg.norm(rate))):.2f} deg/s by the magnetometer"
+
+
+class OrbitFeed:
+    """Passes gyro and magnetometer readings to the filter; implements `ReadingFeed`."""
+
+    def __init__(self, filter_: OrbitFilter) -> None:
+        self._filter = filter_
+
+    def accept(self, reading: ImuReading) -> ReadingAgreement:
+        """Collect angular rate and magnetic field for the filter's next step."""
+        return ReadingAgreement(self._filter.accept(reading))
+
+    def begin(self, attitude: AttitudeMeasurement) -> bool:
+        """Start the filter from an attitude measured with stars, and return whether it started."""
+        return self._filter.begin(attitude)
 
 
 SUNLIT_SHARE = 0.5

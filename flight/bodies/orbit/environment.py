@@ -40,8 +40,8 @@ from knightcube.gnc.estimation.free_filter import FilterEnvironment
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
 """Time spans (s) after and before the requested time that the short prediction covers."""
-GATE = 5.0
-"""Largest accepted deviation of a GPS fix from the known orbit in standard deviations."""
+GATE, ELEMENTS_GATE = 5.0 * math.sqrt(3.0), 4.0
+"""Largest distances (sigma) of a GPS fix from earlier fixes and from the elements at which it is accepted."""
 LEAST_GATE, FIX_GATE = 5e3, 500.0
 """Deviations (m) of a GPS fix from the elements, and from earlier fixes, that are always accepted."""
 SPEED_GATE, ORBITAL_RATE = 20.0, 1.2e-3
@@ -170,8 +170,9 @@ def _agree(known: GpsFix | TwoLineElements, fix: GpsFix, least: float) -> bool:
         expected = known.at(fix.julian_date)
     except OrbitError:
         return isinstance(known, TwoLineElements)
-    sigma = GATE * math.sqrt(3.0) * math.hypot(expected.sigma, found.sigma)
-    speed = math.hypot(GATE * math.sqrt(3.0) * fix.velocity_sigma, ORBITAL_RATE * max(sigma, least))
+    gate = ELEMENTS_GATE if isinstance(known, TwoLineElements) else GATE
+    sigma = gate * math.hypot(expected.sigma, found.sigma)
+    speed = math.hypot(GATE * fix.velocity_sigma, ORBITAL_RATE * max(sigma, least))
     off, fast = found.position - expected.position, found.velocity - expected.velocity
     return bool(np.linalg.norm(off) <= max(least, sigma) and np.linalg.norm(fast) <= max(SPEED_GATE, speed))
 

@@ -20,7 +20,6 @@ import numpy as np
 
 from flight.bodies.orbit.environment import StuckFieldCheck
 from flight.bodies.orbit.steps import DipoleHistory, FilterStep, OpenStep, RateByField
-from flight.loop.body import ReadingAgreement
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_matrix, cross_product
@@ -28,6 +27,7 @@ from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotatio
 from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation import estimate as form
 from knightcube.gnc.estimation import free_filter as states
+from knightcube.gnc.estimation.error_state import PriorCheck
 from knightcube.gnc.estimation.estimate import FIELD_BIAS, Estimate, Knowledge, Parameters
 from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
 from knightcube.gnc.estimation.free_filter import (
@@ -44,6 +44,7 @@ from knightcube.gnc.estimation.measurements import (
     MeanRateMeasurement,
     Measurement,
 )
+from knightcube.gnc.estimation.rigid_body import by_matrix
 
 FORGOTTEN_NS = 10_000_000_000
 """Time (ns) without a contradicting gyro after which the commanded dipoles are trusted again."""
@@ -109,6 +110,7 @@ class StepReplay:
         contradicted: number of steps in a row, with current in the coils, whose gyro contradicts the motion;
             reset after `FORGOTTEN_NS`, because coils that are off give no evidence.
         refused_fields: number of magnetic fields in a row that contradict the estimate.
+        contradictions: texts about learned states that measurements have contradicted.
     """
 
     def __init__(self, settings: OrbitFilterSettings, dipoles: DipoleHistory) -> None:
@@ -117,9 +119,10 @@ class StepReplay:
         self._dipoles = dipoles
         self.free = FreeFilter(settings.inertia, settings.free, settings.slow)
         self.steps: deque[FilterStep] = deque()
-        self.refused_gyros = 0
-        self.refused_fields = 0
-        self.contradicted = 0
+        self.refused_gyros = self.refused_fields = self.contradicted = 0
+        self.contradictions: list[str] = []
+        self._checks = {name: PriorCheck() for name in states.LEARNED}
+        self._innovation = "body", 0.0  # what the newest gyro innovation can contradict, and its square
         self._refused_ns = 0
 
     def add(self, step: FilterStep) -> None:
@@ -129,6 +132,16 @@ class StepReplay:
             self.steps.popleft()
         if self.free.started:
             self.take_on(len(self.steps) - 1)
+            if step.samples and step.doubt < self._settings.dipole_limit:
+                self._check_learned(step.end_ns / SECOND_NS)
+
+    def _check_learned(self, time: float) -> None:
+        """Learn states again that the gyro contradicts consistently until a time (s)."""
+        name, square = self._innovation
+        if self._checks[name].add(time, square):
+            self.contradictions.append(f"the motion contradicts the learned {name}, which are learned again")
+            self.free.widen(states.LEARNED[name], self._memories, drop=True)
+            self.take_again(0)
 
     def follow_gyro(self) -> None:
         """Process the last two steps again with unknown dipoles if the gyro contradicts the dipoles.
@@ -172,18 +185,20 @@ class StepReplay:
         if coils.is_redundant:
             self.take_again(0)
             return
-        memories = [step.before for step in self.steps if step.before is not None]
-        inverse = coils.per_dipole(np.eye(len(change)))
+        memories, inverse = self._memories, coils.per_dipole(np.eye(len(change)))
         for coil in changed.tolist():
             direction = coils.dipoles[:, coil] / np.linalg.norm(coils.dipoles[:, coil])
             dual = inverse[coil] / float(inverse[coil] @ direction)
             self.free.renew_coil(direction, dual, float(deviations[coil]), memories)
         self.take_again(0)
 
+    @property
+    def _memories(self) -> list[FreeMemory]:
+        return [step.before for step in self.steps if step.before is not None]
+
     def renew_coils(self, covariance: FloatArray) -> None:
         """Reset the learned matrix of the coils to a covariance (9, 9), and process the steps again."""
-        memories = [step.before for step in self.steps if step.before is not None]
-        self.free.renew_coils(covariance, memories)
+        self.free.renew_coils(covariance, self._memories)
         self.take_again(0)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
@@ -310,6 +325,7 @@ class StepReplay:
             noise = settings.gyro_noise**2 / step.samples
             spread = settings.free.coil_error**2 * float(change @ change) + noise
             refused = not free.gyro(step.gyro, spread * _EYE, change, since)
+            self._innovation = "coils and body" if step.dipole.any() else "body", free.newest_square
         self.refused_gyros = self.refused_gyros + 1 if refused else 0
         if step.field is not None:
             ago = (step.end_ns - step.field_ns) / SECOND_NS
@@ -435,7 +451,7 @@ class EstimatePropagation:
         moved = np.zeros((6, len(_MOVING)))
         moved[0:3, 0:3], moved[0:3, 3:6] = attitude_matrix(rotation), seconds * _EYE
         moved[3:6, 3:6] = _EYE + seconds * motion.stiffness(middle)
-        by_coils = -seconds * (motion.inverse @ cross_matrix(field)) @ states.by_matrix(dipole)
+        by_coils = -seconds * (motion.inverse @ cross_matrix(field)) @ by_matrix(dipole)
         moved[0:3, 6:15], moved[3:6, 6:15] = half * by_coils, by_coils
         return rotation, after, moved, seconds * self._free.rate_noise(dipole, begun.around)
 
@@ -473,6 +489,7 @@ class OrbitFilter:
 
     Attributes:
         restarts: number of estimates that were discarded.
+        contradictions: texts about learned states that measurements have contradicted so far.
         field_at_rest: time (ns) and strength (T) of the newest magnetic field measured with the coils off.
     """
 
@@ -489,6 +506,7 @@ class OrbitFilter:
         # Dipoles are kept longer than the history, because its first step may begin earlier.
         self._dipoles = DipoleHistory(settings.history_ns + 2 * settings.step_ns)
         self._replay = StepReplay(settings, self._dipoles)
+        self.contradictions = self._replay.contradictions
         self._free, self._steps = self._replay.free, self._replay.steps
         self._propagated = EstimatePropagation(self._free)
         self._open: OpenStep | None = None
@@ -587,11 +605,6 @@ class OrbitFilter:
         seconds, dipole = (time_ns - newest.end_ns) / SECOND_NS, self._dipoles.mean(newest.end_ns, time_ns)
         camera = self._propagated.camera_covariance(seconds, dipole, newest.around)
         return {**self._free.description(), "camera_attitude_sigma": np.sqrt(camera.diagonal())}
-
-    @property
-    def magnet_bias(self) -> FloatArray:
-        """The magnetometer's bias (3,), T, body axes."""
-        return self._free.magnet_bias
 
     def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
         """Record the coil currents (n,), A, that flow from `time_ns` on.
@@ -783,18 +796,3 @@ class OrbitFilter:
         step = gathered.close(dipole, doubt, around, self.rate_by_field() or unknown)
         self._replay.add(step)
         self._replay.follow_gyro()
-
-
-class OrbitFeed:
-    """Passes gyro and magnetometer readings to the filter; implements `ReadingFeed`."""
-
-    def __init__(self, filter_: OrbitFilter) -> None:
-        self._filter = filter_
-
-    def accept(self, reading: ImuReading) -> ReadingAgreement:
-        """Collect angular rate and magnetic field for the filter's next step."""
-        return ReadingAgreement(self._filter.accept(reading))
-
-    def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Start the filter from an attitude measured with stars, and return whether it started."""
-        return self._filter.begin(attitude)

@@ -18,7 +18,7 @@ import numpy as np
 
 from flight.loop.state import Learned
 from knightcube.astro.arrays import IntArray
-from knightcube.gnc.estimation.error_state import ErrorState
+from knightcube.gnc.estimation.error_state import PLAUSIBLE, ErrorState, plausible
 from knightcube.gnc.estimation.free_filter import (
     CAMERA,
     COILS,
@@ -28,13 +28,11 @@ from knightcube.gnc.estimation.free_filter import (
     GYRO_MATRIX,
     INERTIA,
     MAGNET,
-    PLAUSIBLE,
     SLOW,
     SUNLIT,
     TORQUES,
     SlowStates,
     density_walk,
-    plausible,
 )
 
 ERRORS, SOURCES, BODY, LEARNED_AT = "attitude-errors", "attitude-torques", "body", "learned-at"

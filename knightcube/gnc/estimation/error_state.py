@@ -204,6 +204,51 @@ def joined(covariance: FloatArray, by_states: FloatArray, first: FloatArray) -> 
     return whole
 
 
+PLAUSIBLE = 4.0
+"""Largest plausible deviation of a learned state from its configured value, in standard deviations."""
+
+
+def plausible(values: FloatArray, variances: FloatArray) -> BoolArray:
+    """Return flags (k,): whether each learned state is plausible for its variance at the start."""
+    return np.asarray(np.abs(values) <= PLAUSIBLE * np.sqrt(variances))
+
+
+CONTRADICTED, PAUSE = 60.0, 600.0
+"""Time (s) over which innovations are judged, and time (s) after a contradiction in which none is judged."""
+_LARGEST, _MEAN, _LEAST = chi_square.bound(0.001, 3), 5.0, 40
+"""Largest counted square of an innovation, largest mean of consistent ones, and minimum number of them."""
+
+
+class PriorCheck:
+    """Detects that consistent measurements contradict learned states.
+
+    Learned states are contradicted if the normalised squares of the innovations in `CONTRADICTED` seconds
+    have a mean above 5 instead of 3. Each square counts at most as one that is exceeded once in a thousand,
+    so that a few outliers contradict nothing.
+    """
+
+    def __init__(self) -> None:
+        self._begun, self._least_time = 0.0, -math.inf
+        self._number, self._sum = 0, 0.0
+
+    def add(self, time: float, square: float) -> bool:
+        """Add the normalised square of an innovation with three components at a time (s).
+
+        Return whether the innovations contradict the learned states. A contradiction is followed by a pause.
+        """
+        if not time >= self._least_time or math.isnan(square):
+            return False
+        if not self._number:
+            self._begun = time
+        self._number, self._sum = self._number + 1, self._sum + min(square, _LARGEST)
+        if time - self._begun < CONTRADICTED or self._number < _LEAST:
+            return False
+        is_contradicted = self._sum > _MEAN * self._number
+        self._least_time = time + PAUSE if is_contradicted else time
+        self._number, self._sum = 0, 0.0
+        return is_contradicted
+
+
 def gate_bounds(sigma: float) -> dict[int, float]:
     """Return the largest accepted normalised square of an innovation with 1, 2 and 3 components.
 

@@ -36,12 +36,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, cross_matrix, cross_product, tangent_basis
+from knightcube.astro.arrays import (
+    FloatArray,
+    IntArray,
+    cross_matrix,
+    cross_product,
+    tangent_basis,
+)
 from knightcube.astro.earth.disturbance import AIR, SIZES, Pressures, box_areas, shapes
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.quaternion import (
@@ -58,6 +64,7 @@ from knightcube.gnc.estimation.error_state import (
     gate_bounds,
     joined,
     keep_scale,
+    plausible,
     propagated,
     reset,
     slices,
@@ -66,7 +73,14 @@ from knightcube.gnc.estimation.error_state import (
     with_role,
 )
 from knightcube.gnc.estimation.estimate import Knowledge
-from knightcube.gnc.estimation.rigid_body import BodyErrors, by_inertia, inertia_covariance, tensor
+from knightcube.gnc.estimation.rigid_body import (
+    BodyErrors,
+    by_inertia,
+    by_matrix,
+    inertia_covariance,
+    per_trace,
+    tensor,
+)
 
 BLOCKS = {
     "attitude": 3,
@@ -203,14 +217,6 @@ class FreeMotion:
         return np.asarray(-self.trace * self.inverse @ changed)
 
 
-def by_matrix(vector: FloatArray) -> FloatArray:
-    """Return the derivative (3, 9) of M v, for a vector v (3,), with respect to the rows of M (3, 3)."""
-    rows = np.zeros((3, 3, 3))
-    rows[_AXES, _AXES] = vector
-    return rows.reshape(3, 9)
-
-
-_AXES = np.arange(3)
 _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 """Rows and columns of the elements xx, yy, zz, yz, zx, xy of a tensor."""
 
@@ -224,8 +230,6 @@ CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
 constant torque is small, because the error of the inertia has its own states. At one attitude the torques
 cannot be distinguished, and a torque by air that is attributed to the constant torque is wrong at every other
 attitude."""
-PLAUSIBLE = 4.0
-"""Largest plausible deviation of a slow state, in standard deviations at the start."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -376,7 +380,7 @@ class FreeFilter:
         covariance: covariance (STATES, STATES) of the error state.
         field_error: standard deviation of the field model's error, T per axis.
         changes: number of changes of the estimate so far. refused: number of measurements that did not pass
-            the gate.
+            the gate. newest_square: normalised square of the newest innovation.
     """
 
     def __init__(
@@ -402,7 +406,7 @@ class FreeFilter:
         self._since = 0.0  # time (s) over which `_lag` and `_given` are integrated
         self.started = False
         self.refused = 0
-        self.changes = 0
+        self.changes, self.newest_square = 0, 0.0
         self.quaternion: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
         self.rate: FloatArray = np.zeros(3)
         self.covariance: FloatArray = self.layout.prior.copy()
@@ -430,9 +434,7 @@ class FreeFilter:
         """
         self.changes += 1
         if doubted:
-            slow, prior = self._constants[SLOW], self.layout.prior[SLOW, SLOW]
-            slow[~plausible(slow, prior.diagonal())] = 0.0
-            self.covariance[SLOW, SLOW] = prior
+            self.widen(np.arange(SLOW.start, SLOW.stop))
             self.field_error = max(self.field_error, self._settings.field)
             self._reset_field()
         # The first attitude and rate depend on misalignments, gyro bias and gyro matrix.
@@ -479,15 +481,8 @@ class FreeFilter:
     def memory(self) -> FreeMemory:
         """Return a copy of the estimate, for `recall`."""
         constants, covariance = self._constants.copy(), self.covariance.copy()
-        return FreeMemory(
-            self.quaternion,
-            self.rate,
-            self.acceleration,
-            self.driven,
-            constants,
-            covariance,
-            self.field_error,
-        )
+        rates = self.rate, self.acceleration
+        return FreeMemory(self.quaternion, *rates, self.driven, constants, covariance, self.field_error)
 
     def recall(self, then: FreeMemory) -> None:
         """Restore an earlier estimate from its copy `then`."""
@@ -528,10 +523,7 @@ class FreeFilter:
             error = error + least * np.outer(direction, direction)
         spread = np.kron(_EYE, dual[:, None])
         fresh = spread @ error @ spread.T
-        for constants, covariance in (
-            (self._constants, self.covariance),
-            *((memory.constants, memory.covariance) for memory in memories),
-        ):
+        for constants, covariance in self._with(memories):
             constants[COILS] = kept[COILS, COILS] @ constants[COILS]
             covariance[:] = kept @ covariance @ kept.T
             covariance[COILS, COILS] += fresh
@@ -544,12 +536,30 @@ class FreeFilter:
         """
         self.changes += 1
         estimated = self.layout.prior[COILS, COILS].any()
-        for constants, whole in (
-            (self._constants, self.covariance),
-            *((memory.constants, memory.covariance) for memory in memories),
-        ):
+        for constants, whole in self._with(memories):
             constants[COILS] = whole[COILS] = whole[:, COILS] = 0.0
             whole[COILS, COILS] = covariance if estimated else 0.0
+
+    def widen(self, at: IntArray, memories: Sequence[FreeMemory] = (), *, drop: bool = False) -> None:
+        """Reset the covariance of the slow states with the indices `at` (k,) to that of the settings.
+
+        The estimate and its copies `memories` are changed. The reset is necessary if measurements contradict
+        learned values. Implausible values are set to zero, and with `drop` also errors of inertia and coils.
+        """
+        self.changes += 1
+        prior = self.layout.prior[np.ix_(at, at)]
+        for constants, covariance in self._with(memories):
+            values = constants[at]
+            dropped = drop & (at >= INERTIA.start) & (at < COILS.stop)
+            constants[at] = np.where(plausible(values, prior.diagonal()) & ~dropped, values, 0.0)
+            covariance[at] = covariance[:, at] = 0.0
+            covariance[np.ix_(at, at)] = prior
+
+    def _with(self, memories: Sequence[FreeMemory]) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Yield the constants and the covariance of the estimate, and of each of its copies."""
+        yield self._constants, self.covariance
+        for memory in memories:
+            yield memory.constants, memory.covariance
 
     @property
     def gyro_bias(self) -> FloatArray:
@@ -848,6 +858,7 @@ class FreeFilter:
         The innovation has the Jacobian `rows` (k, STATES) and the noise covariance `noise` (k, k).
         """
         square, gain, cross, spread = weigh(self.covariance, value, rows, noise)
+        self.newest_square = square
         if not 0.0 <= square <= self._gates[len(value)]:  # a NaN does not pass
             self.refused += 1
             return False
@@ -863,26 +874,14 @@ class FreeFilter:
         return True
 
 
+BODY: IntArray = np.r_[DIPOLE, SUNLIT, TORQUES, INERTIA]
+LEARNED = {"body": BODY, "coils and body": np.r_[BODY, COILS]}
+"""Indices of the learned states that the motion without and with currents in the coils can contradict."""
 # Twice these states give the same motion, because inertia, dipoles and torques have a common scale.
 _SCALED: FloatArray = np.zeros(STATES)
-_SCALED[np.r_[DIPOLE, SUNLIT, TORQUES, INERTIA, COILS]] = 1.0
+_SCALED[LEARNED["coils and body"]] = 1.0
 _CAMERA_ROWS: FloatArray = np.zeros((3, STATES))
 _CAMERA_ROWS[:, ATTITUDE] = _CAMERA_ROWS[:, CAMERA] = _EYE
-
-
-def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
-    """Return the Jacobian (15, 15) of inertia and coils, each divided by the trace of the inertia.
-
-    The array `inertia` (6,) holds the elements xx, yy, zz, yz, zx and xy, relative to the trace of the
-    assumed inertia. The array `coils` (9,) holds the matrix of the coils row by row. The motion of a
-    satellite shows only the ratios of inertia and dipole, because a body with twice the inertia and twice the
-    dipole moves in the same way.
-    """
-    trace = inertia[:3].sum()
-    rows: FloatArray = np.eye(15) / trace
-    rows[:6, :3] -= inertia[:, None] / trace**2
-    rows[6:, :3] -= coils[:, None] / trace**2
-    return rows
 
 
 def density_walk(sizes: FloatArray) -> FloatArray:
@@ -893,8 +892,3 @@ def density_walk(sizes: FloatArray) -> FloatArray:
     walk = np.zeros((SIZES, SIZES))
     walk[AIR, AIR] = AIR_WALK**2 * np.outer(sizes[AIR], sizes[AIR])
     return walk
-
-
-def plausible(values: FloatArray, variances: FloatArray) -> BoolArray:
-    """Return flags (k,): whether each slow state is plausible for its variance at the start."""
-    return np.asarray(np.abs(values) <= PLAUSIBLE * np.sqrt(variances))

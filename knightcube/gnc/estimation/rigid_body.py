@@ -402,3 +402,28 @@ def _folded(quadratic: FloatArray) -> FloatArray:
     folded = quadratic[..., _FIRST, _SECOND] + quadratic[..., _SECOND, _FIRST]
     folded[..., :3] *= 0.5
     return np.asarray(folded)
+
+
+def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
+    """Return the Jacobian (15, 15) of inertia and coils, each divided by the trace of the inertia.
+
+    The array `inertia` (6,) holds the elements xx, yy, zz, yz, zx and xy, relative to the trace of the
+    assumed inertia. The array `coils` (9,) holds the matrix of the coils row by row. The motion of a
+    satellite shows only the ratios of inertia and dipole, because a body with twice the inertia and twice the
+    dipole moves in the same way.
+    """
+    trace = inertia[:3].sum()
+    rows: FloatArray = np.eye(15) / trace
+    rows[:6, :3] -= inertia[:, None] / trace**2
+    rows[6:, :3] -= coils[:, None] / trace**2
+    return rows
+
+
+def by_matrix(vector: FloatArray) -> FloatArray:
+    """Return the derivative (3, 9) of M v, for a vector v (3,), with respect to the rows of M (3, 3)."""
+    rows = np.zeros((3, 3, 3))
+    rows[_INDICES, _INDICES] = vector
+    return rows.reshape(3, 9)
+
+
+_INDICES = np.arange(3)

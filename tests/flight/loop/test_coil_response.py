@@ -278,12 +278,18 @@ def test_a_sign_changed_wrongly_in_a_tumble_is_changed_back() -> None:
     assert body.watch.correction.factors.tolist() == [1.0, 1.0, 1.0]
 
 
-@pytest.mark.parametrize("stored", [-1.0, 0.5])
-def test_the_motion_replaces_a_wrong_factor_of_an_earlier_boot_within_a_minute(stored: float) -> None:
-    body = Orbiting(np.ones(3), tumble_rate=0.01)
-    assert body.watch.restore(np.array([1.0, stored, 1.0]), np.array([0.0, 0.05, 0.0])) == ""
-    body.fly(40.0)
-    assert body.watch.correction.factors == pytest.approx(np.ones(3), abs=0.05)
+@pytest.mark.parametrize(
+    ("axis", "stored", "true"), [(1, -1, 1), (1, 0.5, 1), (1, -0.5, 1), (0, -0.3, 1), (2, 0.5, -1)]
+)
+def test_the_motion_replaces_a_wrong_factor_of_an_earlier_boot_within_a_minute(
+    axis: int, stored: float, true: float
+) -> None:
+    signs, factors, deviations = np.ones(3), np.ones(3), np.zeros(3)
+    signs[axis], factors[axis], deviations[axis] = true, stored, 0.05
+    body = Orbiting(signs, tumble_rate=0.01)
+    assert body.watch.restore(factors, deviations) == ""
+    body.fly(55.0)
+    assert body.watch.correction.factors == pytest.approx(signs, abs=0.05)
 
 
 @pytest.mark.parametrize("axis", range(3))

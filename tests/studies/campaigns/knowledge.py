@@ -3,7 +3,8 @@
 `aged-elements` gives the environment elements of up to 60 days, whose B* is wrong by up to 100 %, and a
 receiver that is good, silent or false. `calendar` flies a revolution in every month from 2026 to 2036, over
 the rollover of the GPS week in November 2038 and over a leap second, with fixes as the driver reads them from
-NAV-PVT, whose date is 1024 weeks early in every second case.
+NAV-PVT, whose date is 1024 weeks early in every second case. Each craft flies its own orbit, and its attitude
+filter follows its own body for `FOLLOWED` seconds, by its magnetometer alone after the first star attitudes.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
+from flight.bodies.orbit.body import description_errors, filter_settings
 from flight.bodies.orbit.environment import EstimatedEnvironment, Witness
 from flight.loop.navigation import GPS_DELAY_NS
 from flight.schema import reader as configuration
-from flight.schema.orbit import as_orbit
+from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from hal.drivers.ublox import (
     DATE_AND_TIME,
@@ -33,6 +35,7 @@ from hal.drivers.ublox import (
 from hal.interfaces.devices import GpsReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import Pressures
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import (
     ROTATION_RATE,
@@ -42,6 +45,14 @@ from knightcube.astro.earth.orientation import (
     terrestrial_time,
 )
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, sunlit_share
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from knightcube.gnc.estimation.free_filter import FilterEnvironment, FreeFilter, FreeMotion
 from sim_hal.clock import SimClock
 from sim_hal.worlds import magnetic_field
 from sim_hal.worlds.orbit import sun_position
@@ -54,6 +65,8 @@ SPAN, STEP, USED_WITHIN = 1200, 10, 600
 FALSE = ("jump", "shift", "radius", "velocity", "date", "field", "sun")
 KINDS = ("good", "good", "good", "good", "silent", "silent", *FALSE)
 DAYS_NS = 86_400 * SECOND_NS
+STAR_SIGMA = 5e-5
+"""rad, standard deviation of a star attitude about each axis."""
 FIELD_ERROR = 5.0e-8
 """T, error of the field model within its validity, per axis, as the filter assumes it."""
 
@@ -250,7 +263,16 @@ AGED_ELEMENTS = Campaign(
     200,
 )
 
-CRAFT = ("orbit.yaml", "orbit_3u.yaml")
+CRAFT = {
+    "orbit.yaml": None,
+    "orbit_3u.yaml": ((51.64, 0.0006, 130.5, 0.0), 15.50),
+}
+"""Configurations, and inclination, eccentricity, perigee and anomaly (deg) and daily revolutions of orbits.
+
+The KnightCube flies the orbit of its configuration, and the 3U that of the ISS.
+"""
+FOLLOWED, STARS_UNTIL = 600, 60
+"""Time (s) for which the attitude is followed, and time until which there are star attitudes."""
 ROLLOVER = "2038-11-20T23:15:00"
 """UTC three quarters of an hour before the ten-bit week of GPS begins again."""
 LEAP = "2035-06-30T23:15:00"
@@ -274,9 +296,9 @@ def fly_month(case: Case) -> Result:
     config = as_orbit(configuration.load(CONFIG.parent / given["craft"]))
     assert config.elements is not None
     second = config.elements[1]
-    angles = [float(second[8:16]), rng.uniform(0.0, 360.0), float(f"0.{second[26:33]}")]
-    angles += [float(second[34:42]), float(second[43:51])]
-    true = TwoLineElements(*lines(begin, 0.0, angles, float(second[52:63])))
+    own = (float(second[8:16]), float(f"0.{second[26:33]}"), float(second[34:42]), float(second[43:51]))
+    (inclination, *angles), motion = CRAFT[given["craft"]] or (own, float(second[52:63]))
+    true = TwoLineElements(*lines(begin, 0.0, [inclination, rng.uniform(0.0, 360.0), *angles], motion))
     receiver = Receiver(true, round(begin.timestamp()) * SECOND_NS, rng)
     known = EstimatedEnvironment(None, SimClock(receiver.begin_ns))
     for seconds in (0, 1, 2):
@@ -311,7 +333,77 @@ def fly_month(case: Case) -> Result:
         result["field_sigmas"] = max(result["field_sigmas"], float(np.abs(off).max()) / sigma)
         result["dark"] += share == 0.0
         wrong += share in (0.0, 1.0) and abs(found.sunlit - share) > 0.5
-    return {**given, **result, "eclipse_wrong": wrong, "used": used}
+    return {
+        **given,
+        **result,
+        "eclipse_wrong": wrong,
+        "used": used,
+        **_followed(config, receiver, rng),
+    }
+
+
+class _UnlikeBody:
+    """Body and sensors of a craft that differ from its configuration within the stated accuracies."""
+
+    def __init__(self, config: OrbitConfig, rng: np.random.Generator) -> None:
+        self._rng, self._unit = rng, config.inertial_unit
+        self._field_noise, errors = config.estimation.field_noise, description_errors(config)
+        inertia = config.craft.inertia_matrix()
+        self._motion = FreeMotion(inertia @ np.diag(1.0 + errors.moments * rng.uniform(-0.5, 0.5, 3)))
+        largest = [config.dipole_errors()[0], config.estimation.bias_start]
+        largest += [self._unit.accuracy.field_bias, errors.camera]
+        dipole, *self._off = np.array(largest)[:, None] * rng.uniform(-1.0, 1.0, (4, 3))
+        self._dipole = np.array(config.craft.residual_dipole) + dipole
+        quaternion = rng.standard_normal(4)
+        self.quaternion, self._rate = quaternion / np.linalg.norm(quaternion), rng.uniform(-2e-3, 2e-3, 3)
+
+    def turn(self, around: FilterEnvironment) -> None:
+        """Rotate for a second without currents in the coils."""
+        for _ in range(4):
+            torque = self._motion.torque(self.quaternion, np.zeros(3), self._dipole, np.zeros(9), around)[0]
+            change = 0.25 * self._motion.acceleration(self._rate, torque)
+            turned = from_rotation_vector(0.25 * (self._rate + 0.5 * change))
+            self.quaternion, self._rate = multiply(turned, self.quaternion), self._rate + change
+
+    def measured(self, around: FilterEnvironment) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the mean gyro rate of a second, the magnetic field, and the star camera's attitude."""
+        noise, (bias, magnet, camera) = self._rng.standard_normal((3, 3)), self._off
+        gyro = self._rate + bias + self._unit.rate_noise / math.sqrt(self._unit.rate_hz) * noise[0]
+        field = attitude_matrix(self.quaternion) @ around.field + magnet + self._field_noise * noise[1]
+        return gyro, field, multiply(from_rotation_vector(camera + STAR_SIGMA * noise[2]), self.quaternion)
+
+
+def _followed(config: OrbitConfig, receiver: Receiver, rng: np.random.Generator) -> Result:
+    """Return errors of the attitude of a craft; `attitude_sigmas` is the largest in units of its claim."""
+    body, unit = _UnlikeBody(config, rng), config.inertial_unit
+    free = FreeFilter(config.craft.inertia_matrix(), filter_settings(config))
+    known = EstimatedEnvironment(None, SimClock(receiver.begin_ns))
+    for second in (0, 1, 2):
+        known.fix(receiver.reading(second))
+    nothing, worst, end, eye = Pressures(np.zeros((1, 3)), np.zeros((1, 3))), 0.0, 0.0, np.eye(3)
+    for second in range(3, 3 + FOLLOWED):
+        if second % 60 == 0:
+            known.fix(receiver.reading(second))
+        around, date = known.at(second * SECOND_NS), receiver.date(second)
+        if around is None:
+            return {"attitude_sigmas": math.inf, "attitude_deg": 180.0}
+        position = receiver.true.at(date).position
+        here = FilterEnvironment(magnetic_field.field(date, position), position, nothing, around.sunlit)
+        body.turn(here)
+        gyro, field, stars = body.measured(here)
+        if not free.started:
+            free.start(stars, STAR_SIGMA**2 * eye, gyro, by_stars=True)
+            continue
+        free.advance(1.0, np.zeros(3), around)
+        free.gyro(gyro, unit.rate_noise**2 / unit.rate_hz * eye)
+        free.field(field, around.field, config.estimation.field_noise**2 * eye)
+        if second <= STARS_UNTIL and second % 10 == 0:
+            free.attitude(stars, STAR_SIGMA**2 * eye)
+        error = to_rotation_vector(multiply(free.quaternion, conjugate(body.quaternion)))
+        end = math.degrees(float(np.linalg.norm(error)))
+        if second % 60 == 0:
+            worst = max(worst, float(np.abs(error / np.sqrt(free.covariance.diagonal()[:3])).max()))
+    return {"attitude_sigmas": worst, "attitude_deg": end}
 
 
 def _angle_deg(one: FloatArray, other: FloatArray) -> float:
@@ -352,6 +444,9 @@ def _as_received(sound: GpsReading, given: Result) -> GpsReading:
     return replace(read, time_ns=sound.time_ns, arrival_ns=sound.time_ns)
 
 
+_LARGEST = ("worst", "sun_deg", "field_nt", "field_sigmas", "attitude_sigmas", "attitude_deg")
+
+
 def summarise_months(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each craft, the rollover and the leap second."""
     rows = {}
@@ -363,10 +458,7 @@ def summarise_months(results: Sequence[Result], _: Path) -> Summary:
             "revolutions": len(flown),
             "unknown": sum(result["unknown"] for result in flown),
             "fixes_refused": sum(94 - result["used"] for result in flown),
-            **{
-                name: max(result[name] for result in flown)
-                for name in ("worst", "sun_deg", "field_nt", "field_sigmas")
-            },
+            **{name: max(result[name] for result in flown) for name in _LARGEST},
             "dark": sum(result["dark"] for result in flown),
             "eclipse_wrong": sum(result["eclipse_wrong"] for result in flown),
         }

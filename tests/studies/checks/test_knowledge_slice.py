@@ -37,14 +37,25 @@ def test_claims_with_old_elements_are_honest_and_only_good_fixes_are_used(kind: 
     json.dumps(AGED_ELEMENTS.summarise([result], Path()).facts, allow_nan=False)
 
 
-@pytest.mark.parametrize("utc", ["2026-01-15", "2031-07-15", "2036-12-15", ROLLOVER, LEAP])
-def test_place_sun_field_and_shadow_are_known_throughout_the_mission(utc: str) -> None:
+@pytest.mark.parametrize(
+    ("craft", "utc"),
+    [
+        ("orbit", "2026-01-15"),
+        ("orbit_3u", "2031-07-15"),
+        ("orbit", "2036-12-15"),
+        ("orbit_3u", ROLLOVER),
+        ("orbit", LEAP),
+    ],
+)
+def test_place_sun_field_shadow_and_attitude_are_known_throughout_the_mission(craft: str, utc: str) -> None:
     """Two dates are followed by the rollover of the GPS week, and by a leap second."""
-    [case] = [case for case in months(132, 1) if case.key.startswith(f"orbit.yaml/{utc}")]
+    [case] = [case for case in months(132, 1) if case.key.startswith(f"{craft}.yaml/{utc}")]
     result = fly_month(case)
     assert (result["unknown"], result["eclipse_wrong"]) == (0, 0)
     assert result["worst"] <= HONEST
     assert result["field_sigmas"] <= HONEST
+    assert result["attitude_sigmas"] <= HONEST
+    assert result["attitude_deg"] < 5.0
     assert result["sun_deg"] < 0.05
     assert result["used"] == (94 if utc != LEAP else pytest.approx(87, abs=1))
     assert result["dark"] > 0

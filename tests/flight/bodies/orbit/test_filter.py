@@ -24,12 +24,14 @@ from knightcube.astro.quaternion import (
 from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Knowledge
 from knightcube.gnc.estimation.free_filter import (
+    COILS,
     GYRO,
     SLOW,
     FilterEnvironment,
     FreeFilterSettings,
     SlowStates,
 )
+from knightcube.gnc.estimation.free_filter import INERTIA as INERTIA_ERROR
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.gnc.estimation.rigid_body import BodyErrors
 
@@ -73,6 +75,7 @@ class Flown:
         self._pulses = pulses
         self.carries = 1.0  # the coils' dipole over the commanded one
         self.rests = False  # no dipole is commanded
+        self.alternates = False  # the dipole is about x and -z in turn
         self.field: FloatArray | None = None  # what the magnetometer repeats
         self.magnet: FloatArray = np.zeros(3)  # T, added to the field
         self.has_gyro = True
@@ -82,6 +85,8 @@ class Flown:
         for _ in range(round(seconds * SECOND_NS / PERIOD_NS)):
             acts = self._pulses and not self.rests and self.time_ns % SECOND_NS >= 200_000_000
             dipole = np.array([DIPOLE if acts else 0.0, 0.0, 0.0])
+            if self.alternates and self.time_ns // SECOND_NS % 10 >= 5:
+                dipole = -dipole[[2, 1, 0]]
             self.filter.command(self.time_ns, dipole)
             for _ in range(5):
                 shown = attitude_matrix(self.attitude) @ FIELD
@@ -225,6 +230,54 @@ def test_stars_replace_a_wrong_bias_of_an_earlier_boot_within_half_a_minute(wron
     found = flown.filter.at(flown.time_ns)
     assert found.bias == pytest.approx(BIAS, abs=1e-4)
     assert flown.error() < 1e-3
+
+
+ACCURACY = BodyErrors(moments=0.1, axes=0.05, coil_gain=0.2, coil_axes=0.05)
+
+
+def _taught(stored: dict[int, tuple[float, float]]) -> SlowStates:
+    """Return the states of an earlier boot: value and standard deviation of some elements, by index."""
+    covariance = FreeFilterSettings(errors=ACCURACY).error_state(INERTIA).prior[SLOW, SLOW].copy()
+    values = np.zeros(len(covariance))
+    for index, (value, sigma) in stored.items():
+        at = index - SLOW.start
+        covariance[at] = covariance[:, at] = 0.0
+        values[at], covariance[at, at] = value, sigma**2
+    return SlowStates(values, covariance)
+
+
+# Elements of the inertia, relative to the trace, that are 10 or 15 % of a moment off.
+WRONG_INERTIA = {INERTIA_ERROR.start: (0.052, 1e-4), INERTIA_ERROR.start + 1: (-0.034, 1e-4)}
+KNOWN_COILS = {index: (0.0, 5e-3) for index in range(COILS.start, COILS.stop)}
+
+
+@pytest.mark.parametrize(
+    ("stored", "spin", "wrong"),
+    [
+        (WRONG_INERTIA, 20.0 * SPIN, True),
+        (KNOWN_COILS | {COILS.start: (-0.4, 5e-3)}, 20.0 * SPIN, True),
+        (KNOWN_COILS | {COILS.stop - 1: (0.3, 5e-3)}, 20.0 * SPIN, True),
+        (KNOWN_COILS | {index: (0.0, 1e-4) for index in WRONG_INERTIA}, 20.0 * SPIN, False),
+    ],
+)
+def test_the_motion_replaces_wrong_learned_values_after_a_minute_and_healthy_ones_never(
+    stored: dict[int, tuple[float, float]], spin: FloatArray, wrong: bool
+) -> None:
+    flown = Flown(pulses=True, errors=ACCURACY, slow=_taught(stored))
+    flown.rate, flown.alternates = spin, True
+    flown.fly(3.0)
+    assert flown.filter.begin(flown.stars(flown.time_ns - 24 * PERIOD_NS))
+    for _ in range(15):
+        flown.fly(5.0)
+        flown.see(52 * PERIOD_NS)
+    assert len(flown.filter.contradictions) == wrong
+    slow = flown.filter.slow
+    for index, (_, sigma) in stored.items():
+        at = index - SLOW.start
+        claimed = float(np.sqrt(slow.covariance[at, at]))
+        assert abs(slow.values[at]) < 4.0 * claimed
+        assert (claimed > 2.0 * sigma) is wrong
+    assert flown.error() < 4.0 * flown.filter.worst_sigma
 
 
 def test_attitudes_that_are_not_finite_never_restart_the_filter() -> None:

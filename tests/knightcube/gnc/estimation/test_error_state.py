@@ -8,7 +8,9 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
 from knightcube.gnc.estimation.error_state import (
+    CONTRADICTED,
     ErrorState,
+    PriorCheck,
     Role,
     StateBlock,
     gate_bounds,
@@ -106,3 +108,22 @@ def test_the_first_attitude_and_rate_have_the_errors_of_the_states_on_which_they
 def test_the_gate_of_one_component_is_the_square_of_its_standard_deviations() -> None:
     assert gate_bounds(5.0)[1] == pytest.approx(25.0)
     assert gate_bounds(5.0)[1] < gate_bounds(5.0)[2] < gate_bounds(5.0)[3]
+
+
+@pytest.mark.parametrize(("variance", "found"), [(1.0, False), (1.2, False), (2.2, True), (30.0, True)])
+def test_learned_states_are_contradicted_by_consistent_innovations_and_not_by_outliers(
+    variance: float, found: bool
+) -> None:
+    check, squares = PriorCheck(), variance * np.random.default_rng(3).chisquare(3, 600)
+    squares[10:13], squares[20] = 1e6, np.nan
+    times = [time for time, square in enumerate(squares) if check.add(time, square)]
+    assert bool(times) is found
+    if found:
+        assert CONTRADICTED <= times[0] <= CONTRADICTED + 2
+        assert len(times) == 1, "a pause follows"
+
+
+def test_few_innovations_contradict_nothing() -> None:
+    check = PriorCheck()
+    assert not any(check.add(10.0 * number, 100.0) for number in range(39))
+    assert check.add(390.0, 100.0)

@@ -27,9 +27,9 @@ from knightcube.gnc.estimation.free_filter import (
     FilterEnvironment,
     FreeFilter,
     FreeFilterSettings,
-    per_trace,
 )
 from knightcube.gnc.estimation.free_filter import INERTIA as INERTIA_ERROR
+from knightcube.gnc.estimation.rigid_body import per_trace
 from tests.knightcube.gnc.estimation.filter_states import NO_ERRORS
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])

@@ -17,12 +17,11 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.gnc.estimation.error_state import Role
+from knightcube.gnc.estimation.error_state import PLAUSIBLE, Role
 from knightcube.gnc.estimation.free_filter import (
     AIR_WALK,
     ATTITUDE,
     GYRO,
-    PLAUSIBLE,
     RATE,
     SLOW,
     TORQUES,
