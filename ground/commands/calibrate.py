@@ -18,13 +18,12 @@ from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import SHAPE_TERMS
 from knightcube.vision.lens_calibration import (
     MIN_STARS,
-    PARAMETERS,
     CalibrationImage,
     DeterminedLens,
     OmittedTerm,
     calibrate_lens,
-    parameters_of,
 )
+from knightcube.vision.lens_knowledge import PARAMETERS, parameters_of
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

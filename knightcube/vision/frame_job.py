@@ -27,6 +27,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.images import KeptFrames, keep_frame
 from knightcube.vision.camera.lens import CameraModel, Pinhole
+from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import FrameKind, Survey, measure_areas, survey
 from knightcube.vision.startracker.index import sky_index
@@ -45,6 +46,7 @@ from knightcube.vision.startracker.solve import (
     solve_points,
 )
 from knightcube.vision.startracker.verification import PRIOR_SIGMAS
+from knightcube.vision.streaks.geometry import streak_pinhole
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
@@ -119,6 +121,8 @@ class FrameJob:
         motion_first: whether the motion is always estimated, instead of only if a survey shows streaks.
         objects: settings of the measurement of objects. If `objects` is None, objects are not measured.
         kept: folder in which the frame is kept on disk; None: it is not kept.
+        lens: knowledge of the lens from earlier frames, with which the frame is solved, and the time since
+            the last frame, s. If `lens` is None, the lens is not learned.
     """
 
     pixels: Image
@@ -132,6 +136,21 @@ class FrameJob:
     motion_first: bool = True
     objects: ObjectMeasurementSettings | None = None
     kept: KeptFrames | None = None
+    lens: tuple[LensKnowledge, float] | None = None
+
+    def with_lens(self) -> FrameJob:
+        """Return the job with the learned lens, if it is usable, instead of the configured lens."""
+        if self.lens is None or not self.lens[0].usable:
+            return self
+        known, estimator, tracker = self.lens[0], self.estimator, self.tracker
+        accuracy, line_time, psf_sigma = known.accuracy, known.shutter[0], known.psf_sigma
+        if isinstance(estimator, LikelihoodSettings):
+            estimator = replace(estimator, line_time=line_time, psf_sigma=psf_sigma, knowledge=accuracy)
+        if tracker is not None:
+            detection = replace(tracker.solve.detection, psf_sigma=psf_sigma)
+            solve = replace(tracker.solve, detection=detection, lens=accuracy)
+            tracker = replace(tracker, solve=solve, scale=(1.0, 1.0))
+        return replace(self, camera=known.camera, estimator=estimator, tracker=tracker)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,11 +162,13 @@ class FrameFound:
         solution: attitude at mid-exposure, or None if stars were not identified.
         objects: points that may be space objects instead of stars, or None if they were not measured or the
             attitude is unknown.
+        lens: knowledge of the lens after the frame, or None if the lens is not learned.
     """
 
     motion: FrameMotion
     solution: FrameSolution | None
     objects: MeasuredObjects | None = None
+    lens: LensKnowledge | None = None
 
 
 def run(job: FrameJob) -> FrameFound:
@@ -157,7 +178,7 @@ def run(job: FrameJob) -> FrameFound:
         found = FrameFound(_motion(job), None)
     else:
         sky = default_index() if tracker.index is None else sky_index.load_once(tracker.index)
-        found = attitude_and_rate(job, tracker, sky)
+        found = run_with_lens(job, tracker, sky)
         if job.objects is not None and found.solution is not None:
             from knightcube.vision.objects.measure import measure_objects  # noqa: PLC0415 - needs scipy
 
@@ -169,6 +190,26 @@ def run(job: FrameJob) -> FrameFound:
     if job.kept is not None:
         keep_frame(job.kept, job.pixels, _facts(job, found))
     return found
+
+
+def run_with_lens(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
+    """Return attitude and rate from a frame with the learned lens, and the lens after the frame.
+
+    If the frame contradicts the learned lens, the frame is solved again with the configured lens.
+    """
+    through = job.with_lens()
+    found = attitude_and_rate(through, through.tracker or tracker, sky)
+    if job.lens is None:
+        return found
+    before, elapsed = job.lens
+    if found.solution is None:
+        return replace(found, lens=before)
+    lens = before.update(found.solution, sky, tracker.solve.velocity, elapsed)
+    if lens.contradictions > before.contradictions:
+        found = attitude_and_rate(job, tracker, sky)
+        if found.solution is not None:
+            lens = lens.update(found.solution, sky, tracker.solve.velocity)
+    return replace(found, lens=lens)
 
 
 def _facts(job: FrameJob, found: FrameFound) -> dict[str, Any]:
@@ -211,6 +252,28 @@ def solve_frame(
 ) -> FrameSolution:
     """Return the attitude from an image (rows, columns), and the rate if the image shows streaks.
 
+    The arguments are those of `found_in_image`.
+    """
+    found = found_in_image(
+        pixels, camera, scale, exposure, sky, settings, attitude_prior, rate_prior
+    ).solution
+    assert found is not None  # the tracker is given
+    return found
+
+
+def found_in_image(
+    pixels: Image,
+    camera: CameraModel,
+    scale: tuple[float, float],
+    exposure: float,
+    sky: SkyIndex,
+    settings: SolveSettings,
+    attitude_prior: AttitudePrior | None = None,
+    rate_prior: RatePrior | None = None,
+    lens: LensKnowledge | None = None,
+) -> FrameFound:
+    """Return the solution of an image (rows, columns), and the knowledge of the lens after it.
+
     Args:
         pixels: counts of the image (rows, columns).
         camera: assumed camera, of the size of the image.
@@ -222,6 +285,7 @@ def solve_frame(
         attitude_prior: predicted attitude. Stars are first searched near their predicted positions.
         rate_prior: predicted rate. The predicted rate determines the sign of the rotation, which a single
             frame does not show.
+        lens: knowledge of the lens from earlier images of the camera; None: the lens is not learned.
     """
     tracker = TrackerSettings(settings, scale)
     # The attitude needs only the positions of the stars, so a poorly determined rate is accepted as well.
@@ -229,9 +293,7 @@ def solve_frame(
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
     )
-    found = attitude_and_rate(job, tracker, sky).solution
-    assert found is not None  # the tracker is given
-    return found
+    return run_with_lens(job if lens is None else replace(job, lens=(lens, 0.0)), tracker, sky)
 
 
 def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
@@ -313,6 +375,7 @@ def _motion(job: FrameJob) -> FrameMotion:
     rate, sigma = (prior.rate, prior.sigma) if prior is not None else (None, math.inf)
     lens, estimator, previous = job.camera.ideal, job.estimator, job.previous_checksum
     if isinstance(estimator, LikelihoodSettings):
+        lens = streak_pinhole(job.camera, estimator.knowledge)
         course = prior.course if prior is not None else None
         return estimate_motion(job.pixels, lens, job.exposure, estimator, rate, sigma, previous, course)
     return estimator.motion(job.pixels, lens, job.exposure, rate, sigma, previous)

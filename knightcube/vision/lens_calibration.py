@@ -24,17 +24,29 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.attitude.solvers import solve
 from knightcube.astro.attitude.wahba import AttitudeError
-from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from knightcube.errors import FlightError, UsageError
+from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import SHAPE_TERMS, CameraModel, Lens, LensError
 from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.lens_knowledge import (
+    NONE,
+    PARAMETERS,
+    CalibrationError,
+    FitStep,
+    LensFit,
+    MatchedFrame,
+    accepted_matches,
+    cauchy_weights,
+    matched_frame,
+    parameters_of,
+    residual_lengths,
+    residuals,
+    step,
+)
 from knightcube.vision.star_tracker import camera_of_field
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import FrameSolution, SolveSettings
 
-PARAMETERS = ("focal_length", "centre_x", "centre_y", "k1", "k2", *SHAPE_TERMS)
 MIN_STARS = 24
 """Minimum number of accepted matches of stars: three per parameter of the lens and of one attitude."""
 _ROBUST_STEPS = 20
@@ -44,26 +56,12 @@ _CONVERGED = 1e-6
 """Predicted decrease of chi-square at which the fit is converged."""
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 """Rounding error of a position, relative to the size of a frame."""
-_CUT = 5.0
-"""Residual, in standard deviations, above which the match of a star is rejected."""
-_CAUCHY = 2.385
-"""Tuning constant of the Cauchy weights, for 95 % efficiency without outliers."""
-_MEDIAN_LENGTH = np.sqrt(2.0 * np.log(2.0))
-"""Median length of a residual of unit variance per axis (Rayleigh distribution)."""
 _DETERMINED = 0.5
 """Ratio of posterior to prior standard deviation below which a lens parameter counts as determined."""
 _MAX_EXCESS = 3.0
 """Excess of chi-square, in its standard deviations, above which star position errors count as too small."""
-_MIN_SPREAD = 1e-12
-"""Minimum eigenvalue of the information matrix of a frame's attitude, relative to its trace."""
-_MIN_INDEPENDENCE = 1e-10
-"""Minimum eigenvalue of the information matrix of the lens, normalised to a unit diagonal."""
-_MIN_COSINE = 0.05
-"""Minimum cosine of the angle between a star in the image and the optical axis."""
 _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
 """Prior standard deviations that fix omitted lens terms (px for the centre), in the order of omission."""
-NONE = 1e-7
-"""Prior standard deviation of a lens term that is held at zero."""
 _USUAL_SHAPE = 0.02
 """Prior standard deviation of aspect, of shear, and of the tangential displacement of an image corner."""
 _SHOWN = 18.4
@@ -73,8 +71,6 @@ _ROUNDS = 3
 
 With a better lens model, more stars in the image corners match.
 """
-_MIN_SIGMA_PX = 0.02
-"""Minimum standard deviation (px) of a star position, for errors that the covariance does not include."""
 _FIRST_SETTINGS = SolveSettings()
 """Settings of the star tracker in the first pass, which recognises mirrored images."""
 _SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
@@ -82,179 +78,6 @@ _SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
 _REVERSED = "it shows the mirrored sky, but the other pictures do not"
 _MIN_USED = 0.5
 """Minimum fraction of accepted star matches for a frame to be included in the fit of the common lens."""
-
-
-class CalibrationError(FlightError):
-    """Error raised for frames that do not determine a lens."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MatchedFrame:
-    """The n stars identified in one frame, a few of them possibly wrong.
-
-    Attributes:
-        points: measured star positions (n, 2), px.
-        sigma: standard deviations (n,) of the star positions along one axis, px.
-        directions: unit vectors (n, 3) to the stars in any reference frame.
-    """
-
-    points: FloatArray
-    sigma: FloatArray
-    directions: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LensFit:
-    """Lens parameters (9,) and attitudes (m, 4) of the frames, from reference axes to camera axes."""
-
-    parameters: FloatArray
-    attitudes: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FitStep:
-    """Result of one Gauss-Newton step of the calibration.
-
-    Attributes:
-        fit: lens parameters and attitudes after the step.
-        decrease: decrease of chi-square that the linear model predicts.
-        information: information matrix (9, 9) of the lens parameters from the stars, after elimination of the
-            attitudes.
-    """
-
-    fit: LensFit
-    decrease: float
-    information: FloatArray
-
-
-def parameters_of(lens: Lens) -> FloatArray:
-    """Return the parameters (9,) of a lens in the order of PARAMETERS."""
-    shape = [getattr(lens, name) for name in SHAPE_TERMS]
-    return np.array([lens.focal_length, *lens.centre, lens.k1, lens.k2, *shape])
-
-
-def residuals(frame: MatchedFrame, fit: LensFit, number: int) -> FloatArray:
-    """Return measured minus predicted positions (n, 2) of frame `number`, in standard deviations.
-
-    The residual of a star beside or behind the camera is infinite.
-    """
-    focal_length, x, y, k1, k2 = fit.parameters[:5]
-    in_camera = frame.directions @ attitude_matrix(fit.attitudes[number]).T
-    ahead = in_camera[:, 2:] > _MIN_COSINE
-    tangent = in_camera[:, :2] / np.where(ahead, in_camera[:, 2:], 1.0)
-    square = np.sum(tangent**2, axis=1, keepdims=True)
-    distorted = tangent * (1.0 + square * (k1 + square * k2))
-    distorted = distorted + _tangential_slopes(tangent) @ fit.parameters[7:]
-    predicted = focal_length * distorted @ _pixels(fit) + np.array([x, y])
-    return np.where(ahead, (frame.points - predicted) / frame.sigma[:, None], np.inf)
-
-
-def _pixels(fit: LensFit) -> FloatArray:
-    """Return the symmetric matrix (2, 2) of aspect and shear by which distorted tangents are multiplied."""
-    aspect, shear = fit.parameters[5:7]
-    return np.array([[1.0 + aspect, shear], [shear, 1.0 - aspect]])
-
-
-def _tangential_slopes(tangent: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 2, 2) of distorted tangents by the coefficients p1 and p2."""
-    x, y = tangent.T
-    cross, square = 2.0 * x * y, x * x + y * y
-    return np.stack([np.stack([cross, square + 2.0 * y * y]), np.stack([square + 2.0 * x * x, cross])]).T
-
-
-def step(
-    frames: Sequence[MatchedFrame],
-    fit: LensFit,
-    weights: Sequence[FloatArray],
-    prior: FloatArray,
-    expected: FloatArray,
-) -> FitStep:
-    """Return lens and attitudes after one Gauss-Newton step.
-
-    Args:
-        frames: the frames.
-        fit: lens parameters and attitudes before the step.
-        weights: weights (n,) of the squared residuals of the stars, for each frame.
-        prior: prior information (9,) on each lens parameter, as inverse variances.
-        expected: prior means (9,) of the lens parameters.
-
-    Raises CalibrationError if a frame does not determine its attitude, or if the data do not determine the
-    lens.
-    """
-    information, gradient = np.zeros((len(PARAMETERS), len(PARAMETERS))), np.zeros(len(PARAMETERS))
-    turns, decrease = [], 0.0
-    for number, frame in enumerate(frames):
-        lens, turn, misfit = _linearised(frame, fit, number, weights[number])
-        own = turn.T @ turn
-        if np.linalg.eigvalsh(own)[0] <= _MIN_SPREAD * np.trace(own):
-            raise CalibrationError(f"frame {number}: its matches do not determine its attitude")
-        inverse = np.linalg.inv(own)
-        free, coupling = inverse @ (turn.T @ misfit), inverse @ (turn.T @ lens)
-        turns.append((free, coupling))
-        decrease += float(free @ (turn.T @ misfit))
-        beyond = lens - turn @ coupling  # effect of the lens parameters that no rotation can compensate
-        information += beyond.T @ beyond
-        gradient += beyond.T @ misfit
-    gradient += prior * (expected - fit.parameters)
-    total = information + np.diag(prior)
-    size = np.sqrt(np.diag(total))
-    if not np.all(size > 0.0):
-        raise CalibrationError("a parameter of the lens has no information: give a prior")
-    scaled = total / np.outer(size, size)
-    if not np.linalg.eigvalsh(scaled)[0] > _MIN_INDEPENDENCE:
-        raise CalibrationError("the matches do not separate the lens's parameters: give a prior")
-    change = np.asarray(np.linalg.solve(scaled, gradient / size) / size)
-    attitudes = [
-        normalise(multiply(from_rotation_vector(free - coupling @ change), attitude))
-        for (free, coupling), attitude in zip(turns, fit.attitudes, strict=True)
-    ]
-    moved = LensFit(fit.parameters + change, np.array(attitudes))
-    return FitStep(moved, decrease + float(gradient @ change), information)
-
-
-def _linearised(
-    frame: MatchedFrame, fit: LensFit, number: int, weight: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return weighted derivatives by lens parameters (2n, 9) and rotation (2n, 3), and residuals (2n,).
-
-    The lens is that of `Lens`. A small rotation moves a direction v by v x rotation.
-    """
-    misfit = residuals(frame, fit, number)
-    usable = (weight > 0.0) & np.isfinite(misfit[:, 0])
-    focal_length, _, _, k1, k2, _, _, p1, p2 = fit.parameters
-    v = frame.directions[usable] @ attitude_matrix(fit.attitudes[number]).T
-    u = v[:, :2] / v[:, 2:]
-    square = np.sum(u**2, axis=1)
-    stretch, slope = 1.0 + square * (k1 + square * k2), k1 + 2.0 * square * k2
-    lens = np.zeros((len(u), 2, len(PARAMETERS)))
-    x, y = u.T
-    tangential = _tangential_slopes(u)
-    distorted, pixels = u * stretch[:, None] + tangential @ np.array([p1, p2]), focal_length * _pixels(fit)
-    lens[:, :, 0] = distorted @ pixels / focal_length
-    lens[:, 0, 1] = lens[:, 1, 2] = 1.0
-    lens[:, :, 3] = u * square[:, None] @ pixels
-    lens[:, :, 4] = lens[:, :, 3] * square[:, None]
-    lens[:, :, 5] = focal_length * distorted * np.array([1.0, -1.0])
-    lens[:, :, 6] = focal_length * distorted[:, ::-1]
-    lens[:, :, 7:] = pixels @ tangential
-    bend = 2.0 * np.array(
-        [[p1 * y + 3.0 * p2 * x, p1 * x + p2 * y], [p1 * x + p2 * y, 3.0 * p1 * y + p2 * x]]
-    )
-    by_tangent = pixels @ (
-        stretch[:, None, None] * np.eye(2)
-        + 2.0 * slope[:, None, None] * u[:, :, None] * u[:, None, :]
-        + bend.transpose(2, 0, 1)
-    )
-    one = np.ones_like(x)
-    by_turn = np.array([[x * y, -one - x * x, y], [one + y * y, -x * y, -x]])
-    turn = np.einsum("nij,jkn->nik", by_tangent, by_turn)
-    scale = np.sqrt(weight[usable])
-    over = (scale / frame.sigma[usable])[:, None, None]
-    return (
-        (lens * over).reshape(-1, len(PARAMETERS)),
-        (turn * over).reshape(-1, 3),
-        (misfit[usable] * scale[:, None]).ravel(),
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,12 +177,12 @@ def calibrate(
     attitudes = np.array([_attitude(frame, begun, number) for number, frame in enumerate(frames)])
     fit = LensFit(parameters_of(begun), attitudes)
     for _ in range(_ROBUST_STEPS):
-        fit = step(frames, fit, _cauchy_weights(_lengths(frames, fit)), information, expected).fit
-    used = _accepted(_lengths(frames, fit))
+        fit = step(frames, fit, cauchy_weights(residual_lengths(frames, fit)), information, expected).fit
+    used = accepted_matches(residual_lengths(frames, fit))
     for _ in range(_MAX_SELECTIONS):
         last = _converged(frames, fit, used, information, expected)
         fit, before = last.fit, used
-        used = _accepted(_lengths(frames, fit))
+        used = accepted_matches(residual_lengths(frames, fit))
         if all(np.array_equal(a, b) for a, b in zip(before, used, strict=True)):
             return _result(frames, begun, last, used, information, expected)
     raise CalibrationError(
@@ -389,38 +212,12 @@ def _attitude(frame: MatchedFrame, lens: Lens, number: int) -> FloatArray:
         for _ in range(_ROBUST_STEPS):
             quaternion = solve(in_camera, frame.directions, sigma / np.sqrt(weight)).quaternion
             fit = LensFit(parameters_of(lens), quaternion[None])
-            (weight,) = _cauchy_weights(_lengths([frame], fit))
+            (weight,) = cauchy_weights(residual_lengths([frame], fit))
             # Weights stay positive, so that matches rejected with a poor initial attitude can recover.
             weight = np.maximum(weight, 1e-6)
     except AttitudeError as error:
         raise CalibrationError(f"frame {number}: {error}") from error
     return quaternion
-
-
-def _lengths(frames: Sequence[MatchedFrame], fit: LensFit) -> list[FloatArray]:
-    """Return the lengths (n,) of the residuals of each frame, in standard deviations."""
-    return [np.linalg.norm(residuals(frame, fit, number), axis=1) for number, frame in enumerate(frames)]
-
-
-def _spread(lengths: Sequence[FloatArray]) -> float:
-    """Return the standard deviation per axis of the residuals, estimated from their median.
-
-    It is at least one. Raises CalibrationError if half of the stars are behind the camera.
-    """
-    median = float(np.median(np.concatenate(lengths)))
-    if not median < np.inf:
-        raise CalibrationError("half of the matched stars are behind the camera: too many matches are wrong")
-    return max(1.0, median / float(_MEDIAN_LENGTH))
-
-
-def _cauchy_weights(lengths: Sequence[FloatArray]) -> list[FloatArray]:
-    scale = _CAUCHY * _spread(lengths)
-    return [1.0 / (1.0 + (length / scale) ** 2) for length in lengths]
-
-
-def _accepted(lengths: Sequence[FloatArray]) -> tuple[BoolArray, ...]:
-    cut = _CUT * _spread(lengths)
-    return tuple(length <= cut for length in lengths)
 
 
 def _converged(
@@ -461,7 +258,9 @@ def _result(
     except LensError as error:
         raise CalibrationError(f"the fitted parameters are not those of a lens: {error}") from error
     offset = last.fit.parameters - expected
-    squares = [length[chosen] ** 2 for length, chosen in zip(_lengths(frames, last.fit), used, strict=True)]
+    squares = [
+        length[chosen] ** 2 for length, chosen in zip(residual_lengths(frames, last.fit), used, strict=True)
+    ]
     chi_square = float(np.sum(np.concatenate(squares)) + np.sum(prior * offset**2))
     count = sum(map(len, squares))
     degrees = 2 * count + int(np.count_nonzero(prior)) - len(PARAMETERS) - 3 * len(frames)
@@ -744,7 +543,7 @@ def calibrate_lens(
         sigmas = focal_lengths * np.array([solution.scale_sigma for solution in solutions])
         median = int(np.argsort(focal_lengths)[len(solved) // 2])
         initial = solutions[median].camera if lens is None else model
-        matches = [_matches(solution, sky) for solution in solutions]
+        matches = [matched_frame(solution, sky) for solution in solutions]
         lens, excluded = calibrate_one_lens(matches, initial, focal_lengths, sigmas)
         for number, reason in excluded.items():
             outcomes[solved[number]] = replace(outcomes[solved[number]], excluded=reason)
@@ -772,11 +571,3 @@ def _mirrored_back(found: LensCalibration) -> LensCalibration:
     return replace(
         found, determined=replace(determined, calibration=calibration, omitted=omitted), mirrored=True
     )
-
-
-def _matches(solution: FrameSolution, sky: SkyIndex) -> MatchedFrame:
-    """Return the identified stars of a solution as a matched frame."""
-    matched = solution.matched
-    variance = 0.5 * np.trace(solution.covariance[matched], axis1=1, axis2=2) + _MIN_SIGMA_PX**2
-    directions = sky.stars.direction[solution.star[matched]]
-    return MatchedFrame(solution.points[matched], np.sqrt(variance), directions)

@@ -18,8 +18,9 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.earth.sun import J2000, earth_velocity, julian_date
 from knightcube.errors import InputError
-from knightcube.vision.camera.lens import CameraModel, Pinhole
-from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Pinhole
+from knightcube.vision.frame_job import found_in_image
+from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex, load_once
 from knightcube.vision.startracker.sky_map import ASPECT, Pointing, SkyMap
@@ -154,6 +155,9 @@ class StarTracker:
             `fov_deg`.
         settings: tolerances and methods of detection, identification and attitude. None: the defaults.
         index: a sky index, or the path of a sky index file. None: the default index.
+        learn: whether the lens is learned from the solved images, which must be of one camera. The learned
+            lens is the attribute `lens`. The accuracy of the given field of view or camera is
+            `settings.lens`, or that of an uncalibrated camera.
 
     Raises:
         InputError: if a field of view is out of range or is given together with a camera, or if the index
@@ -170,12 +174,15 @@ class StarTracker:
         camera: CameraModel | None = None,
         settings: SolveSettings | None = None,
         index: SkyIndex | Path | str | None = None,
+        learn: bool = False,
     ) -> None:
         if fov_deg is not None and camera is not None:
             raise InputError("fov_deg", "give a field of view or a camera, not both")
         _check_field_of_view(fov_deg, fov_error_deg)
         self._fov_deg, self._fov_error_deg, self._camera = fov_deg, fov_error_deg, camera
         self._settings = SolveSettings() if settings is None else settings
+        self._learn = learn
+        self.lens: LensKnowledge | None = None
         if index is None:
             self._index = default_index()
         else:
@@ -223,17 +230,26 @@ class StarTracker:
             date = julian_date(utc)
             sky = sky.at(2000.0 + (date - J2000) / 365.25)
             settings = replace(settings, velocity=earth_velocity(date))
-        frame = solve_frame(
-            image,
-            camera,
-            scale,
-            1.0 if exposure is None else exposure,
-            sky,
-            settings,
-            None if attitude is None else AttitudePrior(np.asarray(attitude, dtype=float), attitude_sigma),
-            None if rate is None else RatePrior(np.asarray(rate, dtype=float), rate_sigma),
-        )
+        if self._learn and self.lens is None:
+            self.lens = self._described(camera, scale)
+        seconds = 1.0 if exposure is None else exposure
+        attitudes = None if attitude is None else AttitudePrior(np.asarray(attitude, float), attitude_sigma)
+        rates = None if rate is None else RatePrior(np.asarray(rate, dtype=float), rate_sigma)
+        found = found_in_image(image, camera, scale, seconds, sky, settings, attitudes, rates, self.lens)
+        self.lens, frame = found.lens, found.solution
+        assert frame is not None  # the settings of the star tracker are given
         return _solution(frame, sky, settings.velocity, exposure is not None)
+
+    def _described(self, camera: CameraModel, scale: tuple[float, float]) -> LensKnowledge:
+        """Return the knowledge of the lens before the first image."""
+        accuracy, shutter = self._settings.lens or CameraKnowledge(), self._settings.likelihood
+        return LensKnowledge.of(
+            camera,
+            accuracy,
+            scale_error=scale[1] - 1.0,
+            line_time=shutter.line_time,
+            psf_sigma=shutter.psf_sigma,
+        )
 
     def _camera_for(self, shape: tuple[int, ...]) -> tuple[CameraModel, tuple[float, float]]:
         """Return the camera for an image of `shape`, and the limits of the scale of field-angle tangents."""

@@ -53,6 +53,10 @@ class Pinhole:
         """Return the camera with its focal length multiplied by `factor`."""
         return Pinhole(self.columns, self.rows, self.focal_length * factor)
 
+    def binned(self, columns: int, rows: int, size: int) -> Pinhole:
+        """Return the camera of `columns` x `rows` bins of `size` x `size` px with the same centre."""
+        return Pinhole(columns, rows, self.focal_length / size)
+
     @property
     def centre(self) -> tuple[float, float]:
         """The pixel (x, y) on the boresight: (columns - 1)/2, (rows - 1)/2."""
@@ -373,6 +377,9 @@ class MountedCamera:
         return np.asarray(rays @ self.to_camera)
 
 
+FOURTH_AS = -0.3, 1.2
+"""Constant and quadratic term that approximate a fourth power of the radius (least squares over an image)."""
+
 UNSTATED = 30e-6
 """Standard deviation (s) of an unknown line time of a rolling shutter; rows of one image often span 30 ms."""
 
@@ -390,12 +397,15 @@ class CameraKnowledge:
             from the image centre.
         line_time: standard deviation of the delay between the exposures of successive rows, s. A `line_time`
             of None means 0 if the camera's line time is stated, otherwise `UNSTATED`.
+        covariance: covariance (5, 5) of relative focal length, optical axis along x and y, distortion and
+            line time, in the units above, if the lens was learned from frames. None: independent errors.
     """
 
     focal_length: float = 0.0
     centre: float = 2.0
     distortion: float = 0.005
     line_time: float | None = None
+    covariance: tuple[tuple[float, ...], ...] | None = None
 
 
 EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)

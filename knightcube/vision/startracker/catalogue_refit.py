@@ -38,6 +38,7 @@ from knightcube.vision.streaks.geometry import (
     path_lengths,
     polar_angles,
     positions,
+    streak_pinhole,
 )
 from knightcube.vision.streaks.joint_fit import FitProblem, joint_fit
 from knightcube.vision.streaks.normal_equations import light_of
@@ -109,13 +110,13 @@ def refit_motion(
     between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None
-    pinhole, exposure = solution.camera.ideal, motion.exposure
+    pinhole, exposure = streak_pinhole(solution.camera, likelihood.knowledge), motion.exposure
     # The rotation during the exposure follows from the mean rate, the acceleration and the higher terms.
     growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
     shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
     course = CameraMotion.between(motion.rate * exposure, growth, shape)
     most = likelihood.most_stars + likelihood.most_neighbours + likelihood.most_faint
-    known = _known_stars(motion, solution, sky, settings, course, most)
+    known = _known_stars(motion, solution, sky, settings, course, (pinhole, most))
     if known is None:
         return None
     camera = FitProblem(
@@ -201,10 +202,11 @@ def _known_stars(
     sky: SkyIndex,
     settings: SolveSettings,
     course: CameraMotion,
-    most: int,
+    seen_by: tuple[Pinhole, int],
 ) -> _Known | None:
     """Return the catalogue stars in the frame, or None if no fitted star is identified.
 
+    The camera model of the streak fit and the maximum number of stars are `seen_by`.
     The counts of a star of magnitude zero are determined from the identified stars.
     """
     matched = solution.matched
@@ -215,7 +217,7 @@ def _known_stars(
         return None
     magnitude = sky.stars.magnitude
     zero = np.median(np.log10(motion.flux[fitted[used]]) + 0.4 * magnitude[solution.star[matched[used]]])
-    pinhole, matrix = solution.camera.ideal, attitude_matrix(solution.fix.quaternion)
+    (pinhole, most), matrix = seen_by, attitude_matrix(solution.fix.quaternion)
     reach = min(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(course.rotation)), 0.5 * np.pi)
     near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse > np.cos(reach))
     direction = sky.stars.direction[near]

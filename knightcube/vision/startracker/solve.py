@@ -76,6 +76,7 @@ class FrameSolution:
         mirrored: whether the image shows the mirrored sky. For a mirrored sky, `fix` is the attitude of the
             image with left and right exchanged about the optical axis, but the points are those of the
             original image.
+        psf_sigma: measured standard deviation of the point spread, px; NaN if unknown.
     """
 
     status: SolveStatus
@@ -94,6 +95,7 @@ class FrameSolution:
     tracked: bool = False
     motion: MotionResult | None = None
     mirrored: bool = False
+    psf_sigma: float = math.nan
 
     @property
     def matched(self) -> IntArray:
@@ -332,7 +334,8 @@ def solve_motion(
     if solution.fix is None:
         return solution
     covariance = solution.fix.covariance + timing_covariance(motion)
-    return replace(solution, fix=replace(solution.fix, covariance=covariance))
+    fix = replace(solution.fix, covariance=covariance)
+    return replace(solution, fix=fix, psf_sigma=motion.psf_sigma)
 
 
 def points_near(
@@ -407,8 +410,9 @@ def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSe
     width, given = found.width[np.isfinite(found.width)], settings.detection.psf_sigma
     if solution.fix is None or given is None or not len(width):
         return solution
-    doubt = _SHAPE_DOUBT * abs(float(np.median(width)) - given) / solution.camera.focal_length
-    return solution.wider(np.diag([doubt**2, doubt**2, 0.0]))
+    measured = float(np.median(width))
+    doubt = _SHAPE_DOUBT * abs(measured - given) / solution.camera.focal_length
+    return replace(solution, psf_sigma=measured).wider(np.diag([doubt**2, doubt**2, 0.0]))
 
 
 def _identify(

@@ -302,7 +302,7 @@ class Binning:
             columns, rows = (_centred_count(length, size) for length in (pinhole.columns, pinhole.rows))
             left = pinhole.columns - size * columns, pinhole.rows - size * rows
             if min(columns, rows) > 0 and not left[0] % 2 and not left[1] % 2:
-                small = Pinhole(columns, rows, pinhole.focal_length / size)
+                small = pinhole.binned(columns, rows, size)
                 return cls(size, (left[0] // 2, left[1] // 2), small)
         return cls(1, (0, 0), pinhole)
 
@@ -323,6 +323,10 @@ class Binning:
         """Return the `settings` for the full frame converted to binned pixels."""
         if self.size == 1:
             return settings
+        unit = np.array([1.0, 1.0 / self.size, 1.0 / self.size, 1.0, self.size])
+        covariance = settings.knowledge.covariance
+        if covariance is not None:
+            covariance = tuple(map(tuple, (np.array(covariance) * np.outer(unit, unit)).tolist()))
         return replace(
             settings,
             psf_sigma=settings.psf_sigma / self.size,
@@ -331,6 +335,7 @@ class Binning:
                 settings.knowledge,
                 centre=settings.knowledge.centre / self.size,
                 line_time=settings.line_time_sigma * self.size,
+                covariance=covariance,
             ),
         )
 

@@ -10,6 +10,7 @@ star is identified by its pixel coordinates at mid-exposure.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_product, select
-from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.camera.lens import FOURTH_AS, CameraKnowledge, CameraModel, Lens, Pinhole
 
 PIXEL_VARIANCE = 1.0 / 12.0
 """Variance (px^2) of a uniform distribution over one pixel."""
@@ -43,6 +44,25 @@ class DistortedPinhole(Pinhole):
     shift: tuple[float, float]
     scale: float
     cubic: float
+
+    @classmethod
+    def of(cls, lens: Lens) -> DistortedPinhole:
+        """Return the pinhole with the centre and radial distortion of `lens`.
+
+        A cubic and a change of scale replace the second distortion term (least squares over the image).
+        """
+        middle = lens.ideal.centre
+        square = (math.hypot(*middle) / lens.focal_length) ** 2
+        constant, quadratic = FOURTH_AS
+        last = lens.k2 * square**2
+        shift = lens.centre[0] - middle[0], lens.centre[1] - middle[1]
+        cubic = lens.k1 * square + quadratic * last
+        return cls(lens.columns, lens.rows, lens.focal_length, shift, constant * last, cubic)
+
+    def binned(self, columns: int, rows: int, size: int) -> DistortedPinhole:
+        """Return the camera of `columns` x `rows` bins of `size` x `size` px."""
+        shift = self.shift[0] / size, self.shift[1] / size
+        return DistortedPinhole(columns, rows, self.focal_length / size, shift, self.scale, self.cubic)
 
     @property
     def _per_square(self) -> float:
@@ -78,6 +98,13 @@ class DistortedPinhole(Pinhole):
         closing = np.sum(away * velocity, axis=1, keepdims=True)
         square = np.sum(velocity**2, axis=1, keepdims=True)
         return np.asarray(2.0 * self._per_square * (2.0 * closing * velocity + square * away))
+
+
+def streak_pinhole(camera: CameraModel, knowledge: CameraKnowledge) -> Pinhole:
+    """Return the camera model of the streak fit, which includes the distortion only of a learned lens."""
+    if knowledge.covariance is None or not isinstance(camera, Lens):
+        return camera.ideal
+    return DistortedPinhole.of(camera)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

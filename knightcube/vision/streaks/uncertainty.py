@@ -241,9 +241,9 @@ def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> F
     the line time of the shutter is last. A streak determines the position of its path perpendicular to the
     path, and its ends determine the length.
     """
-    errors = _error_sizes(camera)
+    errors = _error_root(camera)
     n = len(scene.stars)
-    if not errors:
+    if not errors.shape[1]:
         return np.empty((n, 3, 0))
     time, stars = np.repeat(_INSTANTS, n), np.tile(scene.stars, (len(_INSTANTS), 1))
     sensitive, velocity = sensitivities_and_velocity(camera.pinhole, scene.motion, stars, time, growing=False)
@@ -265,46 +265,47 @@ def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> F
     return np.asarray((np.linalg.pinv(change) @ displaced)[:, :3])
 
 
-def _error_sizes(camera: FitProblem) -> dict[str, float]:
-    """Return the standard deviations of the uncertain calibration parameters, with the line time last."""
+def _error_root(camera: FitProblem) -> FloatArray:
+    """Return a root (5, m) of the covariance of the calibration errors, one column per independent error.
+
+    The rows are relative focal length, centre x and y (px), distortion at the corner, and line time (s). If
+    the errors are independent, the line time is the last column.
+    """
     known = camera.settings.knowledge
-    sizes = {
-        "focal length": known.focal_length,
-        "centre x": known.centre,
-        "centre y": known.centre,
-        "distortion": known.distortion,
-        "line time": camera.settings.line_time_sigma,
-    }
-    return {error: sigma for error, sigma in sizes.items() if sigma > 0.0}
+    if known.covariance is not None:
+        covariance = np.array(known.covariance)
+        unit = np.sqrt(np.diag(covariance))
+        size, axes = np.linalg.eigh(covariance / np.outer(*[np.maximum(unit, 1e-30)] * 2))
+        return np.asarray(unit[:, None] * axes * np.sqrt(np.maximum(size, 0.0)))
+    sizes = np.array([known.focal_length, known.centre, known.centre, known.distortion, 0.0])
+    sizes[4] = camera.settings.line_time_sigma
+    return np.diag(sizes)[:, sizes > 0.0]
 
 
 def _error_displacements(
-    pinhole: Pinhole, errors: dict[str, float], place: FloatArray, velocity: FloatArray
+    pinhole: Pinhole, errors: FloatArray, place: FloatArray, velocity: FloatArray
 ) -> FloatArray:
-    """Return the displacements (p, 2, m), px, of stars by each of m calibration errors."""
+    """Return the displacements (p, 2, m), px, of stars by each of m calibration errors (5, m)."""
     away = place - np.array(pinhole.centre)
     corner = np.hypot(*pinhole.centre)
-    moves = {
-        "focal length": away,
-        "centre x": np.array([[1.0, 0.0]]),
-        "centre y": np.array([[0.0, 1.0]]),
-        "distortion": away * (np.sum(away**2, axis=1, keepdims=True) / corner**2),
-        "line time": velocity * away[:, 1:],
-    }
-    return np.stack(
-        [np.broadcast_to(sigma * moves[error], away.shape) for error, sigma in errors.items()], axis=-1
-    )
+    moves = [
+        away,
+        np.array([[1.0, 0.0]]),
+        np.array([[0.0, 1.0]]),
+        away * (np.sum(away**2, axis=1, keepdims=True) / corner**2),
+        velocity * away[:, 1:],
+    ]
+    return np.stack([np.broadcast_to(move, away.shape) for move in moves], axis=-1) @ errors
 
 
 def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
     """Return `camera` with a lens that has calibration errors `error` (m,), given in standard deviations."""
-    # The line time, which is the last of the calibration errors, is not a property of the lens.
-    sizes = zip(_error_sizes(camera).items(), error, strict=False)
-    found = {name: sigma * float(by) for (name, sigma), by in sizes}
-    scale, x, y, cubic = (
-        found.get(name, 0.0) for name in ("focal length", "centre x", "centre y", "distortion")
-    )
+    # The line time, which is the last row of the calibration errors, is not a property of the lens.
+    change = _error_root(camera)[:4] @ error
     pinhole = camera.pinhole
+    if isinstance(pinhole, DistortedPinhole):
+        change = change + np.array([pinhole.scale, *pinhole.shift, pinhole.cubic])
+    scale, x, y, cubic = change.tolist()
     lens = DistortedPinhole(pinhole.columns, pinhole.rows, pinhole.focal_length, (x, y), scale, cubic)
     return replace(camera, pinhole=lens)
 

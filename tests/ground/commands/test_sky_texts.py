@@ -20,13 +20,8 @@ from ground.commands.options import utc
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import Lens, Pinhole
-from knightcube.vision.lens_calibration import (
-    MIN_STARS,
-    DeterminedLens,
-    MatchedFrame,
-    OmittedTerm,
-    calibrate_determined,
-)
+from knightcube.vision.lens_calibration import MIN_STARS, DeterminedLens, OmittedTerm, calibrate_determined
+from knightcube.vision.lens_knowledge import MatchedFrame
 from knightcube.vision.star_tracker import StarSolution, StarTracker
 from sim_hal.star_camera import StarCameraModel
 from tests.ground.commands.in_process import command

@@ -13,18 +13,20 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix, normalise
 from knightcube.vision.camera.lens import Lens, Pinhole
 from knightcube.vision.lens_calibration import (
-    PARAMETERS,
     Calibration,
-    CalibrationError,
     DeterminedLens,
     LensCalibration,
-    LensFit,
     LensPrior,
-    MatchedFrame,
     _mirrored_back,
     calibrate,
     calibrate_determined,
     lens_accuracy,
+)
+from knightcube.vision.lens_knowledge import (
+    PARAMETERS,
+    CalibrationError,
+    LensFit,
+    MatchedFrame,
     parameters_of,
     residuals,
     step,

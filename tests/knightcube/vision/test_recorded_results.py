@@ -9,7 +9,8 @@ from knightcube.reference.corner_streaks.estimator import CornerEstimator
 from knightcube.reference.corner_streaks.settings import StreakSettings
 from knightcube.vision.camera.lens import Lens, Pinhole
 from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings, run
-from knightcube.vision.lens_calibration import MatchedFrame, calibrate, calibrate_determined, lens_accuracy
+from knightcube.vision.lens_calibration import calibrate, calibrate_determined, lens_accuracy
+from knightcube.vision.lens_knowledge import MatchedFrame
 from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 from knightcube.vision.star_tracker import StarTracker
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings

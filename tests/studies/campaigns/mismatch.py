@@ -114,7 +114,7 @@ def expose(case: Case, imperfection: Imperfection) -> tuple[Image, FloatArray]:
     for _ in range(_MOST_SKIES):
         attitudes = attitudes_of(case.parameters, camera, rng)
         sky = Sky(directions, camera.electrons(stars.magnitude, exposure))
-        near, good = _seen(camera, sky, attitudes, exposure)
+        near, good = seen_stars(camera, sky, attitudes, exposure)
         if good >= LEAST_USABLE:
             break
     else:
@@ -136,7 +136,9 @@ def expose(case: Case, imperfection: Imperfection) -> tuple[Image, FloatArray]:
     return detected(electrons, imperfection, camera, exposure, rng), np.asarray(rate)
 
 
-def _seen(camera: StarCameraModel, sky: Sky, attitudes: Attitudes, exposure: float) -> tuple[IntArray, int]:
+def seen_stars(
+    camera: StarCameraModel, sky: Sky, attitudes: Attitudes, exposure: float
+) -> tuple[IntArray, int]:
     """Return the stars that may throw light on the frame, and how many are usable."""
     vectors = np.einsum("tij,nj->tni", attitude_matrix(attitudes(np.array([-0.5, 0.0, 0.5]))), sky.directions)
     reach = np.cos(camera.pinhole.half_diagonal + 0.4 * camera.field_of_view)

@@ -42,6 +42,7 @@ from tests.studies.campaigns.robust_controllers import ROBUST_CONTROLLERS
 from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
 from tests.studies.campaigns.safe_sun import SAFE_SUN
+from tests.studies.campaigns.self_calibration import SELF_CALIBRATION
 from tests.studies.campaigns.soak import SOAK
 from tests.studies.campaigns.start import START
 from tests.studies.campaigns.streaked import STREAKED
@@ -64,6 +65,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         STREAKED,
         RATE_CHANGE,
         ROLLING_SHUTTER,
+        SELF_CALIBRATION,
         RSO_ORBITS,
         FIRST_ORBITS,
         OBJECT_PASSES,

@@ -1,0 +1,226 @@
+"""Knowledge of the lens from solved frames: accuracy, honesty, a changed lens, and its use in a frame.
+
+Star positions are computed with the true lens by `Lens.project`, not with the equations under test.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.wahba import AttitudeFix
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from knightcube.vision.camera.lens import CameraKnowledge, Lens, Pinhole
+from knightcube.vision.lens_knowledge import LensKnowledge
+from knightcube.vision.startracker.detection import FrameKind
+from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.solve import FrameSolution, SolveStatus
+from knightcube.vision.streaks.geometry import CameraMotion, DistortedPinhole, positions
+from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
+
+DESCRIBED = Pinhole(640, 480, 1800.0)
+KNOWN = CameraKnowledge(centre=3.0, distortion=0.006)
+NOISE = 0.05
+
+
+@dataclass(frozen=True)
+class TrueCamera:
+    """A lens, and the line time of its shutter, s."""
+
+    lens: Lens
+    line_time: float = 0.0
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, focal: float = 0.0) -> TrueCamera:
+        square = (np.hypot(*DESCRIBED.centre) / DESCRIBED.focal_length) ** 2
+        centre = np.array(DESCRIBED.centre) + rng.normal(0.0, KNOWN.centre, 2)
+        k1 = rng.normal(0.0, KNOWN.distortion) / square
+        length = DESCRIBED.focal_length * (1.0 + focal)
+        return cls(Lens(640, 480, length, (centre[0], centre[1]), k1), abs(rng.normal(0.0, 20e-6)))
+
+    def values(self) -> FloatArray:
+        return np.array(
+            [self.lens.focal_length, *self.lens.centre, self.lens.k1, self.lens.k2, self.line_time]
+        )
+
+
+def frame_of(
+    camera: TrueCamera,
+    known: LensKnowledge,
+    rng: np.random.Generator,
+    stars: int = 25,
+    wrong: int = 0,
+    status: StreakStatus = StreakStatus.RATE,
+) -> tuple[FrameSolution, SkyIndex]:
+    """Return a frame of streaks in a random field, solved with the shutter of `known`, and its stars."""
+    true = normalise(rng.normal(size=4))
+    pixels = rng.uniform([0.0, 0.0], [639.0, 479.0], (stars, 2))
+    directions = camera.lens.unit_vectors(pixels) @ attitude_matrix(true)
+    velocity = rng.uniform(-600.0, 600.0, 2)
+    assumed, sigma = known.shutter
+    row = (pixels[:, 1:] - 239.5) * velocity
+    points = pixels + row * (camera.line_time - assumed) + rng.normal(0.0, NOISE, pixels.shape)
+    points[:wrong] += 15.0
+    start = multiply(from_rotation_vector(rng.normal(0.0, 1e-4, 3)), true)
+    motion = MotionResult(status, 0, 0.2, line_time_sigma=sigma, psf_sigma=1.3)
+    solution = FrameSolution(
+        SolveStatus.SOLVED,
+        "",
+        FrameKind.STREAKS,
+        known.camera,
+        points,
+        np.tile(NOISE**2 * np.eye(2), (stars, 1, 1)),
+        row * sigma if sigma else np.empty((0, 2)),
+        np.arange(stars),
+        fix=AttitudeFix(start, 1e-8 * np.eye(3), 0.0),
+        motion=motion,
+        psf_sigma=1.3,
+    )
+    return solution, cast(SkyIndex, SimpleNamespace(stars=SimpleNamespace(direction=directions)))
+
+
+def learned(camera: TrueCamera, known: LensKnowledge, rng: np.random.Generator, frames: int) -> LensKnowledge:
+    for _ in range(frames):
+        known = known.update(*frame_of(camera, known, rng), elapsed=5.0)
+    return known
+
+
+def nees(known: LensKnowledge, camera: TrueCamera) -> float:
+    values, covariance = known.learned
+    unit = np.sqrt(np.diag(covariance))[:6]
+    error = (values[:6] - camera.values()) / unit
+    return float(error @ np.linalg.solve(covariance[:6, :6] / np.outer(unit, unit), error))
+
+
+@pytest.mark.parametrize("scale_error", [0.0, 0.05])
+def test_ten_frames_shrink_an_honest_covariance_of_the_lens(scale_error: float) -> None:
+    """The normalised error squared has six degrees of freedom, or five with an exact focal length."""
+    found, sigmas = [], []
+    for seed in range(5):
+        rng = np.random.default_rng((31, seed))
+        camera = TrueCamera.drawn(rng, rng.uniform(-scale_error, scale_error))
+        known = learned(camera, LensKnowledge.of(DESCRIBED, KNOWN, scale_error=scale_error), rng, 10)
+        assert known.usable
+        assert known.contradictions == 0
+        found.append(nees(known, camera))
+        sigmas.append(known.sigma / known.spread)
+    # The mean of 5 chi-squares of 5 or 6 degrees of freedom has a standard deviation of at most 1.6.
+    assert 1.5 < np.mean(found) < 10.5
+    # A shift d of the axis displaces a star at a corner, 400 px from the axis, by only 0.05 d.
+    # The 250 stars of 0.05 px therefore leave at least 0.06 px of the axis, and some tenths with distortion.
+    shrunk = np.median(sigmas, axis=0)
+    assert np.all(shrunk[[1, 2]] < 0.25)
+    assert shrunk[9] < 0.01
+
+
+def test_a_changed_lens_is_noticed_by_the_next_frame_and_learned_again() -> None:
+    rng = np.random.default_rng(41)
+    first = TrueCamera.drawn(rng)
+    known = learned(first, LensKnowledge.of(DESCRIBED, KNOWN), rng, 10)
+    centre = first.lens.centre
+    after = TrueCamera(Lens(640, 480, 1800.0, (centre[0] + 4.0, centre[1]), first.lens.k1 + 0.08), 1e-6)
+    noticed = known.update(*frame_of(after, known, rng), elapsed=5.0)
+    assert noticed.contradictions == 1
+    assert not noticed.usable
+    assert np.allclose(noticed.sigma, noticed.spread)
+    again = learned(after, noticed, rng, 10)
+    assert again.contradictions == 1
+    assert nees(again, after) < 20.0 < nees(again, first)
+
+
+def test_an_unchanged_lens_is_not_contradicted() -> None:
+    rng = np.random.default_rng(51)
+    camera = TrueCamera.drawn(rng)
+    known = learned(camera, LensKnowledge.of(DESCRIBED, KNOWN), rng, 30)
+    assert known.contradictions == 0
+    assert known.frames == 30
+
+
+def test_wrong_matches_do_not_move_the_lens() -> None:
+    rng = np.random.default_rng(61)
+    camera = TrueCamera.drawn(rng)
+    known = LensKnowledge.of(DESCRIBED, KNOWN)
+    for _ in range(8):
+        known = known.update(*frame_of(camera, known, rng, wrong=3))
+    assert known.frames == 8
+    assert nees(known, camera) < 20.0
+
+
+def test_frames_that_cannot_teach_change_nothing() -> None:
+    rng = np.random.default_rng(71)
+    camera, known = TrueCamera.drawn(rng), LensKnowledge.of(DESCRIBED, KNOWN)
+    assert known.update(*frame_of(camera, known, rng, stars=5)) is known
+    # Without the direction of the rotation, the effect of an unknown line time has an unknown sign.
+    ambiguous = frame_of(camera, known, rng, status=StreakStatus.AMBIGUOUS)
+    assert known.update(*ambiguous) is known
+
+
+def test_a_line_time_that_is_zero_within_its_error_is_fitted_as_a_global_shutter() -> None:
+    rng = np.random.default_rng(81)
+    still = TrueCamera(TrueCamera.drawn(rng).lens)
+    known = learned(still, LensKnowledge.of(DESCRIBED, KNOWN), rng, 10)
+    time, sigma = known.shutter
+    assert time == 0.0
+    assert abs(known.values[9]) <= sigma < 5e-7
+    rolling = TrueCamera(still.lens, 2.5e-5)
+    time, sigma = learned(rolling, LensKnowledge.of(DESCRIBED, KNOWN), rng, 10).shutter
+    assert abs(time - 2.5e-5) < 4.0 * sigma < 2e-6
+
+
+def test_the_width_of_the_point_spread_is_learned() -> None:
+    rng = np.random.default_rng(91)
+    known = learned(TrueCamera.drawn(rng), LensKnowledge.of(DESCRIBED, KNOWN), rng, 10)
+    assert known.psf_sigma == pytest.approx(1.3, abs=0.03)
+
+
+def test_stored_values_start_the_next_boot_unless_they_are_implausible() -> None:
+    rng = np.random.default_rng(101)
+    camera, begun = TrueCamera.drawn(rng), LensKnowledge.of(DESCRIBED, KNOWN)
+    known = learned(camera, begun, rng, 10)
+    after = begun.restored(*known.learned, 0.1)
+    assert after is not None
+    assert after.usable
+    assert np.array_equal(after.learned[0], known.learned[0])
+    expected = np.hypot(known.sigma[1], 0.1 * begun.spread[1])
+    assert after.sigma[1] == pytest.approx(expected)
+    values, covariance = known.learned
+    assert begun.restored(values + np.array([0.0, 30.0, 0.0, 0.0, 0.0, 0.0, 0.0]), covariance, 0.1) is None
+    assert begun.restored(values[:6], covariance[:6, :6], 0.1) is None
+
+
+def test_an_exact_camera_has_nothing_to_learn() -> None:
+    exact = CameraKnowledge(centre=0.0, distortion=0.0)
+    assert not LensKnowledge.of(DESCRIBED, exact, line_time=0.0).uncertain
+    assert LensKnowledge.of(DESCRIBED, exact).uncertain  # its line time
+    assert LensKnowledge.of(DESCRIBED, exact, line_time=0.0, scale_error=0.01).uncertain
+
+
+@pytest.mark.parametrize(("k1", "k2"), [(-0.2, 0.0), (0.12, 0.9), (-0.15, -0.8)])
+def test_the_camera_of_the_streak_fit_images_like_the_learned_lens(k1: float, k2: float) -> None:
+    lens = Lens(640, 480, 1800.0, (323.0, 236.5), k1, k2)
+    pixels = np.random.default_rng(3).uniform([0.0, 0.0], [639.0, 479.0], (200, 2))
+    simple = DistortedPinhole.of(lens)
+    ideal = Pinhole(640, 480, 1800.0).project(lens.unit_vectors(pixels))
+    off = np.hypot(*(simple.distorted(ideal) - pixels).T)
+    # The remainder of the fourth power is at most 0.13 of the second term, which displaces corners by 0.9 px.
+    assert off.max() < (1e-6 if k2 == 0.0 else 0.15)
+    still = CameraMotion.steady(np.zeros(3))
+    assert np.allclose(positions(simple, still, pixels, np.zeros(200)), pixels, atol=1e-6)
+
+
+def test_the_accuracy_of_the_lens_contains_the_scatter_of_the_corner() -> None:
+    """The stated distortion is the error of a corner's radius, computed by sampling lenses."""
+    rng = np.random.default_rng(111)
+    known: Any = learned(TrueCamera.drawn(rng), LensKnowledge.of(DESCRIBED, KNOWN, scale_error=0.02), rng, 5)
+    values, covariance = known.learned
+    unit = np.sqrt(np.diag(covariance))
+    root = unit[:, None] * np.linalg.cholesky(covariance / np.outer(unit, unit))
+    drawn = values + (root @ rng.normal(size=(7, 2000))).T
+    tangent = np.hypot(*DESCRIBED.centre) / values[0]
+    radius = drawn[:, 0] * tangent * (1.0 + drawn[:, 3] * tangent**2 + drawn[:, 4] * tangent**4)
+    assert known.accuracy.distortion == pytest.approx(np.std(radius) / np.mean(radius), rel=0.1)
