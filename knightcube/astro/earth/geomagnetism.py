@@ -14,6 +14,7 @@ from functools import cache
 
 import numpy as np
 from pygeomag import GeoMag
+from pygeomag.geomag import GeoMagResult
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import (
@@ -25,6 +26,9 @@ from knightcube.astro.earth.orientation import (
 from knightcube.errors import FlightError
 
 FIRST_YEAR, LAST_YEAR = 2025.0, 2030.0
+DEGREE = 12
+_NEAR_POLE = 0.5 * math.pi - 1e-6
+"""Largest latitude (rad) of the common expansion, because pygeomag treats the poles separately."""
 NANOTESLA = 1e-9
 EXTRAPOLATION = 2.5e-8
 """Standard deviation of the extrapolated field, T per component and per year outside the model's validity.
@@ -92,6 +96,106 @@ def field(julian_date: float, position: FloatArray) -> FloatArray:
         float(julian_epoch(julian_date)), latitude, longitude, height
     )
     return np.asarray(north_east_down_field @ north_east_down(longitude, latitude) @ to_ground)
+
+
+def fields(julian_dates: FloatArray, positions: FloatArray) -> FloatArray:
+    """Return the fields (n, 3) in ICRS axes, T, at n times and positions, exactly as `field` gives each.
+
+    The expansion is evaluated for all positions together. A position takes 0.03 ms if there are a hundred.
+
+    Args:
+        julian_dates: (n,) Julian dates UTC.
+        positions: (n, 3) geocentric positions in ICRS axes, m.
+    """
+    to_ground = celestial_to_terrestrial(julian_dates)
+    there = np.array([turn @ position for turn, position in zip(to_ground, positions, strict=True)])
+    longitude, latitude, height = geodetic(there)
+    if not np.abs(latitude).max() < _NEAR_POLE:  # also for an invalid position, which `field` refuses
+        return np.array([field(float(date), at) for date, at in zip(julian_dates, positions, strict=True)])
+    parts = zip(
+        _expansion(julian_epoch(julian_dates), latitude, longitude, height),
+        north_east_down(longitude, latitude),
+        to_ground,
+        strict=True,
+    )
+    return np.array([NANOTESLA * np.array(found) @ axes @ turn for found, axes, turn in parts])
+
+
+def _expansion(
+    years: FloatArray, latitude: FloatArray, longitude: FloatArray, height: FloatArray
+) -> list[tuple[float, float, float]]:
+    """Return the field components north, east and down, nT, with each operation of `GeoMag.calculate`."""
+    model = _model()
+    assert model.model  # it has read its coefficients
+    lowest, highest = FIRST_YEAR - LONGEST_EXTRAPOLATION, LAST_YEAR + LONGEST_EXTRAPOLATION
+    since = np.minimum(np.maximum(years, lowest), highest) - model._epoch
+    at = [math.radians(math.degrees(angle)) for angle in latitude.tolist()]
+    turns = [math.remainder(angle, 2.0 * math.pi) for angle in longitude.tolist()]
+    east = [math.radians(math.degrees(angle)) for angle in turns]
+    sine, cosine = np.array([math.sin(angle) for angle in at]), np.array([math.cos(angle) for angle in at])
+    up = 1e-3 * height
+    a2, b2 = 6378.137 * 6378.137, 6356.7523142 * 6356.7523142
+    c2, a4, c4 = a2 - b2, a2 * a2, a2 * a2 - b2 * b2
+    squares = sine * sine, cosine * cosine
+    q = np.sqrt(a2 - c2 * squares[0])
+    q1 = up * q
+    q2 = ((q1 + a2) / (q1 + b2)) * ((q1 + a2) / (q1 + b2))
+    ct = sine / np.sqrt(q2 * squares[1] + squares[0])
+    st = np.sqrt(1.0 - ct * ct)
+    r = np.sqrt(up * up + 2.0 * q1 + (a4 - c4 * squares[0]) / (q * q))
+    ca = (up + np.sqrt(a2 * squares[1] + b2 * squares[0])) / r
+    sa = c2 * cosine * sine / (r * np.sqrt(a2 * squares[1] + b2 * squares[0]))
+    br, bt, bp = _sums(model, since, st, ct, 6371.2 / r, east)
+    along = -bt * ca - br * sa, bp / st, bt * sa - br * ca
+    return [_rounded(*(float(part) for part in found)) for found in zip(*along, strict=True)]
+
+
+def _sums(
+    model: GeoMag, since: FloatArray, st: FloatArray, ct: FloatArray, ratio: FloatArray, east: list[float]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the sums (n,) over degrees and orders: radial, along the meridian, and along the parallel.
+
+    `since` are years after the epoch, `st` and `ct` sine and cosine of the colatitude, `ratio` the reference
+    radius over the distance, and `east` the longitudes, rad.
+    """
+    sines = [np.zeros(len(east)), np.array([math.sin(angle) for angle in east])]
+    cosines = [np.ones(len(east)), np.array([math.cos(angle) for angle in east])]
+    for m in range(2, DEGREE + 1):
+        sines.append(sines[1] * cosines[m - 1] + cosines[1] * sines[m - 1])
+        cosines.append(cosines[1] * cosines[m - 1] - sines[1] * sines[m - 1])
+    nothing = np.zeros(len(east))
+    legendre, slope = {(0, 0): np.ones(len(east))}, {(0, 0): nothing}
+    power, br, bt, bp = ratio * ratio, nothing, nothing, nothing
+    for n in range(1, DEGREE + 1):
+        power = power * ratio
+        for m in range(n + 1):
+            if n == m:
+                before = legendre[m - 1, n - 1]
+                value, tilt = st * before, st * slope[m - 1, n - 1] + ct * before
+            else:
+                before, k = legendre[m, n - 1], model._k[m][n]
+                value = ct * before - k * legendre.get((m, n - 2), nothing)
+                tilt = ct * slope[m, n - 1] - st * before - k * slope.get((m, n - 2), nothing)
+            legendre[m, n], slope[m, n] = value, tilt
+            g = model._c[m][n] + since * model._cd[m][n]
+            h = model._c[n][m - 1] + since * model._cd[n][m - 1] if m else nothing
+            outward = g * cosines[m] + h * sines[m]
+            across = g * sines[m] - h * cosines[m]
+            bt = bt - power * outward * tilt
+            bp = bp + float(m) * across * (power * value)
+            br = br + float(n + 1) * outward * (power * value)
+    return br, bt, bp
+
+
+def _rounded(north: float, east: float, down: float) -> tuple[float, float, float]:
+    """Return components as pygeomag gives them, computed from intensity, declination and inclination."""
+    level = math.sqrt(north * north + east * east)
+    result = GeoMagResult(0.0, 0.0, 0.0, 0.0)
+    result.f = math.sqrt(level * level + down * down)
+    result.d = math.degrees(math.atan2(east, north))
+    result.i = math.degrees(math.atan2(down, level))
+    result.calculate(raise_in_warning_zone=False)
+    return result.x, result.y, result.z
 
 
 @cache

@@ -157,3 +157,22 @@ def test_the_stored_table_is_the_builder_s() -> None:
     row = table[epochs.tolist().index(2025)]
     for pair, value in build_igrf.PUBLISHED.items():
         assert row[build_igrf.order().index(pair)] == value
+
+
+def test_many_positions_give_exactly_the_fields_of_each() -> None:
+    """From below the ground to the geostationary orbit, in the years of the model and after them."""
+    generator = np.random.default_rng(3)
+    directions = generator.normal(size=(100, 3))
+    heights = np.geomspace(6.3e6, 4.2e7, 100)[:, None]
+    positions = heights * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    dates = generator.uniform(julian_date(2000.0), julian_date(2060.0), 100)
+    each = [believed.field(float(date), position) for date, position in zip(dates, positions, strict=True)]
+    np.testing.assert_array_equal(believed.fields(dates, positions), each)
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-12, 1e-9, 2e-6])
+def test_a_position_near_a_pole_among_others_gives_its_field(off: float) -> None:
+    to_ground = celestial_to_terrestrial(DATE)
+    positions = 7e6 * np.array([[off, 0.0, 1.0], [0.0, off, -1.0], [1.0, 0.0, 0.0]]) @ to_ground
+    found = believed.fields(np.full(3, DATE), positions)
+    np.testing.assert_array_equal(found, [believed.field(DATE, position) for position in positions])
