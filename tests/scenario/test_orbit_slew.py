@@ -21,9 +21,9 @@ from tests.scenario.mode_flights import modes_of
 from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
-BEGIN, SLEW, TURN = 20.0, 150.0, np.radians([20.0, 20.0, -10.0])
-"""Begin (s) and duration (s) of the slew, and its rotation vector (rad). The rotation about x, along the
-field, is one that the field's own rotation permits at 0.7 deg/s; a path may rotate at 0.8 deg/s."""
+BEGIN, SLEW, AFTER, TURN = 20.0, 150.0, 15.0, np.radians([20.0, 20.0, -10.0])
+"""Begin and duration (s) of the slew, time (s) after it, and its rotation vector (rad). The rotation about x,
+along the field, is one that the field's own rotation permits at 0.7 deg/s; a path may rotate at 0.8 deg/s."""
 BROKEN = 22.0
 """Time (s) at which the coils x and z break. The remaining coil causes no torque about its own axis y, about
 which the slew rotates most."""
@@ -55,7 +55,7 @@ def slewing(duration: float, *faults: FaultEntry) -> tuple[OrbitConfig, Simulati
 
 @pytest.fixture(scope="module")
 def slewed(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    config, section = slewing(BEGIN + SLEW + 30.0)
+    config, section = slewing(BEGIN + SLEW + AFTER)
     return fly(config, tmp_path_factory.mktemp("slewed"), section=section)
 
 
@@ -90,7 +90,7 @@ def test_a_slew_is_handed_over_to_pointing_without_a_jump(slewed: Run) -> None:
     assert modes_of(slewed)[-1] is Mode.POINT
     before = part(slewed, begun[0] - 1.0, begun[0] + 1.0)
     assert np.degrees(angle_between(before["quaternion"][-1], before["target"][-1])) > 20.0
-    last, over = part(slewed, ended[0] - 1.0, ended[0])[-1], part(slewed, ended[0] + 0.1, ended[0] + 30.0)
+    last, over = part(slewed, ended[0] - 1.0, ended[0])[-1], part(slewed, ended[0] + 0.1, ended[0] + AFTER)
     left = np.degrees(angle_between(over["quaternion"], over["wanted"]))
     new = int(np.flatnonzero(left < 0.1)[0])
     handed = over[new]
@@ -126,13 +126,13 @@ def test_a_body_that_leaves_its_path_is_held_still_and_planned_for_again(cripple
 @pytest.mark.slow
 def test_a_slew_during_which_a_coil_is_isolated_ends_at_its_target(tmp_path: Path) -> None:
     """The rest of the slew is planned again for the other two coils."""
-    config, section = slewing(BEGIN + SLEW + 30.0, FaultEntry(fault="coil-x: open", at=1.0))
+    config, section = slewing(BEGIN + SLEW + AFTER, FaultEntry(fault="coil-x: open", at=1.0))
     run = fly(config, tmp_path, section=section)
     (begun,), (isolated,), (ended,) = (at(run, name) for name in ("slew-begun", "coil-broken", "slew-ended"))
     assert begun < isolated < ended
     assert SLEW - 5.0 < ended - begun < SLEW + 5.0
     assert not {"astray", "planner-failed", "tumbling"} & set(event_names(run))
-    arrived, there = part(run, ended, ended + 1.0), part(run, ended, ended + 30.0)
+    arrived, there = part(run, ended, ended + 1.0), part(run, ended, ended + AFTER)
     # A 3U slews to its target within 0.5 deg in 95 % of the flights (requirement).
     assert np.degrees(angle_between(arrived["quaternion"], arrived["target"])).max() < 0.5
     assert np.degrees(angle_between(there["quaternion"], there["target"])).max() < 2.0

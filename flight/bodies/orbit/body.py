@@ -255,8 +255,8 @@ class SatelliteEstimation(BodyEstimation):
 
     def field(self, estimate: Estimate) -> FloatArray:
         """Return the expected magnetic field (3,), T, in body axes, or zero while the orbit is unknown."""
-        around = self.environment.at(estimate.time_ns)
-        return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
+        field = self.environment.field(estimate.time_ns)
+        return np.zeros(3) if field is None else attitude_matrix(estimate.quaternion) @ field
 
     def angular_acceleration_psd(self, time_ns: int) -> FloatArray:
         """Return the power spectral density (3, 3), rad^2/s^3, of the acceleration noise at a time."""

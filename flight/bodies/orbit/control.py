@@ -181,11 +181,11 @@ class PointingTracker:
         self._window = None
 
     def _command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
-        around = self._environment.at(reference.time_ns)
+        around = self._environment.field(reference.time_ns)
         if around is None:
             return self._nothing
         residual = self._filter.residual_dipole
-        field = attitude_matrix(estimate.quaternion) @ around.field
+        field = attitude_matrix(estimate.quaternion) @ around
         quaternion, rate = estimate.quaternion, estimate.rate
         found = reference.law.command(
             reference.seconds, quaternion, rate, field, residual, self._filter.torque_sizes

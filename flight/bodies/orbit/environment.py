@@ -263,6 +263,11 @@ class EstimatedEnvironment:
             math.hypot(self.field_sigma(now_ns), self._displaced_field(near)),
         )
 
+    def field(self, now_ns: int) -> FloatArray | None:
+        """Return the magnetic field (3,), T, ICRS, or None while the orbit is unknown."""
+        near, times = self._prediction(now_ns)
+        return None if near is None else np.asarray(near.field_at(times)[0])
+
     def field_sigma(self, now_ns: int) -> float:
         """Return the standard deviation (T per axis) that a field model past its validity adds, usually 0."""
         return extrapolation_sigma(self.julian_date(now_ns))
