@@ -88,7 +88,10 @@ def emulate_vn100(emulation: Emulation, unit: InertialUnitSection) -> Vn100Emula
         free_fall=isinstance(emulation.world, OrbitingWorld),
     )
     line = emulation.connect(unit.device, unit.baud_rate)
-    return Vn100Emulator(emulation.sense, line, emulation.generator, settings, now_ns=emulation.start_ns)
+    emulator = Vn100Emulator(emulation.sense, line, emulation.generator, settings, now_ns=emulation.start_ns)
+    if line.baud_rate != unit.baud_rate:
+        emulator.set_baud_rate(unit.baud_rate)
+    return emulator
 
 
 def gps_errors(emulation: Emulation) -> GpsErrors:

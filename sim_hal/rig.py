@@ -63,6 +63,8 @@ PATIENCE_S = 5.0
 """Time (s) after which the device server ends if the flight process has died."""
 FARTHEST_ELEMENTS = 100e3
 """Largest accepted distance (m) of the two-line elements from the first revolution of the simulated orbit."""
+BENCH_COIL_FIELD = 5.0e-4
+"""Field (T/A) of a coil along its axis at the magnetometer, if `simulation.coil_field` is not given."""
 _START_S = 20.0
 """Longest time (s) that the server process may take to start."""
 _FACTS = ("socket", "camera", "lines", "coil_bus", "wide", "utc_offset_ns")
@@ -190,6 +192,43 @@ def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: Flo
     device = emulated_camera(camera, section.sky, motion, expose, clock.now_ns, objects)
     clock.attach(TimedSimulation(lambda _: None, [device]))
     return PosedCamera(clock, device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion))
+
+
+@dataclass(frozen=True, slots=True)
+class EmulatedBench:
+    """The rig of a body on a bench, and the hand that turns the body and covers the lens of the camera."""
+
+    rig: Rig
+    hardware: Hardware
+
+    def turn(self, axis: FloatArray, angle: float, seconds: float) -> None:
+        """Turn the upright body about `axis` (3,) by `angle` rad from now on. An angle of 0 puts it back."""
+        held: Any = self.hardware.world
+        held.turn(axis, angle, self.rig.clock.now_ns(), seconds)
+
+    def cover(self, on: bool) -> None:
+        """Put the cap on the lens or take it off. A camera with another fault keeps this fault."""
+        camera = self.hardware.camera
+        if camera is not None and camera.fault in {"", "capped"}:
+            camera.fault = "capped" if on else ""
+
+
+def open_bench(request: SimulationRequest, config: Config) -> EmulatedBench:
+    """Return the emulated devices of a configuration on a bench, in lock-step, with the configured faults.
+
+    The noise of the inertial unit is that of its data sheet plus the errors that `simulation.imu` adds. A
+    coil makes a field at the magnetometer even if the section does not describe this field.
+    """
+    section = request.section()
+    check(section.faults, config, False)
+    imu = configuration.replace(section.imu, profile="datasheet")
+    axes = np.array([coil.direction() for coil in config.coils.slots]).T
+    rows = section.coil_field or tuple(map(tuple, (BENCH_COIL_FIELD * axes).tolist()))
+    section = configuration.replace(section, world="bench", imu=imu, coil_field=rows)
+    clock = SimClock(utc_ns(section.utc))
+    devices = build_lockstep(config, section, None, clock)
+    devices.release(clock.now_ns())
+    return EmulatedBench(devices.rig(section.seed), devices.hardware)
 
 
 def fault_catalogue() -> tuple[str, str]:

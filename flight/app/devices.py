@@ -72,7 +72,7 @@ from knightcube.astro.quaternion import NED_TO_TESTBED, attitude_map, attitude_m
 from knightcube.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim_hal.rig import PosedCamera, SimulationRequest
+    from sim_hal.rig import EmulatedBench, PosedCamera, SimulationRequest
 
 NO_CAMERA = (
     "real devices are flown: give `{driver: v4l2, path: ...}` or `{driver: aravis, name: ...}`, or "
@@ -122,6 +122,13 @@ def simulated_camera(config_path: Path, text: str, config: Config, rate: FloatAr
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.open_camera(rig.SimulationRequest(config_path, text, Path()), config, rate)
+
+
+def emulated_bench(config_path: Path, text: str, config: Config) -> EmulatedBench:
+    """Return the emulated devices of a configuration on a bench, where a hand turns the body."""
+    from sim_hal import rig  # noqa: PLC0415
+
+    return rig.open_bench(rig.SimulationRequest(config_path, text, Path()), config)
 
 
 def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:

@@ -58,6 +58,7 @@ COMMANDS = {
         "samples:configure_samples",
     ),
     "horizon": ("sky", "find the nadir in a picture of the Earth's limb", "horizon:configure"),
+    "bringup": ("fly", "lead through the first bench session with new hardware", "bringup:configure"),
     "calibrate": ("sky", "calibrate a camera's lens from pictures of the sky", "calibrate:configure"),
 }
 """Group and purpose of each command, and the module and function that add its arguments to a parser."""

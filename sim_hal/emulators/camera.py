@@ -176,10 +176,19 @@ def blinded(pixels: Image, seed: int) -> Image:
     return np.asarray(np.clip(pixels + veil, 0, top).astype(pixels.dtype))
 
 
+def capped(pixels: Image, seed: int) -> Image:
+    """Return a frame behind a lens cap, with the level and the noise of the pixels without a star."""
+    level = float(np.median(pixels))
+    noise = 1.4826 * float(np.median(np.abs(pixels - level)))
+    dark = np.random.default_rng(seed).normal(level, noise, pixels.shape)
+    return np.asarray(np.clip(np.round(dark), 0, np.iinfo(pixels.dtype).max).astype(pixels.dtype))
+
+
 SPOILT: dict[str, Callable[[Image, int], Image]] = {
     "black": lambda pixels, _: np.zeros_like(pixels),
     "saturated": lambda pixels, _: np.full_like(pixels, np.iinfo(pixels.dtype).max),
     "blinded": blinded,
+    "capped": capped,
     "garbage": _garbage,
     "wrong": lambda pixels, _: np.ascontiguousarray(pixels[::-1]),
 }

@@ -1,0 +1,623 @@
+"""Diagnosis of a first bench session: noise and rate of the inertial unit, its axes, and the coils.
+
+The coils are compared by the field that each coil makes at the magnetometer per ampere, in both directions of
+the current, and by the current that the supply delivers. The measured response of each coil is compared with
+the expected response of every coil, so that exchanged, reversed and weak coils are distinguished. The axes of
+gyro, accelerometer and magnetometer follow from right-handed turns of 90 deg about each body axis, which
+begin with the z axis up. A hand keeps the angle and the axis to about 15 deg, so that only exchanged and
+reversed axes and large rotations are found. A turn leaves the common sign of the magnetometer open; the coils
+determine this sign.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares, linear_sum_assignment
+
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    from_matrix,
+    from_rotation_vector,
+    to_rotation_vector,
+)
+
+QUARTER = 0.5 * math.pi
+"""Angle (rad) of the turn about each body axis."""
+GRAVITY = 9.80665
+RECOGNISED = math.radians(25.0)
+"""Largest angle between a measured and an expected direction that belong together."""
+FEWEST = 20
+"""Smallest number of samples from which noise is determined."""
+ALIKE = math.radians(15.0)
+"""Largest angle between the axes of two sensors that have the same axes."""
+_AXES = "xyz"
+_NEAR = 0.15
+"""Relative difference up to which a measured value agrees with its expected value."""
+UNRECOGNISED = "unlike the configuration, cause not recognised"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One fault of a part.
+
+    Attributes:
+        part: section of the configuration, for example `coils.windings[0]`.
+        kind: kind of the fault in one or two words, for example `reversed`.
+        text: measured value and its meaning.
+        cure: remedy.
+        coil: index of the coil whose resistance differs, or None.
+        factor: factor by which the resistance differs, or None.
+    """
+
+    part: str
+    kind: str
+    text: str
+    cure: str
+    coil: int | None = None
+    factor: float | None = None
+
+    def line(self) -> str:
+        """Return the finding as one line."""
+        return f"{self.part}: {self.kind}: {self.text}: {self.cure}"
+
+
+def signed_permutations() -> list[FloatArray]:
+    """Return the 48 matrices (3, 3) that exchange and reverse axes; the identity is the first."""
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            found.append(matrix)
+    return found
+
+
+def axis_names(matrix: FloatArray) -> str:
+    """Return which body axis each measured axis shows, such as `x shows -y, y shows x`."""
+    shown = []
+    for name, row in zip(_AXES, matrix, strict=True):
+        index = int(np.argmax(np.abs(row)))
+        other = f"{'-' if row[index] < 0 else ''}{_AXES[index]}"
+        if other != name:
+            shown.append(f"{name} shows {other}")
+    return ", ".join(shown)
+
+
+# Inertial unit at rest and in turns.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Readings of the inertial unit: `times` (k,), s, and rate, field and acceleration (k, 3), body axes."""
+
+    times: FloatArray
+    rate: FloatArray
+    field: FloatArray
+    acceleration: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class UnitExpectation:
+    """Expected sample rate (Hz) and noise of a sample: gyro (rad/s), field (T) and acceleration (m/s^2)."""
+
+    rate_hz: float
+    gyro: float
+    field: float
+    acceleration: float
+
+
+def noise_of(values: FloatArray) -> FloatArray:
+    """Return the white noise (3,) of values (k, 3), which slow drifts do not increase."""
+    return np.asarray(np.std(np.diff(values, axis=0), axis=0) / math.sqrt(2.0))
+
+
+def allan_deviation(values: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
+    """Return averaging times (m,), s, and the Allan deviations (m, 3) of values (k, 3)."""
+    sizes = [1 << n for n in range(int(math.log2(max(len(values) // 4, 1))) + 1)]
+    found = []
+    for size in sizes:
+        means = values[: len(values) // size * size].reshape(-1, size, 3).mean(axis=1)
+        found.append(np.sqrt(0.5 * np.mean(np.diff(means, axis=0) ** 2, axis=0)))
+    return period * np.array(sizes), np.array(found)
+
+
+def diagnose_rest(
+    samples: Samples, span: float, expected: UnitExpectation, bad: float, strongest: float
+) -> list[Finding]:
+    """Return the faults of an inertial unit that rested for `span` s.
+
+    `bad` is the share of packets with a wrong checksum, `strongest` the largest field (T) that the site has.
+    """
+    found, part = [], "inertial_unit"
+    if bad > 0.01:
+        text = f"{100.0 * bad:.1f} % of the packets have a wrong checksum"
+        cure = "check the ground wire and the length of the cable, or lower the baud rate"
+        found.append(Finding(part, "corrupted packets", text, cure))
+    measured = len(samples.times) / span
+    if abs(measured / (expected.rate_hz * max(1.0 - bad, 0.01)) - 1.0) > 0.05:
+        text = f"{measured:.1f} valid samples per second arrive instead of {expected.rate_hz:g}"
+        cure = "check `rate_hz`, the baud rate, which limits the samples, and the cable"
+        found.append(Finding(part, "wrong rate", text, cure))
+    if len(samples.times) < FEWEST:
+        return found
+    quantities = (
+        ("gyro", samples.rate, expected.gyro, "rad/s"),
+        ("magnetometer", samples.field, expected.field, "T"),
+        ("accelerometer", samples.acceleration, expected.acceleration, "m/s^2"),
+    )
+    for name, values, sigma, unit in quantities:
+        found += _noise_findings(f"{part}.{name}", values, sigma, unit)
+    return found + _rest_values(samples, strongest)
+
+
+def _noise_findings(part: str, values: FloatArray, sigma: float, unit: str) -> list[Finding]:
+    """Return the fault that the noise of a sensor shows, if any."""
+    noise = noise_of(values)
+    if not np.isfinite(values).all():
+        return [Finding(part, "dead", "it sends values that are not numbers", "replace the sensor")]
+    if noise.max() > 3.0 * sigma:
+        axis = _AXES[int(np.argmax(noise))]
+        text = f"noise {noise.max():.2g} {unit} on {axis}, expected {sigma:.2g}"
+        cure = "keep the unit still and away from supplies and fans; replace it if the noise stays"
+        return [Finding(part, "noisy", text, cure)]
+    if noise.min() < 1e-3 * sigma:
+        axes = ", ".join(axis for axis, value in zip(_AXES, noise, strict=True) if value < 1e-3 * sigma)
+        text = f"its values on {axes} do not change: noise {noise.min():.1e} {unit}, expected {sigma:.2g}"
+        return [Finding(part, "stuck", text, "switch the unit off and on; replace it if the values stay")]
+    return []
+
+
+def _rest_values(samples: Samples, strongest: float) -> list[Finding]:
+    """Return the faults in the mean values of a resting unit."""
+    found, part = [], "inertial_unit"
+    bias = samples.rate.mean(axis=0)
+    if np.abs(bias).max() > 0.02:
+        found.append(
+            Finding(
+                f"{part}.gyro",
+                "biased",
+                f"it measures {np.abs(bias).max():.3f} rad/s at rest",
+                "keep the body still and repeat the step; calibrate the gyro if the bias stays",
+            )
+        )
+    force = float(np.linalg.norm(samples.acceleration.mean(axis=0)))
+    if np.isfinite(force) and abs(force / GRAVITY - 1.0) > 0.05:
+        found.append(
+            Finding(
+                f"{part}.accelerometer",
+                "wrong scale",
+                f"it measures {force:.2f} m/s^2 at rest instead of {GRAVITY:.2f}",
+                "check the range and the unit of its driver",
+            )
+        )
+    field = float(np.linalg.norm(samples.field.mean(axis=0)))
+    if np.isfinite(field) and not 1.5e-5 <= field <= strongest:
+        found.append(
+            Finding(
+                f"{part}.magnetometer",
+                "wrong scale",
+                f"it measures {1e6 * field:.3g} uT at rest, the site has 15 to {1e6 * strongest:.0f} uT",
+                "check the unit and the range of its driver, and remove magnets and iron",
+            )
+        )
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turns:
+    """Measurements of the turns about x, y and z, whose first index is the axis of the turn.
+
+    Attributes:
+        gyro: rotation vectors (3, 3) by the gyro, rad.
+        before, after: mean acceleration and field (3, 2, 3) before and after each turn.
+    """
+
+    gyro: FloatArray
+    before: FloatArray
+    after: FloatArray
+
+
+def turned(samples: Samples, bias: FloatArray) -> FloatArray:
+    """Return the integral (3,), rad, of the gyro's rate less its `bias` (3,), rad/s.
+
+    For a turn about one axis, the integral is the rotation vector, also beyond half a turn.
+    """
+    steps = np.diff(samples.times)[:, None]
+    return np.asarray(np.sum((samples.rate[1:] - bias) * steps, axis=0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxesFound:
+    """The axes of each sensor: the orthogonal matrix (3, 3) from body axes to measured axes, or None."""
+
+    gyro: FloatArray | None
+    accelerometer: FloatArray | None
+    magnetometer: FloatArray | None
+    findings: list[Finding]
+
+
+def diagnose_axes(turns: Turns) -> AxesFound:
+    """Return the axes of gyro, accelerometer and magnetometer from the turns about x, y and z."""
+    findings: list[Finding] = []
+    gyro = _gyro_axes(turns.gyro, findings)
+    axes: dict[str, FloatArray | None] = {"gyro": gyro}
+    # The gyro measures the turns better than a hand makes them, if its scale is right.
+    vectors = QUARTER * np.eye(3) if gyro is None or findings else turns.gyro @ gyro
+    rotations = [attitude_matrix(from_rotation_vector(vector)) for vector in vectors]
+    up = np.array([0.0, 0.0, 1.0])
+    force = np.concatenate([turns.before[:, 0], turns.after[:, 0]]) / GRAVITY
+    if np.isfinite(force).all():
+        axes["accelerometer"] = _orthogonal(force, np.array([up] * 3 + [one @ up for one in rotations]))
+    if np.isfinite(turns.before[:, 1]).all() and np.isfinite(turns.after[:, 1]).all():
+        axes["magnetometer"] = _field_axes(turns.before[:, 1], turns.after[:, 1], rotations, gyro)
+    for index, name in enumerate(("accelerometer", "magnetometer")):
+        size = float(np.linalg.norm(turns.before[0, index]))
+        if name in axes and np.abs(turns.after[:, index] - turns.before[:, index]).max() < 0.02 * size:
+            axes[name] = None
+            text, cure = "its values do not change in the turns", "switch the unit off and on, or replace it"
+            findings.append(Finding(f"inertial_unit.{name}", "stuck", text, cure))
+        elif name in axes and axes[name] is None:
+            text = f"its values in the turns are {UNRECOGNISED}"
+            cure = "repeat the turns with exact angles of 90 deg, away from iron"
+            findings.append(Finding(f"inertial_unit.{name}", "wrong axes", text, cure))
+    found = {name: _nearest(matrix) for name, matrix in axes.items() if matrix is not None}
+    common = _common(found)
+    if common is not None:
+        found = dict.fromkeys(found, common)
+        if not _is_identity(common):
+            findings.append(_wrong_axes("inertial_unit", common))
+    else:
+        wrong = {name: matrix for name, matrix in found.items() if not _is_identity(matrix)}
+        findings += [_wrong_axes(f"inertial_unit.{name}", matrix) for name, matrix in wrong.items()]
+    return AxesFound(found.get("gyro"), found.get("accelerometer"), found.get("magnetometer"), findings)
+
+
+def _common(found: dict[str, FloatArray]) -> FloatArray | None:
+    """Return the axes of all sensors if they agree, or None. The sign of the magnetometer's axes is open."""
+    if "gyro" not in found:
+        return None
+    first = found["gyro"]
+    agree = [
+        min(_angle(matrix, first), _angle(-matrix, first) if name == "magnetometer" else math.pi) <= ALIKE
+        for name, matrix in found.items()
+    ]
+    return first if len(found) > 1 and all(agree) else None
+
+
+def _wrong_axes(part: str, axes: FloatArray) -> Finding:
+    """Return the finding about a sensor, or the whole unit, with other axes than the configured ones."""
+    whole, proper = part == "inertial_unit", np.linalg.det(axes) > 0
+    sensors = "all sensors have other axes" if whole else "its axes differ from the body's"
+    if not np.allclose(np.abs(axes).max(axis=1), 1.0):
+        vector = -to_rotation_vector(from_matrix(axes if proper else -axes))
+        about = ", ".join(f"{value:.2f}" for value in vector / np.linalg.norm(vector))
+        text = f"{sensors}: rotated by {math.degrees(float(np.linalg.norm(vector))):.0f} deg about ({about})"
+    else:
+        text = f"{sensors}: {axis_names(axes)}"
+    if whole and proper:
+        cure = "set `mounting` as in the fragment, or mount the unit as configured"
+    elif proper or not whole:
+        cure = "correct `sensors[].measures`; reset registers 23 and 26 of a VN-100 to the identity"
+    else:
+        cure = "correct the axes in the driver, because no mounting mirrors a unit"
+    return Finding(part, "rotated" if proper else "mirrored", text, cure)
+
+
+def _is_identity(axes: FloatArray) -> bool:
+    return bool(np.allclose(axes, np.eye(3)))
+
+
+def _angle(first: FloatArray, second: FloatArray) -> float:
+    """Return the angle (rad) between two orthogonal matrices; pi if one mirrors and the other does not."""
+    product = first @ second.T
+    if np.linalg.det(product) < 0:
+        return math.pi
+    return math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(product)) - 1.0))))
+
+
+def _nearest(axes: FloatArray) -> FloatArray:
+    """Return the signed permutation near an orthogonal matrix, or the matrix itself if none is near."""
+    best = min(signed_permutations(), key=lambda matrix: _angle(matrix, axes))
+    return best if _angle(best, axes) <= RECOGNISED else axes
+
+
+def _orthogonal(measured: FloatArray, true: FloatArray) -> FloatArray | None:
+    """Return the orthogonal matrix that maps true unit vectors (k, 3) to measured ones, or None."""
+    left, _, right = np.linalg.svd(measured.T @ true)
+    found = left @ right
+    return found if np.linalg.norm(measured - true @ found.T, axis=1).max() <= RECOGNISED else None
+
+
+def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | None:
+    """Return the gyro's axes from the integrals (3, 3) of its rate in the turns, or None with a finding."""
+    part, sizes = "inertial_unit.gyro", np.linalg.norm(measured, axis=1)
+    if not np.isfinite(sizes).all():
+        text = "its rates are not numbers, or outside its range"
+        cure = "check the unit of its driver (deg/s or rad/s), or replace the gyro"
+        findings.append(Finding(part, "dead", text, cure))
+        return None
+    if (sizes < 0.2 * QUARTER).any():
+        for axis in np.flatnonzero(sizes < 0.2 * QUARTER):
+            text = f"a turn of 90 deg about {_AXES[axis]} gave {math.degrees(sizes[axis]):.1f} deg"
+            findings.append(Finding(part, "dead", text, "repeat the turn; replace the gyro if it stays so"))
+        return None
+    ratio = sizes / QUARTER
+    if (np.abs(np.log(ratio)) > math.log(1.35)).any():
+        shown = ", ".join(f"{axis} {value:.2f}" for axis, value in zip(_AXES, ratio, strict=True))
+        text = f"ratio of measured to asked angle: {shown}"
+        cure = "turn by 90 deg; if the ratio stays, check the range and the unit (deg/s, rad/s) of the driver"
+        findings.append(Finding(part, "wrong scale", text, cure))
+    found = _orthogonal(measured / sizes[:, None], np.eye(3))
+    if found is None:
+        text = f"the axes of its rates in the turns are {UNRECOGNISED}"
+        findings.append(Finding(part, "wrong axes", text, "repeat the turns about the asked axes"))
+    return found
+
+
+def _field_axes(
+    before: FloatArray, after: FloatArray, turns: Sequence[FloatArray], gyro: FloatArray | None
+) -> FloatArray | None:
+    """Return the magnetometer's axes from fields (3, 3) before and after turns, with an unknown bias.
+
+    The fit starts from the best exchange of axes and from the axes of the gyro.
+
+    The common sign is open: of two matrices with opposite signs, the matrix closer to the identity is
+    returned. None is returned if no matrix explains the fields.
+    """
+    values = np.concatenate([*before, *after])
+
+    def solved(axes: FloatArray) -> tuple[FloatArray, float]:
+        """Return the residuals and the size of the field for given axes."""
+        rows = [np.hstack([np.eye(3), np.eye(3)])] * 3
+        rows += [np.hstack([axes @ turn @ axes.T, np.eye(3)]) for turn in turns]
+        matrix = np.vstack(rows)
+        unknown = np.linalg.lstsq(matrix, values, rcond=None)[0]
+        return matrix @ unknown - values, float(np.linalg.norm(unknown[:3]))
+
+    def rotated(vector: FloatArray, start: FloatArray) -> FloatArray:
+        return np.asarray(attitude_matrix(from_rotation_vector(vector)) @ start)
+
+    def refined(start: FloatArray) -> FloatArray:
+        size = solved(start)[1] or 1.0
+        fit = least_squares(lambda vector: solved(rotated(vector, start))[0] / size, np.zeros(3), x_scale=0.1)
+        return rotated(fit.x, start)
+
+    def misfit(axes: FloatArray) -> float:
+        return float(np.sum(solved(axes)[0] ** 2))
+
+    proper = sorted((one for one in signed_permutations() if np.linalg.det(one) > 0), key=misfit)
+    found = min((refined(start) for start in (proper[0], gyro) if start is not None), key=misfit)
+    residuals, size = solved(found)
+    if not size or np.linalg.norm(residuals.reshape(-1, 3), axis=1).max() > RECOGNISED * size:
+        return None
+    return found if np.trace(found) >= 0.0 else -found
+
+
+# Coils.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoilTest:
+    """The measurements of n coils that were driven one after the other.
+
+    Attributes:
+        commanded: current of each coil (n,), A.
+        plus, minus: field change per ampere (n, 3), T/A, for a positive and for a negative current.
+        current: increase of the supply current (n, 2), A, for both directions; NaN without a monitor.
+        idle: supply current (A) without a command; NaN without a monitor.
+        noise: standard deviation of a field change per ampere, T/A.
+        fault: text of a failed command to the coils, or an empty text.
+        clipped: whether a current exceeded the range of the monitor.
+    """
+
+    commanded: FloatArray
+    plus: FloatArray
+    minus: FloatArray
+    current: FloatArray
+    idle: float
+    noise: float
+    fault: str = ""
+    clipped: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoilsFound:
+    """The result of the coils' test.
+
+    Attributes:
+        response, expected: field of each command (n, 3), T/A, in body axes.
+        serves: index (n,) of the configured coil that each command drives, or -1.
+        strength: field of each command (n,) relative to that of the coil that it drives; negative if
+            reversed.
+        misfit: angle (n,), rad, between measured and expected field, without regard to the sign.
+        live: mask of the commands (n,) that make a field.
+        drawn: supply current (n,) relative to the command, corrected for a wrong shunt; NaN if unknown.
+        shunt: factor by which the shunt differs from the configured one, or 1.
+        findings: the faults.
+    """
+
+    response: FloatArray
+    expected: FloatArray
+    serves: list[int]
+    strength: FloatArray
+    misfit: FloatArray
+    live: BoolArray
+    drawn: FloatArray
+    shunt: float
+    findings: list[Finding]
+
+
+def diagnose_coils(
+    test: CoilTest,
+    expected: FloatArray,
+    names: Sequence[str],
+    magnetometer: FloatArray | None = None,
+    *,
+    size_known: bool = True,
+) -> CoilsFound:
+    """Return the faults of the coils, given the expected field (n, 3), T/A, of each coil in body axes.
+
+    The matrix `magnetometer` (3, 3) maps body axes to measured axes; its sign may be wrong. If the expected
+    size is not known (`size_known`), the median of the coils is the expected size.
+    """
+    axes = np.eye(3) if magnetometer is None else magnetometer
+    plus, minus = test.plus @ axes, test.minus @ axes  # rows in body axes
+    response = 0.5 * (plus + minus)
+    size = np.linalg.norm(response, axis=1)
+    if not size_known:
+        expected = expected * float(np.median(size[size >= 0.2 * size.max()]) or 1.0)
+    live = size > np.maximum(0.12 * np.linalg.norm(expected, axis=1), 6.0 * test.noise)
+    serves, strength, misfit = _match(response, expected, live)
+    sign, found = _common_sign(strength, misfit, live)
+    drawn = np.mean(test.current, axis=1) / test.commanded
+    state = CoilsFound(response, expected, serves, sign * strength, misfit, live, drawn, 1.0, found)
+    shared, shunt = _shared_fault(test, state, size_known)
+    state = replace(state, drawn=drawn / shunt, shunt=shunt)
+    found += shared
+    if not any(one.part in {"coils", "inertial_unit.magnetometer"} and one.kind in _ALL for one in shared):
+        legs = np.linalg.norm(np.stack([plus, minus], axis=1), axis=2)
+        for j in range(len(names)):
+            found += _coil_findings(state, j, names, legs[j])
+    return state
+
+
+_ALL = frozenset({"no field", "no supply", "no response", "wrong supply voltage"})
+"""Kinds of faults that concern all coils, after which single coils are not judged."""
+
+
+def _common_sign(strength: FloatArray, misfit: FloatArray, live: BoolArray) -> tuple[float, list[Finding]]:
+    """Return -1 and a finding if the fields of all coils are opposite, which is one fault of one sensor."""
+    count = int(live.sum())
+    if count < 2 or (strength[live] > 0).any() or (misfit[live] > RECOGNISED).any():
+        return 1.0, []
+    text = f"the fields of all {count} coils are opposite"
+    cure = "reverse the magnetometer's axes; or set `sign: -1` for all coils if all are wound the other way"
+    return -1.0, [Finding("inertial_unit.magnetometer", "reversed sign", text, cure)]
+
+
+def _match(
+    response: FloatArray, expected: FloatArray, live: BoolArray
+) -> tuple[list[int], FloatArray, FloatArray]:
+    """Return the configured coil of each command (n,), its relative strength (n,) and the angle (n,), rad."""
+    count = len(response)
+    unit = expected / np.linalg.norm(expected, axis=1, keepdims=True)
+    length = np.linalg.norm(response, axis=1, keepdims=True)
+    cosine = response / np.where(length > 0.0, length, 1.0) @ unit.T
+    own = 0.05 * np.eye(count)  # parallel coils are not considered exchanged
+    rows = np.flatnonzero(live)
+    serves, strength, misfit = [-1] * count, np.zeros(count), np.full(count, math.pi)
+    if len(rows):
+        picked, columns = linear_sum_assignment(-(np.abs(cosine) + own)[rows])
+        for j, k in zip(rows[picked].tolist(), columns.tolist(), strict=True):
+            serves[j] = k
+            strength[j] = float(response[j] @ unit[k] / np.linalg.norm(expected[k]))
+            misfit[j] = math.acos(min(1.0, abs(float(cosine[j, k]))))
+    return serves, strength, misfit
+
+
+def _shared_fault(test: CoilTest, state: CoilsFound, size_known: bool) -> tuple[list[Finding], float]:
+    """Return the faults that all coils share, and the factor of the shunt."""
+    live, drawn, count = state.live, state.drawn, len(state.live)
+    flowing = drawn > 0.12
+    found = []
+    if abs(test.idle) > max(0.1 * float(np.median(test.commanded)), 0.008):
+        text = f"the supply delivers {1e3 * test.idle:.0f} mA with all coils at zero"
+        cure = "switch the coils' supply off, and look for a bridge leg that is stuck high"
+        found.append(Finding("coils", "current while off", text, cure))
+    if not live.any() and not flowing.any():
+        unknown = not np.isfinite(drawn).any()
+        text = f"none of the {count} coils makes a field{'' if unknown else ' or draws current'}"
+        cure = "check the coils' supply, the output enable line, and the magnetometer"
+        return [*found, Finding("coils", "no field" if unknown else "no supply", text, cure)], 1.0
+    if not live.any() and count > 1:
+        text = "the coils draw current, but the measured field does not change"
+        cure = "the magnetometer is stuck or far from the coils: move or replace it"
+        return [*found, Finding("inertial_unit.magnetometer", "no response", text, cure)], 1.0
+    if live.sum() > 1 and np.isfinite(drawn).all() and np.abs(drawn).max() < 0.03:
+        text = "the coils make their fields, but the measured current stays zero"
+        cure = "wire the monitor's shunt into the supply line of the bridges"
+        return [*found, Finding("power_monitor", "no current", text, cure)], 1.0
+    usable = live & (np.abs(drawn) > 0.03)
+    common = float(np.median(drawn[usable])) if usable.sum() > 1 else 1.0
+    alike = np.abs(drawn[usable] / common - 1.0) < _NEAR
+    if abs(common - 1.0) < _NEAR or 2 * int(alike.sum()) <= int(usable.sum()):
+        return found, 1.0
+    return [*found, *_wrong_current(test, state, common, size_known)], common
+
+
+def _wrong_current(test: CoilTest, state: CoilsFound, common: float, size_known: bool) -> list[Finding]:
+    """Return the finding about a supply current that differs by the factor `common` in all coils."""
+    fields = float(np.median(np.abs(state.strength[state.live])))
+    bound = "at least " if test.clipped else ""
+    text = f"the measured current is {bound}{common:.3g} times the commanded one"
+    if size_known and abs(common / fields - 1.0) < _NEAR:
+        cure = f"correct the supply; or multiply `supply_voltage` by {common:.3g}"
+        return [Finding("coils", "wrong supply voltage", f"{text}, and so are the fields", cure)]
+    cure = f"set `shunt` to the fitted one, {bound}{common:.3g} times the configured one"
+    if size_known or not 0.3 < common < 3.0:
+        return [Finding("power_monitor", "wrong shunt", text, cure)]
+    cure = "check the shunt, `supply_voltage` and the resistances; the size of the fields is not configured"
+    return [Finding("power_monitor", "wrong current", text, cure)]
+
+
+def _coil_findings(state: CoilsFound, j: int, names: Sequence[str], legs: FloatArray) -> list[Finding]:
+    """Return the faults of the command to coil `j`, given its field (2,), T/A, in both directions."""
+    part, name, k = f"coils.windings[{j}]", names[j], state.serves[j]
+    if not state.live[j]:
+        return [_without_field(part, name, float(state.drawn[j]))]
+    if state.misfit[j] >= RECOGNISED:
+        text = f"coil {name}: its field is {math.degrees(state.misfit[j]):.0f} deg off, {UNRECOGNISED}"
+        return [Finding(part, "wrong direction", text, "check the coil's axis, and remove iron and magnets")]
+    found = []
+    if k != j:
+        reversed_too = ", reversed" if state.strength[j] < 0 else ""
+        text = f"the command of coil {name} drives coil {names[k]}{reversed_too}"
+        found.append(Finding(part, "exchanged", text, "use the fragment's `channels`, or exchange the plugs"))
+    elif state.strength[j] < 0:
+        text = f"coil {name}: its field is opposite"
+        found.append(Finding(part, "reversed", text, "set `sign: -1`, or exchange the coil's two wires"))
+    if legs.min() < 0.25 * legs.max():
+        way, leg = ("positive", "A") if legs[0] < legs[1] else ("negative", "B")
+        text, cure = f"coil {name}: a {way} current makes no field", f"check input {leg} of its bridge"
+        return [*found, Finding(part, "half bridge", text, f"{cure}, and the PWM channel")]
+    return found + _wrong_size(part, name, abs(float(state.strength[j])), float(state.drawn[j]))
+
+
+def _without_field(part: str, name: str, drawn: float) -> Finding:
+    """Return the finding about a coil without field, which draws `drawn` times the commanded current."""
+    if math.isnan(drawn):
+        return Finding(
+            part, "no field", f"coil {name}: its field does not change", "check wires and channels"
+        )
+    if drawn < 0.12:
+        cure = "check the coil's wires and plug, and the bridge's `channels`"
+        return Finding(part, "open", f"coil {name}: no field and no current", cure)
+    text = f"coil {name}: no field, but {drawn:.2f} times the commanded current"
+    if drawn > 1.2:
+        return Finding(part, "short", text, "separate the coil's wires: the bridge drives a short circuit")
+    return Finding(part, "current without field", text, "check the plug: the current flows past the coil")
+
+
+def _wrong_size(part: str, name: str, size: float, drawn: float) -> list[Finding]:
+    """Return the finding about a coil whose field or current has another size than expected."""
+    allowed, known = _NEAR + 0.05, not math.isnan(drawn)
+    right_current = not known or abs(drawn - 1.0) <= allowed
+    if abs(size - 1.0) <= allowed and right_current:
+        return []
+    text = f"coil {name}: field {size:.2f} times the expected one"
+    text += f", current {drawn:.2f} times the commanded one" if known else ""
+    if right_current:
+        cure = f"check turns and place of the coil; multiply its dipole moment per ampere by {size:.2f}"
+        return [Finding(part, "wrong strength", text, cure)]
+    if drawn > 0.0 and abs(drawn / size - 1.0) <= _NEAR:
+        cure, index = f"multiply `resistance` by {1.0 / drawn:.2f}", int(part.partition("[")[2][:-1])
+        return [Finding(part, "wrong resistance", text, cure, index, 1.0 / drawn)]
+    if drawn > 1.3:
+        return [Finding(part, "short", text, "separate the shorted turns or wires")]
+    return [Finding(part, "unlike", f"{text}, {UNRECOGNISED}", "check coil, plug and bridge")]
