@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -83,7 +84,7 @@ def _response(ax: Axes, outcome: Outcome) -> None:
     places = np.arange(len(response))
     for index, (name, colour) in enumerate(AXIS_COLOURS.items()):
         ax.bar(places + 0.27 * (index - 1), response[:, index], 0.25, color=colour, label=name)
-        marks = {"linestyle": "", "marker": "_", "markersize": 16.0, "color": BLACK}
+        marks: dict[str, Any] = {"linestyle": "", "marker": "_", "markersize": 16.0, "color": BLACK}
         expected = 1e6 * outcome.arrays["expected"][:, index]
         ax.plot(places + 0.27 * (index - 1), expected, label="expected" if index == 2 else "", **marks)
     ax.axhline(0.0, color=GREY, linewidth=0.8)

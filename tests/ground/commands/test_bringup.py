@@ -70,7 +70,15 @@ def test_a_repeated_session_does_only_the_missing_steps(bench: Path, monkeypatch
 
     for name in list(STEPS):
         noted(name)
-    words = ["bringup", "step_demo", "--wired", bench / "wired.yaml", "--out", bench / "bench", "--json"]
+    words: list[str | Path] = [
+        "bringup",
+        "step_demo",
+        "--wired",
+        bench / "wired.yaml",
+        "--out",
+        bench / "bench",
+        "--json",
+    ]
     first = json.loads(command(*words).stdout)
     assert done == ["find", "rest", "dark", "light", "focus", "lens"]
     assert first["steps"]["coils"]["findings"], "the findings of the kept steps are reported again"
