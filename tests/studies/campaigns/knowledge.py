@@ -271,8 +271,8 @@ CRAFT = {
 
 The KnightCube flies the orbit of its configuration, and the 3U that of the ISS.
 """
-FOLLOWED, STARS_UNTIL = 600, 60
-"""Time (s) for which the attitude is followed, and time until which there are star attitudes."""
+FOLLOWED, STARS_UNTIL, FILTER_STEP = 300, 60, 2
+"""Time (s) for which the attitude is followed, time until which there are star attitudes, and filter step."""
 ROLLOVER = "2038-11-20T23:15:00"
 """UTC three quarters of an hour before the ten-bit week of GPS begins again."""
 LEAP = "2035-06-30T23:15:00"
@@ -333,13 +333,8 @@ def fly_month(case: Case) -> Result:
         result["field_sigmas"] = max(result["field_sigmas"], float(np.abs(off).max()) / sigma)
         result["dark"] += share == 0.0
         wrong += share in (0.0, 1.0) and abs(found.sunlit - share) > 0.5
-    return {
-        **given,
-        **result,
-        "eclipse_wrong": wrong,
-        "used": used,
-        **_followed(config, receiver, rng),
-    }
+    followed = _followed(config, receiver, rng)
+    return {**given, **result, "eclipse_wrong": wrong, "used": used, **followed}
 
 
 class _UnlikeBody:
@@ -358,15 +353,15 @@ class _UnlikeBody:
         self.quaternion, self._rate = quaternion / np.linalg.norm(quaternion), rng.uniform(-2e-3, 2e-3, 3)
 
     def turn(self, around: FilterEnvironment) -> None:
-        """Rotate for a second without currents in the coils."""
-        for _ in range(4):
+        """Rotate for a filter step without currents in the coils."""
+        for _ in range(2 * FILTER_STEP):
             torque = self._motion.torque(self.quaternion, np.zeros(3), self._dipole, np.zeros(9), around)[0]
-            change = 0.25 * self._motion.acceleration(self._rate, torque)
-            turned = from_rotation_vector(0.25 * (self._rate + 0.5 * change))
+            change = 0.5 * self._motion.acceleration(self._rate, torque)
+            turned = from_rotation_vector(0.5 * (self._rate + 0.5 * change))
             self.quaternion, self._rate = multiply(turned, self.quaternion), self._rate + change
 
     def measured(self, around: FilterEnvironment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the mean gyro rate of a second, the magnetic field, and the star camera's attitude."""
+        """Return the gyro rate, the magnetic field, and the star camera's attitude."""
         noise, (bias, magnet, camera) = self._rng.standard_normal((3, 3)), self._off
         gyro = self._rate + bias + self._unit.rate_noise / math.sqrt(self._unit.rate_hz) * noise[0]
         field = attitude_matrix(self.quaternion) @ around.field + magnet + self._field_noise * noise[1]
@@ -381,20 +376,24 @@ def _followed(config: OrbitConfig, receiver: Receiver, rng: np.random.Generator)
     for second in (0, 1, 2):
         known.fix(receiver.reading(second))
     nothing, worst, end, eye = Pressures(np.zeros((1, 3)), np.zeros((1, 3))), 0.0, 0.0, np.eye(3)
-    for second in range(3, 3 + FOLLOWED):
+    knots = np.arange(0.0, FOLLOWED + 11.0, 10.0)
+    dates = [receiver.date(knot) for knot in knots]
+    fields = np.array([magnetic_field.field(date, receiver.true.at(date).position) for date in dates])
+    for second in range(4, FOLLOWED + 1, FILTER_STEP):
         if second % 60 == 0:
             known.fix(receiver.reading(second))
-        around, date = known.at(second * SECOND_NS), receiver.date(second)
+        around = known.at(second * SECOND_NS)
         if around is None:
             return {"attitude_sigmas": math.inf, "attitude_deg": 180.0}
-        position = receiver.true.at(date).position
-        here = FilterEnvironment(magnetic_field.field(date, position), position, nothing, around.sunlit)
+        field = np.array([np.interp(second, knots, part) for part in fields.T])
+        position = receiver.true.at(receiver.date(second)).position
+        here = FilterEnvironment(field, position, nothing, around.sunlit)
         body.turn(here)
         gyro, field, stars = body.measured(here)
         if not free.started:
             free.start(stars, STAR_SIGMA**2 * eye, gyro, by_stars=True)
             continue
-        free.advance(1.0, np.zeros(3), around)
+        free.advance(FILTER_STEP, np.zeros(3), around)
         free.gyro(gyro, unit.rate_noise**2 / unit.rate_hz * eye)
         free.field(field, around.field, config.estimation.field_noise**2 * eye)
         if second <= STARS_UNTIL and second % 10 == 0:
