@@ -366,7 +366,7 @@ class AttitudeFilter:
     def __init__(self, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None) -> None:
         """Create a filter that has not started.
 
-        The prior of the slow states follows from the settings by default.
+        The prior of the slow states follows from the settings by default, and after each restart.
         """
         self._settings = settings
         self._prior = prior or slow_prior(body, settings)
@@ -553,6 +553,9 @@ class AttitudeFilter:
         enough = min(max(accepted, self.REJECTIONS_AT_THE_START), self.REJECTIONS_TO_RESTART)
         if kind is not MeanRateMeasurement and in_a_row >= enough:
             self._history.restart(None)
+            # The measurements contradict the prior, which an earlier boot may have learned wrongly.
+            self._prior = slow_prior(self._model.body, self._settings)
+            self._layout = error_state(self._model.body, self._settings, self._prior)
             self._refused_in_a_row = {}
             self.restarts += 1
             self._discard_branch()

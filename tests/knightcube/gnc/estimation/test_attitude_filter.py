@@ -12,7 +12,7 @@ from flight.bodies.testbed.control import about_thread
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, angle_between, conjugate, from_rotation_vector, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, slow_prior
 from knightcube.gnc.estimation.estimate import ATTITUDE, BIAS, PARAMETERS, RATE, Estimate, Parameters
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
 from tests.knightcube.gnc.estimation.flights import (
@@ -332,3 +332,25 @@ def test_a_cycle_and_a_replay_fit_into_the_40_hz_loop(suspended: bool) -> None:
     accepted = []
     assert ordinary_seconds(lambda: accepted.append(filter_.measure(mean)), 1) < 40e-3
     assert accepted == [True]
+
+
+@pytest.mark.parametrize("wrong", [{"torsion": 0.06}, {"gain": -0.3}])
+def test_a_learned_plant_that_the_motion_contradicts_is_replaced_by_the_configured_one(
+    wrong: dict[str, float],
+) -> None:
+    flight = fly(1, 900, suspended=True)
+    learned = flight.parameters._replace(
+        **{name: getattr(flight.parameters, name) + off for name, off in wrong.items()}
+    )
+    prior, sure = slow_prior(SUSPENDED, SETTINGS), 1e-8 * np.eye(3)
+    prior = replace(prior, parameters=learned, parameters_covariance=sure)
+    found = AttitudeFilter(SUSPENDED, SETTINGS, prior)
+    for cycle, samples in enumerate(flight.samples):
+        if found.started:
+            follow(found, flight, cycle, cycle + 1)
+        else:
+            found.start(*samples)
+    estimate = found.at((len(flight.samples) - 1) * CYCLE_NS)
+    sigma = np.sqrt(estimate.covariance[PARAMETERS, PARAMETERS].diagonal())
+    assert found.restarts == 1
+    assert (np.abs(np.subtract(estimate.parameters, flight.parameters)) < 4.0 * sigma).all()
