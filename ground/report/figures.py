@@ -52,6 +52,7 @@ def draw_figures(run: Run, folder: Path) -> list[Path]:
         "pointing": orbit_figures.pointing_figure,
         "track": orbit_figures.track_figure,
         "objects": orbit_figures.objects_figure,
+        "battery": orbit_figures.battery_figure,
     }
     on_testbed: dict[str, Callable[[RunSignals], Figure | None]] = {
         "attitude": _attitude,

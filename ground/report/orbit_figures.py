@@ -15,6 +15,7 @@ from matplotlib.patches import Patch
 
 from flight.link import events
 from flight.link.modes import Mode
+from flight.link.telemetry.definitions import SHED
 from flight.link.telemetry.packets import PacketArray
 from ground.passes import OrbitPrediction, Station
 from ground.report import panels
@@ -256,6 +257,39 @@ def track_figure(signals: RunSignals) -> Figure | None:
     title = f"Ground track, {np.min(height) * 1e-3:.0f} to {np.max(height) * 1e-3:.0f} km above the ellipsoid"
     panels.style(ax, "latitude, deg", title, "longitude, deg")
     panels.legend(ax)
+    return figure
+
+
+def battery_figure(signals: RunSignals) -> Figure | None:
+    """Return the picture of charge, powers and shed loads, or None without a power system."""
+    packets, true = signals.run["power"], signals.run["true_power"]
+    if not len(packets):
+        return None
+    times = seconds(packets)
+    figure = Figure(figsize=(10.9, 8.2), layout="constrained")
+    charge, power, shed = figure.subplots(3, 1, sharex=True)
+    charge.plot(times, 100.0 * packets["charge"], color=panels.BLUE, label="estimated")
+    drawn = packets["battery_voltage"].astype(float) * packets["battery_current"].astype(float)
+    power.plot(times, drawn, color=panels.BLUE, label="out of the battery, measured")
+    if len(true):
+        at = seconds(true)
+        charge.plot(at, 100.0 * true["charge"], "--", color=panels.BLACK, label="true")
+        for name, label, colour in (
+            ("solar_power", "solar panels", panels.ORANGE),
+            ("load_power", "all loads", panels.VERMILLION),
+            ("coil_power", "coils", panels.GREEN),
+        ):
+            power.plot(at, true[name], color=colour, linewidth=1.0, label=label)
+    shed.step(times, packets["shed"], where="post", color=panels.BLUE)
+    shed.set_yticks([number for number, _ in SHED], [name for _, name in SHED])
+    panels.style(charge, "charge, %", "State of charge", "")
+    panels.style(power, "power, W", "Powers", "")
+    panels.style(shed, "", "Loads shed: each step includes those below it")
+    frames = signals.run["streak"]["exposure_start_ns"] * 1e-9
+    shed.plot(frames, np.full(len(frames), -0.4), "|", color=panels.PURPLE, label="frames of the star camera")
+    for ax in (charge, power, shed):
+        _shade(ax, signals.run["orbit_truth"])
+        panels.legend(ax)
     return figure
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from flight.link import events
 from flight.link.modes import Mode
+from flight.link.telemetry.definitions import SHED
 from flight.link.telemetry.packets import PacketArray
 from flight.loop.facts import FACTS, StreamState
 from flight.schema import reader
@@ -82,6 +83,8 @@ def summarise(run: Run) -> Object:
         "logs": _logs(run),
         "notes": notes,
     }
+    if len(run["power"]):
+        summary["battery"] = _battery(run)
     plain: Object = _plain(summary)
     return plain
 
@@ -278,6 +281,33 @@ def _events(packets: PacketArray) -> list[Object]:
         first = {"name": name, "count": 0, "severity": int(row["severity"]), "first_s": float(time)}
         found.setdefault(name, {**first, "text": text})["count"] += 1 + int(row["suppressed"])
     return list(found.values())
+
+
+def _battery(run: Run) -> Object:
+    """Return state of charge, energies and shed loads of the battery; true values are None without truth."""
+    packets, true, times = run["power"], run["true_power"], seconds(run["power"])
+    charge = packets["charge"].astype(float)
+    known = charge[np.isfinite(charge)]
+    steps = np.append(np.diff(times), 0.0)
+    found: Object = {
+        "charge_lowest": float(known.min()) if len(known) else math.nan,
+        "charge_last": float(charge[-1]),
+        "known_share": float(np.mean(np.isfinite(charge))),
+        "in_j": float(packets["energy_in"][-1]),
+        "out_j": float(packets["energy_out"][-1]),
+        "shed_s": {name: float(steps[packets["shed"] >= level].sum()) for level, name in SHED if level},
+    }
+    names = ("charge_error_rms", "true_charge_lowest", "true_charge_last", "solar_j", "loads_j", "coils_j")
+    found |= dict.fromkeys(names, math.nan)
+    if len(true):
+        at = np.interp(times, seconds(true), true["charge"].astype(float))
+        errors = (charge - at)[np.isfinite(charge)]
+        rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
+        # The true powers are recorded once a second, so their sum is the energy.
+        sums = [float(true[f"{name}_power"].sum()) for name in ("solar", "load", "coil")]
+        values = [rms, float(true["charge"].min()), float(true["charge"][-1]), *sums]
+        found |= dict(zip(names, values, strict=True))
+    return found
 
 
 _OF_COILS = {events.COIL_BROKEN.name, events.COIL_CORRECTED.name, events.COIL_TRUSTED.name}

@@ -33,6 +33,7 @@ def format_report(summary: Object) -> str:
             summary["thesis"],
         ),
         _power(summary["power"], bool(summary["thesis"])),
+        _battery(summary.get("battery")),
         _loop(summary),
         _planner(summary["planner"]),
         _sensing(summary),
@@ -237,6 +238,30 @@ def _limits(title: str, limit: str, judged: list[Object]) -> list[str]:
         for row in judged
     ]
     return [title, *table(["", "this run", limit, ""], rows)]
+
+
+def _battery(found: Object | None) -> list[str]:
+    if found is None:
+        return []
+
+    def charges(name: str, first: str) -> str:
+        lowest, last = (number(found[f"{first}charge_{at}"], 1, 100.0) for at in ("lowest", "last"))
+        return f"{name} lowest {lowest} %, at the end {last} %"
+
+    lines = [
+        charges("state of charge, estimated:", ""),
+        f"estimate available {number(found['known_share'], 1, 100.0)} % of the time, "
+        f"rms error {number(found['charge_error_rms'], 1, 100.0)} %",
+        f"energy into the battery {number(found['in_j'], 1)} J, out of it {number(found['out_j'], 1)} J",
+        "shed: " + ", ".join(f"{name} {number(time, 0)} s" for name, time in found["shed_s"].items()),
+    ]
+    if found["loads_j"] is not None:
+        lines.insert(1, charges("state of charge, true:", "true_"))
+        lines.append(
+            f"true energy of the panels {number(found['solar_j'], 1)} J, "
+            f"of all loads {number(found['loads_j'], 1)} J, of the coils {number(found['coils_j'], 1)} J"
+        )
+    return ["Battery and power system", *(f"  {line}" for line in lines)]
 
 
 def _power(power: Object, thesis: bool) -> list[str]:

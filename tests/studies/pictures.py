@@ -44,12 +44,14 @@ from tests.support import limb_frames
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "config" / "step_demo.yaml"
 ORBIT = ROOT / "config" / "orbit.yaml"
+POWER = ROOT / "docs" / "examples" / "power.yaml"
 RATE = 0.03
 """rad/s: the peak of a 0.1 step."""
 ORION_DEG = 84.0, -2.0, 15.0
 """Right ascension, declination and roll of the solved picture."""
 HORIZON_SEEDS = 2, 4, 6
 _OF_TESTBED, _IN_ORBIT = ("overview", "paths"), ("spin", "knowledge", "pointing")
+_OF_BATTERY = ("battery",)
 
 
 def main() -> int:
@@ -59,7 +61,7 @@ def main() -> int:
     folder: Path = parser.parse_args().out
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place:
-        for flown, names in ((CONFIG, _OF_TESTBED), (ORBIT, _IN_ORBIT)):
+        for flown, names in ((CONFIG, _OF_TESTBED), (ORBIT, _IN_ORBIT), (POWER, _OF_BATTERY)):
             run_folder = Path(place) / flown.stem
             fly(RunRequest(flown, run_folder))
             drawn = {path.stem: path for path in draw(read_run(run_folder), run_folder / "figures")}
@@ -71,7 +73,7 @@ def main() -> int:
     _draw_frame(folder / "frame.png")
     _draw_solved(folder / "solved.png")
     _draw_horizons(folder / "horizons.png")
-    for name in (*_OF_TESTBED, *_IN_ORBIT, "path", "frame", "solved", "horizons"):
+    for name in (*_OF_TESTBED, *_IN_ORBIT, *_OF_BATTERY, "path", "frame", "solved", "horizons"):
         sys.stdout.write(f"{folder / name}.png\n")
     return 0
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flight.app.devices import check_settings
 from flight.link.commands import CommandPacker, Ping, open_udp
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
@@ -230,3 +231,32 @@ def test_the_cones_of_the_shipped_satellites_are_wider_than_the_baffle_of_the_si
     sky, cones = section.sky, flown.pointing.cones
     assert cones.sun_deg is None or cones.sun_deg > sky.sun_exclusion_deg
     assert cones.earth_deg is None or cones.earth_deg > sky.earth_exclusion_deg
+
+
+@pytest.mark.parametrize(
+    ("section", "complaint"),
+    [
+        ("{battery: {capacity: -1.0}}", r"`power.battery.capacity`"),
+        ("{battery: {capacity: 2.6, cells: 4}}", r"`power.battery.cells`"),
+        ("{battery: {capacity: 2.6, open_circuit: [3.0, 3.5, 3.4]}}", r"open_circuit` must rise"),
+        ("{battery: {capacity: 2.6}, battery_monitor: {address: 0x45}}", r"battery_monitor.address` is 0x45"),
+        ("{battery: {capacity: 2.6}, bus_monitor: {address: 0x41}}", r"bus_monitor.address` is 0x41"),
+        ("{battery: {capacity: 2.6}, bus_monitor: {address: 0x49}}", r"bus_monitor.address` is 0x49"),
+        ("{battery: {capacity: 2.6}, low_battery: {critical: 0.35}}", r"has 0.35, 0.3, 0.4.* rising order"),
+        ("{battery: {capacity: 2.6}, low_battery: {low: 0.95}}", r"low_battery.low` is 0.95: with the hyst"),
+        ("{battery: {capacity: 2.6}, low_battery: {camera_period: 4.0}}", r"camera_period` is 4 s: must be"),
+    ],
+)
+def test_an_impossible_power_system_is_refused(section: str, complaint: str) -> None:
+    text = (CONFIG.parent / "orbit.yaml").read_text(encoding="utf-8")
+    assert parse(f"power: {{battery: {{capacity: 2.6}}}}\n{text}").power is not None
+    with pytest.raises(ConfigError, match=complaint):
+        parse(f"power: {section}\n{text}")
+
+
+def test_a_current_beyond_the_range_of_the_power_monitor_is_refused() -> None:
+    text = (CONFIG.parent / "orbit.yaml").read_text(encoding="utf-8")
+    monitor = "battery_monitor: {address: 0x41, shunt: 0.2, maximum_current: 2.0}"
+    config = parse(f"power: {{battery: {{capacity: 2.6}}, {monitor}}}\n{text}")
+    with pytest.raises(ConfigError, match=r"power.battery_monitor.maximum_current.*0 to 1.6 A"):
+        check_settings(config)
