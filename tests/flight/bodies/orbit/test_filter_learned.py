@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 
+from flight.bodies.orbit.body import OrbitView
 from flight.bodies.orbit.learned_states import (
     BODY,
     ERRORS,
@@ -14,8 +18,11 @@ from flight.bodies.orbit.learned_states import (
     learned_of,
     start_from,
 )
+from flight.link import events
+from flight.link.modes import Mode
 from flight.loop.state import Learned, StoredState, decode, encode
 from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.free_filter import (
     DIPOLE,
     GYRO,
@@ -137,3 +144,21 @@ def test_the_inertia_of_the_next_boot_may_have_changed_without_losing_its_correl
     at = PARTS[BODY]
     grown = prior.covariance[np.ix_(at, at)] - known().covariance[np.ix_(at, at)]
     np.testing.assert_allclose(grown, PRIOR[np.ix_(at, at)], rtol=1e-9, atol=1e-15)
+
+
+def test_learned_values_that_the_motion_contradicts_are_reported_once() -> None:
+    reported: list[tuple[events.EventKind, str]] = []
+    log = SimpleNamespace(report=lambda kind, _, text: reported.append((kind, text)))
+    found = SimpleNamespace(knowledge=Knowledge.LOST, contradictions=[])
+    parts = (
+        SimpleNamespace(detumbler=None),
+        found,
+        None,
+        SimpleNamespace(events=log, facts=None, recorder=None),
+    )
+    view = OrbitView(*cast(Any, parts))
+    output = SimpleNamespace(cycle=SimpleNamespace(start_ns=5, slot=1), estimate=None, mode=Mode.POINT)
+    for _ in range(3):
+        view.record_cycle(cast(Any, output))
+        found.contradictions[:] = ["the motion contradicts the learned body"]
+    assert reported == [(events.LEARNED_REFUSED, "the motion contradicts the learned body")]
