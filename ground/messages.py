@@ -308,6 +308,9 @@ def _orbit(number: int, tracks: PacketArray, start_ns: int) -> ObjectOrbit:
     times = seen["middle_ns"] * 1e-9
     span = float(times[-1] - times[0]) if len(times) else 0.0
     found = ObjectOrbit(number, len(seen), span, None, None, "")
+    if seen["relative"].any():
+        # All directions then share the error of the estimated attitude, which an orbit cannot be fitted to.
+        return replace(found, reason="the directions were measured without identified stars")
     placed = seen[np.isfinite(seen["place"]).all(axis=1)]
     if len(placed) < MINIMUM_SIGHTINGS:
         reason = (

@@ -337,6 +337,7 @@ def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> I
         mounting=np.array(camera.mounting),
         estimator=_estimator(camera, body),
         tracker=_tracker(camera),
+        detection=_detection(camera),
         angular_acceleration_psd=body.estimation.angular_acceleration_psd,
         velocity=body.estimation.velocity,
         objects=None
@@ -363,14 +364,16 @@ def horizon_camera_settings(cameras: Sequence[WideCamera]) -> HorizonCameraSetti
     )
 
 
+def _detection(camera: Camera) -> DetectionSettings:
+    return DetectionSettings(psf_sigma=camera.psf_sigma, gain=camera.gain, saturation=_saturation(camera))
+
+
 def _tracker(camera: Camera) -> TrackerSettings | None:
     """Return the settings of the star tracker, or None without a star tracker."""
     section = camera.star_tracker
     if section is None:
         return None
-    detection = DetectionSettings(
-        psf_sigma=camera.psf_sigma, gain=camera.gain, saturation=_saturation(camera)
-    )
+    detection = _detection(camera)
     spread = 1.0 + section.scale_error
     scale = (1.0 / spread, spread)
     index = Path(section.index) if section.index is not None else None

@@ -10,7 +10,8 @@ import math
 import zlib
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +26,14 @@ from flight.schema.devices import FAST
 from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS
-from knightcube.astro.arrays import FloatArray, Image
-from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from knightcube.astro.arrays import FloatArray, Image, cross_matrices
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
 from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Estimate, Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.gnc.tracker import (
@@ -38,7 +45,13 @@ from knightcube.gnc.tracker import (
 from knightcube.vision.camera.images import KeptFrames
 from knightcube.vision.camera.lens import CameraModel, Exposures
 from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings
-from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
+from knightcube.vision.objects.settings import (
+    FLOOR_PX,
+    FieldPoints,
+    MeasuredObjects,
+    ObjectMeasurementSettings,
+)
+from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import (
     NODES,
     AttitudePrior,
@@ -100,6 +113,14 @@ class ImagingSettings:
     calm: Callable[[int, int], int]
     objects: ObjectMeasurementSettings | None = None
     kept: KeptFrames | None = None
+    detection: DetectionSettings = field(default_factory=DetectionSettings)
+
+
+class CameraAttitude(NamedTuple):
+    """Attitude (4,) of the camera in inertial axes, and its covariance (3, 3), rad^2, in inertial axes."""
+
+    quaternion: FloatArray
+    covariance: FloatArray
 
 
 class FrameMeasurer:
@@ -134,7 +155,17 @@ class FrameMeasurer:
             last_checksum,
             objects=self._settings.objects if spare else None,
             kept=None if kept is None else replace(kept, name=f"frame-{frame.sequence:08d}"),
+            detection=self._settings.detection,
         )
+
+    def camera_attitude(self, time_ns: int) -> CameraAttitude | None:
+        """Return the estimated attitude of the camera at a past time, or None without an estimate."""
+        past = self._navigation.past(time_ns)
+        if past is None:
+            return None
+        turn = attitude_matrix(past.quaternion).T
+        covariance = turn @ past.covariance[ATTITUDE, ATTITUDE] @ turn.T
+        return CameraAttitude(multiply(self._settings.mounting, past.quaternion), covariance)
 
     def exposure_ns(self, now_ns: int) -> int:
         """Return the exposure time (ns) for the next frame, from the estimated rate across the boresight."""
@@ -344,19 +375,103 @@ class RepeatedRows:
 
 
 _UNKNOWN = [math.nan] * 3
+_STEP_PX = 2.0
+"""Standard deviation (px) of the predicted rotation of the camera from one frame to the next."""
 
 
 class ObjectTracks:
-    """Tracks objects from frame to frame, and reports and records their tracks."""
+    """Tracks objects from frame to frame, and reports and records their tracks.
+
+    In frames without identified stars, the tracks refer to the star field of the earlier frames
+    (`knightcube.vision.objects.star_field`). Control and telemetry get the tracks in the axes of the attitude
+    estimate. The error of this estimate is part of the recorded covariances of the directions.
+    """
 
     def __init__(self, settings: TrackSettings, body: FlightBody, services: Services) -> None:
+        from knightcube.vision.objects.star_field import StarField  # noqa: PLC0415 - only with a search
+
         self._body = body
         self._tracker = ObjectTracker(settings)
         self._recorder = services.recorder
         self._events = services.events
+        self._field = StarField()
+        self._located: tuple[int, FloatArray, CameraAttitude | None] | None = None
 
     def ingest(self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int) -> None:
         """Accept the objects detected in the frame `sequence`, whose mid-exposure is at `middle_ns`."""
+        if self._located is not None:
+            self._clear("stars are identified again", now_ns)
+            self._located = None
+        self._track(sequence, middle_ns, sighted, now_ns, np.eye(3))
+        for track in self._tracker.objects:
+            self._record_track(track, now_ns)
+        self._body.control.accept_tracks(self._tracker.objects, now_ns)
+
+    def ingest_field(
+        self,
+        sequence: int,
+        middle_ns: int,
+        seen: FieldPoints,
+        motion: FrameMotion,
+        attitude: CameraAttitude | None,
+        now_ns: int,
+    ) -> None:
+        """Accept the points of light in a frame without identified stars.
+
+        Args:
+            sequence: number of the frame.
+            middle_ns: time of mid-exposure.
+            seen: points of light in the frame.
+            motion: motion of the camera over the exposure.
+            attitude: estimated attitude of the camera at mid-exposure, or None if unknown.
+            now_ns: present time.
+        """
+        predicted = self._predicted(middle_ns, motion, attitude)
+        pixel = float(seen.sigma.min(initial=1.0)) / FLOOR_PX
+        place = self._field.locate(seen, predicted, _STEP_PX * pixel)
+        if place.begun or self._located is None:
+            self._clear("the stars of earlier frames are lost", now_ns)
+        self._located = middle_ns, place.quaternion, attitude
+        kept, turn = ~place.is_star, attitude_matrix(place.quaternion).T
+        directions = seen.directions[kept] @ turn.T
+        across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+        covariance = seen.sigma[kept, None, None] ** 2 * across
+        unknown = np.full(len(directions), np.nan)
+        common = turn @ place.covariance @ turn.T
+        sighted = MeasuredObjects(seen.points[kept], directions, covariance, unknown, common)
+        # Without an attitude, the axes of the field are recorded, whose direction is unknown.
+        known = CameraAttitude(place.quaternion, np.eye(3)) if attitude is None else attitude
+        to_estimate = attitude_matrix(known.quaternion).T @ turn.T
+        self._track(sequence, middle_ns, sighted, now_ns, to_estimate)
+        tracks = [_rotated(track, to_estimate) for track in self._tracker.objects]
+        for track in tracks:
+            self._record_track(track, now_ns, known.covariance)
+        if attitude is not None:
+            self._body.control.accept_tracks(tracks, now_ns)
+
+    def _predicted(self, middle_ns: int, motion: FrameMotion, attitude: CameraAttitude | None) -> FloatArray:
+        """Return the attitude (4,) relative to the field, from the estimate or the rate of the streaks."""
+        if self._located is None:
+            return np.array([0.0, 0.0, 0.0, 1.0]) if attitude is None else attitude.quaternion
+        then_ns, quaternion, before = self._located
+        if attitude is not None and before is not None:
+            return multiply(multiply(attitude.quaternion, conjugate(before.quaternion)), quaternion)
+        if motion.rate is None:
+            return quaternion
+        return multiply(from_rotation_vector((middle_ns - then_ns) * 1e-9 * motion.rate), quaternion)
+
+    def _clear(self, reason: str, now_ns: int) -> None:
+        for track in self._tracker.objects:
+            self._events.report(events.OBJECT_LOST, now_ns, f"object {track.number}: {reason}")
+        self._tracker.clear()
+
+    def _track(
+        self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int, to_estimate: FloatArray
+    ) -> None:
+        """Record the sightings of a frame, update the tracks, and report new and ended tracks.
+
+        The matrix `to_estimate` (3, 3) rotates the axes of the sightings to those of the attitude estimate.
+        """
         x, y = np.reshape(sighted.points, (-1, 2)).T
         self._recorder.record(
             SIGHTINGS,
@@ -375,25 +490,27 @@ class ObjectTracks:
             sighted.covariance,
             sighted.magnitudes,
             sighted.attitude,
-            None if orbit is None else orbit.position,
+            None if orbit is None else to_estimate.T @ orbit.position,
         )
         confirmed, ended = self._tracker.ingest(frame)
         for track in confirmed:
             rate_deg = math.degrees(float(np.linalg.norm(track.line.rate)))
-            text = f"object {track.number}: {rate_deg:.3f} deg/s among the stars, V {track.magnitude:.1f}"
+            known = math.isfinite(track.magnitude)
+            brightness = f"V {track.magnitude:.1f}" if known else "brightness unknown"
+            text = f"object {track.number}: {rate_deg:.3f} deg/s among the stars, {brightness}"
             self._events.report(events.OBJECT_FOUND, now_ns, text)
         for track in ended:
             away = (middle_ns - track.seen_ns) * 1e-9
             text = f"object {track.number}: not seen for {away:.1f} s, {track.sightings} sightings"
             self._events.report(events.OBJECT_LOST, now_ns, text)
-        for track in self._tracker.objects:
-            self._record_track(track, now_ns)
-        self._body.control.accept_tracks(self._tracker.objects, now_ns)
 
-    def _record_track(self, track: Track, now_ns: int) -> None:
+    def _record_track(self, track: Track, now_ns: int, attitude: FloatArray | None = None) -> None:
+        """Record a track; `attitude` (3, 3), rad^2, is the covariance of an attitude without star fix."""
         line = track.line
         across = np.eye(3) - np.outer(line.direction, line.direction)
         orbit = self._body.estimation.orbit(line.time_ns)
+        cross = cross_matrices(line.direction[None])[0]
+        shared = np.zeros((3, 3)) if attitude is None else cross @ attitude @ cross.T
         self._recorder.record(
             TRACK,
             now_ns,
@@ -402,18 +519,32 @@ class ObjectTracks:
             seen=int(track.seen),
             sightings=track.sightings,
             measured=track.measured.tolist(),
-            measured_sigma=track.measured_sigma,
+            measured_sigma=math.sqrt(track.measured_sigma**2 + 0.5 * float(np.trace(shared))),
             direction=line.direction.tolist(),
             rate=line.rate.tolist(),
             acceleration=line.acceleration.tolist(),
-            covariance=_packed(line.covariance[:3, :3]),
+            covariance=_packed(line.covariance[:3, :3] + shared),
             rate_covariance=_packed(across @ line.covariance[3:, 3:] @ across),
             magnitude=track.magnitude,
             magnitude_sigma=track.magnitude_sigma,
             place=_UNKNOWN if orbit is None else orbit.position.tolist(),
             velocity=_UNKNOWN if orbit is None else orbit.velocity.tolist(),
             place_sigma=math.nan if orbit is None else orbit.sigma,
+            relative=int(attitude is not None),
         )
+
+
+def _rotated(track: Track, turn: FloatArray) -> Track:
+    """Return a track whose directions are rotated by the matrix `turn` (3, 3)."""
+    line = track.line
+    both = np.kron(np.eye(2), turn)
+    rotated = replace(
+        line,
+        direction=turn @ line.direction,
+        velocity=turn @ line.velocity,
+        covariance=both @ line.covariance @ both.T,
+    )
+    return replace(track, line=rotated, measured=turn @ track.measured)
 
 
 def _padded(values: FloatArray) -> list[float]:
@@ -583,6 +714,11 @@ class Imaging:
             rate = None  # the pixels are invalid
         if found.objects is not None and self._objects is not None:
             self._objects.ingest(frame.sequence, middle_ns(frame), found.objects, now_ns)
+        if found.field is not None and self._objects is not None:
+            middle, attitude_then = middle_ns(frame), self._measurer.camera_attitude(middle_ns(frame))
+            self._objects.ingest_field(frame.sequence, middle, found.field, motion, attitude_then, now_ns)
+        if found.problem:
+            self._events.report(events.VISION_FAILED, now_ns, found.problem)
         if rate is None and attitude is None:
             self._report.unused(frame, found, now_ns)
         known = self._navigation.past(middle_ns(frame)) is not None

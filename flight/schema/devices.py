@@ -406,7 +406,9 @@ class ObjectTracking(Section, frozen=True, kw_only=True):
     """Search for moving objects among the stars of each frame, and tracking of the detected objects.
 
     Detections fainter than the V magnitude `faintest` are ignored. A track begins after `needed` detections
-    in `within` frames, and ends after `coast` s without a detection.
+    in `within` frames, and ends after `coast` s without a detection. Without `star_tracker`, or with a sky
+    index that is missing or damaged, objects are detected by the common motion of the stars from frame to
+    frame; `faintest` then has no effect, because magnitudes are unknown.
     """
 
     faintest: Annotated[float, Meta(ge=-5.0, le=8.0)] = 7.0

@@ -239,7 +239,7 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     def looks_for_objects(self) -> bool:
         """Return whether the star camera searches for moving objects."""
         camera = self.camera
-        return camera is not None and camera.star_tracker is not None and camera.objects is not None
+        return camera is not None and camera.objects is not None
 
     def field_range(self) -> tuple[float, float]:
         """Return the minimum and the maximum strength (T) of a valid magnetometer reading."""

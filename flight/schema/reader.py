@@ -174,7 +174,7 @@ def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
     for index, step in enumerate(config.targets):
         check_aim(f"targets[{index}]", step, step.point, refuse)
         if step.point == "object" and not config.looks_for_objects():
-            refuse(f"targets[{index}].point", "is object: needs `camera` with `star_tracker` and `objects`")
+            refuse(f"targets[{index}].point", "is object: needs `camera` with `objects`")
     axes = (config.pointing.axis, config.pointing.across)
     for name, axis in zip(("axis", "across"), axes, strict=True):
         if abs(math.hypot(*axis) - 1.0) > 1e-6:
@@ -337,13 +337,8 @@ def _check_camera(camera: Camera, refuse: Refuse) -> None:
         least, most = camera.streak_exposure
         if not least <= most < camera.period:
             refuse("camera.streak_exposure", "must be a minimum and a maximum below `camera.period`")
-    if camera.objects is not None:
-        if camera.star_tracker is None:
-            refuse(
-                "camera.objects", "needs `camera.star_tracker`: objects are detected among identified stars"
-            )
-        if camera.objects.needed > camera.objects.within:
-            refuse("camera.objects.needed", f"is {camera.objects.needed}: must not be above `within`")
+    if camera.objects is not None and camera.objects.needed > camera.objects.within:
+        refuse("camera.objects.needed", f"is {camera.objects.needed}: must not be above `within`")
     if camera.fine_period is not None and not camera.period <= camera.fine_period < camera.max_age:
         refuse(
             "camera.fine_period",

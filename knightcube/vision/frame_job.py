@@ -18,18 +18,25 @@ tens of MB, are imported at their first use, because the control process does no
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.errors import FlightError
 from knightcube.vision.camera.images import KeptFrames, keep_frame
 from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.lens_knowledge import LensKnowledge
-from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
-from knightcube.vision.startracker.detection import FrameKind, Survey, measure_areas, survey
+from knightcube.vision.objects.settings import FieldPoints, MeasuredObjects, ObjectMeasurementSettings
+from knightcube.vision.startracker.detection import (
+    DetectionSettings,
+    FrameKind,
+    Survey,
+    measure_areas,
+    survey,
+)
 from knightcube.vision.startracker.index import sky_index
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
@@ -123,6 +130,7 @@ class FrameJob:
         kept: folder in which the frame is kept on disk; None: it is not kept.
         lens: knowledge of the lens from earlier frames, with which the frame is solved, and the time since
             the last frame, s. If `lens` is None, the lens is not learned.
+        detection: settings of the detection of points if no stars are identified.
     """
 
     pixels: Image
@@ -137,6 +145,7 @@ class FrameJob:
     objects: ObjectMeasurementSettings | None = None
     kept: KeptFrames | None = None
     lens: tuple[LensKnowledge, float] | None = None
+    detection: DetectionSettings = field(default_factory=DetectionSettings)
 
     def with_lens(self) -> FrameJob:
         """Return the job with the learned lens, if it is usable, instead of the configured lens."""
@@ -163,21 +172,25 @@ class FrameFound:
         objects: points that may be space objects instead of stars, or None if they were not measured or the
             attitude is unknown.
         lens: knowledge of the lens after the frame, or None if the lens is not learned.
+        field: points of light, for the search for objects without a star catalogue; None if not measured.
+        problem: reason why no sky index could be used; empty if there is none.
     """
 
     motion: FrameMotion
     solution: FrameSolution | None
     objects: MeasuredObjects | None = None
     lens: LensKnowledge | None = None
+    field: FieldPoints | None = None
+    problem: str = ""
 
 
 def run(job: FrameJob) -> FrameFound:
     """Return attitude and rate from a frame. The worker process imports this function by its name."""
     tracker = job.tracker
-    if tracker is None:
-        found = FrameFound(_motion(job), None)
+    sky, problem = _sky(tracker)
+    if tracker is None or sky is None:
+        found = _without_catalogue(job.with_lens(), problem)
     else:
-        sky = default_index() if tracker.index is None else sky_index.load_once(tracker.index)
         found = run_with_lens(job, tracker, sky)
         if job.objects is not None and found.solution is not None:
             from knightcube.vision.objects.measure import measure_objects  # noqa: PLC0415 - needs scipy
@@ -210,6 +223,26 @@ def run_with_lens(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> Fra
         if found.solution is not None:
             lens = lens.update(found.solution, sky, tracker.solve.velocity)
     return replace(found, lens=lens)
+
+
+def _without_catalogue(job: FrameJob, problem: str) -> FrameFound:
+    """Return the motion from a frame, and the points of light if objects are searched for."""
+    motion, lens, points = _motion(job), None if job.lens is None else job.lens[0], None
+    if job.objects is not None:
+        from knightcube.vision.objects.measure import measure_points  # noqa: PLC0415 - needs scipy
+
+        points = measure_points(job.pixels, job.camera, job.exposure, motion, job.objects, job.detection)
+    return FrameFound(motion, None, lens=lens, field=points, problem=problem)
+
+
+def _sky(tracker: TrackerSettings | None) -> tuple[SkyIndex | None, str]:
+    """Return the sky index, or None with the reason, which is empty without a star tracker."""
+    if tracker is None:
+        return None, ""
+    try:
+        return (default_index() if tracker.index is None else sky_index.load_once(tracker.index)), ""
+    except (FlightError, OSError) as error:
+        return None, f"stars are not identified: {error}"
 
 
 def _facts(job: FrameJob, found: FrameFound) -> dict[str, Any]:

@@ -15,25 +15,16 @@ from ground.report.panels import RunSignals
 from ground.report.summary import summarise
 from ground.report.text import format_report
 from ground.telemetry import Run
-from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
-from sim_hal.settings import LineOfSight
-from tests.scenario.object_flights import _BRIGHTNESS, _LINES, flight_with_objects, two_objects
+from tests.scenario.object_flights import (
+    _BRIGHTNESS,
+    _LINES,
+    _PIXEL,
+    _place,
+    flight_with_objects,
+    two_objects,
+)
 from tests.support.flights import demo_config, event_names, fly
-
-_PIXEL = np.radians(20.0) / 1024
-
-
-def _place(line: LineOfSight, time: FloatArray) -> FloatArray:
-    """Return the true directions (n, 3), by the definition of right ascension and position angle."""
-    ra, dec = np.radians([line.right_ascension_deg, line.declination_deg])
-    start = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    north = np.cross(start, east)
-    towards = np.radians(line.towards_deg)
-    ahead = np.cos(towards) * north + np.sin(towards) * east
-    angle = np.radians(line.rate_deg) * time[:, None]
-    return np.asarray(np.cos(angle) * start + np.sin(angle) * ahead)
 
 
 @pytest.fixture(scope="module")

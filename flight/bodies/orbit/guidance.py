@@ -261,7 +261,7 @@ class PointingTargets:
         if not isinstance(wanted, PointingTarget):
             raise UsageError("a satellite points to a goal, not to a q2")
         if wanted.goal is Goal.OBJECT and not self._looks_for_objects:
-            raise UsageError("no star camera looks for objects: `camera: {star_tracker: {}, objects: {}}`")
+            raise UsageError("no star camera looks for objects: `camera: {objects: {}}`")
         return Target(COMMANDED + number, PointingTargetLaw(wanted, self._paths))
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
@@ -346,7 +346,9 @@ class ObjectAim:
             found = min(tracks, key=lambda track: np.nan_to_num(track.magnitude, nan=99.0), default=None)
             self._followed, self._escapes = 0 if found is None else found.number, False
             if found is not None:
-                text = f"object {found.number}, V {found.magnitude:.1f} +- {found.magnitude_sigma:.1f}"
+                text = f"object {found.number}, brightness unknown"
+                if math.isfinite(found.magnitude):
+                    text = f"object {found.number}, V {found.magnitude:.1f} +- {found.magnitude_sigma:.1f}"
                 self._events.report(events.OBJECT_FOLLOWED, now_ns, text)
             elif before:
                 # Search again in the commanded direction, or where the camera points if none is commanded.

@@ -738,8 +738,9 @@ TRACK = Packet(
         Field("place", "f8", "m", "geocentric position of the camera; NaN if unknown", 3),
         Field("velocity", "f8", "m/s", "geocentric velocity of the camera; NaN if unknown", 3),
         Field("place_sigma", "f8", "m", "standard deviation of the position per axis"),
+        flag("relative", "whether the attitude is estimated without identified stars in this frame"),
     ),
-    version=2,
+    version=3,
 )
 
 

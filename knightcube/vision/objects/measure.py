@@ -21,14 +21,21 @@ import numpy as np
 from knightcube.astro import catalogue
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
+from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.objects.detect import detect
-from knightcube.vision.objects.settings import EndpointSettings, MeasuredObjects, ObjectMeasurementSettings
+from knightcube.vision.objects.settings import (
+    FLOOR_PX,
+    EndpointSettings,
+    FieldPoints,
+    MeasuredObjects,
+    ObjectMeasurementSettings,
+)
 from knightcube.vision.objects.star_light import spread_over, spread_with_slopes
 from knightcube.vision.startracker.detection import DetectionSettings, FrameKind, survey
 from knightcube.vision.startracker.detection.survey import Areas, Survey
 from knightcube.vision.startracker.sky_map import SkyMap
 from knightcube.vision.startracker.solve import FrameSolution
-from knightcube.vision.streaks.streak_result import MotionResult
+from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
 _REACH = 5.0
 """Margin of the fitted patch of pixels beyond the ends of an object, in standard deviations of the PSF."""
@@ -440,3 +447,59 @@ def _centre(areas: Areas, area: int, ratio: float, settings: ObjectMeasurementSe
 def _faintness(flux: FloatArray) -> FloatArray:
     """Return 2.5 log10 of counts (n,): the magnitudes by which stars are brighter than one count."""
     return np.asarray(2.5 * np.log10(np.maximum(flux, 1e-9)))
+
+
+MOST_POINTS = 80
+"""Maximum number of points of light that are measured in a frame, brightest first."""
+_FIELD_SIGMAS = 12.0
+"""Minimum flux (standard deviations) of a point of light in a frame without identified stars."""
+STREAK_PX = 20.0
+"""Median length of the streaks (px) from which `detect` searches a single frame."""
+
+
+def measure_points(
+    pixels: Image,
+    camera: CameraModel,
+    exposure: float,
+    motion: FrameMotion,
+    settings: ObjectMeasurementSettings,
+    detection: DetectionSettings,
+) -> FieldPoints:
+    """Return the points of light in a frame (rows, columns), of which objects may be marked as moving.
+
+    Args:
+        pixels: counts of the frame.
+        camera: camera of the frame.
+        exposure: exposure time, s.
+        motion: motion of the camera over the exposure, from the streaks of the frame.
+        settings: settings of the measurement of objects.
+        detection: settings of the survey of the frame.
+    """
+    moves = motion.status is StreakStatus.RATE and motion.rate is not None and motion.length >= STREAK_PX
+    if moves and isinstance(motion, MotionResult) and motion.rate is not None:
+        ends = EndpointSettings(gain=detection.gain or 1.0, saturation=detection.saturation)
+        report = detect(pixels, camera.ideal, motion.rate * exposure, exposure, ends, settings.search)
+        found = () if report is None else report.objects
+        middles = np.array([item.endpoints.mean(axis=0) for item in found]).reshape(-1, 2)
+        points = np.vstack([motion.stars[motion.used], middles])
+        spread = motion.star_covariance[motion.used]
+        sigma = np.sqrt(0.5 * np.trace(spread, axis1=1, axis2=2))
+        sigma = np.concatenate([sigma, np.full(len(middles), settings.search.streak_sigma)])
+        flux = np.concatenate([motion.flux[motion.used], [item.flux for item in found]])
+        moving = np.arange(len(points)) >= len(points) - len(middles)
+    else:
+        seen = survey(pixels, detection)
+        areas, noise = seen.areas, float(np.median(seen.sky.noise.values))
+        ratio = areas.flux / (noise * np.sqrt(np.maximum(areas.pixels, 1)))
+        margin = (3.0 + 0.5 * areas.length)[:, None]
+        inside = np.all(
+            (areas.centre > margin) & (areas.centre < np.array(areas.shape[::-1]) - 1 - margin), axis=1
+        )
+        chosen = np.flatnonzero((ratio >= _FIELD_SIGMAS) & inside)
+        points, flux = areas.centre[chosen], areas.flux[chosen]
+        sigma = np.sqrt(1.0 + areas.length[chosen] ** 2 / 12.0) / ratio[chosen]
+        moving = np.zeros(len(chosen), dtype=np.bool_)
+    first = np.argsort(-np.where(moving, np.inf, flux), kind="stable")[:MOST_POINTS]
+    directions = camera.unit_vectors(points[first]) if len(first) else np.zeros((0, 3))
+    angles = np.hypot(sigma[first], FLOOR_PX) / camera.focal_length
+    return FieldPoints(points[first], directions, angles, flux[first], moving[first])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,3 +150,26 @@ class MeasuredObjects:
     covariance: FloatArray
     magnitudes: FloatArray
     attitude: FloatArray
+
+
+FLOOR_PX = 0.1
+"""Smallest standard deviation (px) per axis of a point of light, of which saturation is the largest part."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldPoints:
+    """Points of light in a frame whose stars are not identified, the brightest first.
+
+    Attributes:
+        points: positions at mid-exposure (n, 2), px.
+        directions: unit vectors at mid-exposure (n, 3), camera axes.
+        sigma: standard deviation of each direction per axis (n,), rad.
+        flux: flux of each point (n,), counts.
+        moving: whether the single frame shows that the point is not a star (n,).
+    """
+
+    points: FloatArray
+    directions: FloatArray
+    sigma: FloatArray
+    flux: FloatArray
+    moving: BoolArray

@@ -12,7 +12,6 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
-from knightcube.errors import InputError
 from knightcube.reference.corner_streaks.estimator import CornerEstimator
 from knightcube.reference.corner_streaks.settings import StreakResult, StreakSettings
 from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings, run
@@ -164,8 +163,13 @@ def test_a_job_and_its_result_can_be_sent_between_processes() -> None:
     _assert_right(found.solution, _frame(0.0).attitude)
 
 
-def test_an_index_that_is_missing_is_reported_with_its_cure(tmp_path: Path) -> None:
+def test_an_index_that_is_missing_is_reported_with_its_cure_and_the_motion_is_estimated(
+    tmp_path: Path,
+) -> None:
     job = _job(_frame(0.0), LikelihoodSettings())
     tracker = replace(_TRACKER, index=tmp_path / "sky.index")
-    with pytest.raises(InputError, match=r"startracker\.index\.build"):
-        run(replace(job, tracker=tracker))
+    found = run(replace(job, tracker=tracker))
+    assert "startracker.index.build" in found.problem
+    assert found.solution is None
+    assert found.motion.status is run(replace(job, tracker=None)).motion.status
+    assert found.field is None, "no objects are searched for"

@@ -1,0 +1,69 @@
+"""Objects without a star catalogue: tracked by the common motion of the stars, at rest and through a slew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from flight.schema import reader as configuration
+from flight.schema.devices import ObjectTracking, StarTrackerSection
+from ground.messages import orbits_of
+from ground.telemetry import Run
+from tests.scenario.object_flights import _LINES, _PIXEL, _place, two_objects
+from tests.support.flights import demo_config, demo_world, event_names, fly
+
+
+def flown(folder: Path, q2: float, seconds: float, tracker: StarTrackerSection | None = None) -> Run:
+    """Return a flight with two objects, that slews from q2 = 0.2 to `q2`."""
+    config, world = demo_config(seconds), demo_world()
+    assert config.camera is not None
+    assert world.release is not None
+    camera = configuration.replace(
+        config.camera, exposure=0.2, period=1.0, objects=ObjectTracking(), star_tracker=tracker
+    )
+    steps = (configuration.replace(config.steps[0], q2=q2),)
+    release = configuration.replace(world.release, q2=0.2, rate=0.0)
+    section = configuration.replace(world, release=release, objects=two_objects())
+    return fly(configuration.replace(config, camera=camera, steps=steps), folder, section=section)
+
+
+def test_two_objects_are_tracked_through_a_slew_with_honest_claims(tmp_path: Path) -> None:
+    run = flown(tmp_path, 0.23, 11.5)
+    assert not len(run["stars"]), "no star is identified"
+    assert (run["streak"]["status"] == b"rate").sum() >= 5, "the stars are streaks during the slew"
+    tracks = run["track"]
+    assert set(tracks["number"].tolist()) == {1, 2}, "both objects, and no false track"
+    assert tracks["relative"].all()
+    assert np.isnan(tracks["magnitude"]).all()
+    owners = set()
+    for number in (1, 2):
+        track = tracks[tracks["number"] == number]
+        true = [_place(line, track["middle_ns"] * 1e-9) for line in _LINES]
+        away = [np.linalg.norm(track["direction"] - place, axis=1) for place in true]
+        own = int(np.argmin([one[-1] for one in away]))
+        owners.add(own)
+        assert track["seen"].all()
+        claim = np.sqrt(0.5 * track["covariance"][:, :3].sum(axis=1))
+        assert (away[own] < 3.5 * claim).all()
+        assert claim.max() < 4.0 * _PIXEL, "the estimated attitude is known to some pixels"
+        # The rate is measured among the stars, so that the error of the attitude is not part of it.
+        rate = np.degrees(np.linalg.norm(track["rate"], axis=1))
+        sigma = np.degrees(np.sqrt(0.5 * track["rate_covariance"][:, :3].sum(axis=1)))
+        assert (np.abs(rate - _LINES[own].rate_deg) < 3.5 * sigma).all()
+        assert sigma[-1] < 1e-3
+    assert owners == {0, 1}
+    assert all("without identified stars" in one.reason for one in orbits_of(run))
+
+
+def test_a_damaged_sky_index_leaves_detection_by_motion(
+    tmp_path: Path,
+) -> None:
+    """The file exists when the flight is opened, but its contents are not a sky index."""
+    index = tmp_path / "sky.index"
+    index.write_bytes(b"not an index")
+    run = flown(tmp_path / "run", 0.2, 6.5, StarTrackerSection(index=str(index)))
+    names = event_names(run)
+    assert "vision-failed" in names
+    assert any(b"stars are not identified" in row["text"] for row in run["event"])
+    assert set(run["track"]["number"].tolist()) == {1, 2}
