@@ -179,7 +179,7 @@ def _star_camera(
 ) -> EmulatedCamera:
     assert config.camera is not None
     make = expose or inline_exposure(StarRenderer(config.camera, section.sky, section.seed))
-    if isinstance(world, OrbitingWorld):
+    if isinstance(world, OrbitingWorld) and not getattr(world, "held", False):
         from sim_hal.star_camera.objects import from_orbit  # noqa: PLC0415 - see above
 
         make = from_orbit(make, world, config.camera, section.sky)

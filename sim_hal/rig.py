@@ -23,7 +23,7 @@ import numpy as np
 
 from flight.link.telemetry.log import FlightLog
 from flight.schema import reader as configuration
-from flight.schema.devices import driver_of
+from flight.schema.devices import coil_fields, driver_of
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
@@ -64,7 +64,7 @@ PATIENCE_S = 5.0
 FARTHEST_ELEMENTS = 100e3
 """Largest accepted distance (m) of the two-line elements from the first revolution of the simulated orbit."""
 BENCH_COIL_FIELD = 5.0e-4
-"""Field (T/A) of a coil along its axis at the magnetometer, if `simulation.coil_field` is not given."""
+"""Field (T/A) of a coil along its axis at the magnetometer, if neither field nor position is configured."""
 _START_S = 20.0
 """Longest time (s) that the server process may take to start."""
 _FACTS = ("socket", "camera", "lines", "coil_bus", "wide", "utc_offset_ns")
@@ -222,8 +222,10 @@ def open_bench(request: SimulationRequest, config: Config) -> EmulatedBench:
     section = request.section()
     check(section.faults, config, False)
     imu = configuration.replace(section.imu, profile="datasheet")
-    axes = np.array([coil.direction() for coil in config.coils.slots]).T
-    rows = section.coil_field or tuple(map(tuple, (BENCH_COIL_FIELD * axes).tolist()))
+    fields = coil_fields(config)
+    if fields is None:
+        fields = BENCH_COIL_FIELD * np.array([coil.direction() for coil in config.coils.slots])
+    rows = section.coil_field or tuple(map(tuple, fields.T.tolist()))
     section = configuration.replace(section, world="bench", imu=imu, coil_field=rows)
     clock = SimClock(utc_ns(section.utc))
     devices = build_lockstep(config, section, None, clock)

@@ -41,7 +41,7 @@ from flight.schema.values import (
 from hal.interfaces.wires import Rig
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.errors import UsageError
-from knightcube.gnc.control.coil_map import LEAST_SPREAD, CoilMap, missing_direction
+from knightcube.gnc.control.coil_map import LEAST_SPREAD, CoilMap, coil_field, missing_direction
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.horizon.structure import polygon_mask
 from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
@@ -153,6 +153,8 @@ class Winding(Section, frozen=True, kw_only=True):
     values stand in the section `plant`. The value `current_limit` (A) replaces that of the section `coils`.
     The values `channels` are the PWM channels of the inputs A and B of the H-bridge; without them, the coils
     use the channels 0 and 1, 2 and 3, and so on. The value `sign` is -1 for a coil whose leads are swapped.
+    The `position` (m, body axes) of the coil's centre relative to the inertial unit gives the field that
+    `knightcube bringup` expects at the magnetometer.
     """
 
     axis: Vector
@@ -163,6 +165,7 @@ class Winding(Section, frozen=True, kw_only=True):
     current_limit: Annotated[float, Meta(gt=0.0, le=1.0)] | None = None
     channels: tuple[Channel, Channel] | None = None
     sign: Sign = 1
+    position: Vector | None = None
 
     def direction(self) -> FloatArray:
         """Return the unit vector (3,) along the dipole moment, body axes."""
@@ -271,6 +274,24 @@ class Coils(Section, frozen=True, kw_only=True):
         strength = np.array([coil.strength() for coil in self.slots])
         dipoles = np.array([coil.direction() for coil in self.slots]).T * strength
         return CoilMap(dipoles, np.array(self.limits), np.array(self.resistance))
+
+
+def coil_fields(config: Any) -> FloatArray | None:
+    """Return the field (n, 3), T/A, of each coil at the inertial unit, or None without all positions."""
+    plant, fields = getattr(config, "plant", None), []  # the testbed's plant describes all coils
+    for coil in config.coils.windings:
+        if coil.position is None or not any(coil.position):
+            return None
+        strength, area = (
+            (coil.strength(), coil.area)
+            if plant is None
+            else (
+                plant.coil_turns * plant.coil_area,
+                plant.coil_area,
+            )
+        )
+        fields.append(coil_field(strength * coil.direction(), -np.array(coil.position), area))
+    return np.array(fields)
 
 
 class PowerMonitorSection(Section, frozen=True, kw_only=True):

@@ -83,13 +83,14 @@ def find(config: Config, rig: Rig, stack: Any) -> Iterator[Found]:
     serial = {
         kind: one for kind in ("inertial_unit", "gps") if hasattr(one := getattr(config, kind), "device")
     }
-    for kind in DRIVERS:
-        section = getattr(config, kind)
+    sections = {kind: getattr(config, kind) for kind in DRIVERS}
+    sections |= {f"wide_cameras[{number}]": camera for number, camera in enumerate(config.wide_cameras)}
+    for kind, section in sections.items():
         if section is None:
             continue
-        camera = kind == "camera"
+        camera = "camera" in kind
         wired = section.device if camera else section  # an emulated camera needs no `device`
-        driver = None if wired is None else driver_of(kind, wired)
+        driver = None if wired is None else driver_of("camera" if camera else kind, wired)
         place = _place(config, kind, section, driver)
         try:
             if camera and rig.cameras is None:
@@ -106,7 +107,7 @@ def _place(config: Config, kind: str, section: Any, driver: Any) -> str:
     files = () if driver is None else driver.files(section)
     bus = driver_of("coils", config.coils).files(config.coils)
     address = getattr(section, "address", None)
-    if kind == "camera" and driver is None:
+    if "camera" in kind and driver is None:
         return "emulated optics"
     return ", ".join([*(files or bus), *([] if address is None else [f"0x{address:02x}"])])
 

@@ -459,10 +459,11 @@ def step_dark(session: Session) -> Outcome:
     hot = float(np.mean(second > level + 10.0 * max(noise, 1.0)))
     sources = len(detect(frames[-1]).stars())
     findings = _frozen(taken)
+    bright = level >= 0.9 * (camera.saturation or float(2**camera.bits - 1))
     if findings:
         pass
-    elif sources >= _FEW_SOURCES:
-        text = f"{sources} point sources although the cap should be on"
+    elif sources >= _FEW_SOURCES or bright:
+        text = f"{sources} point sources and {level:.0f} counts although the cap should be on"
         findings.append(Finding("camera", "lens cap off", text, "put the cap on, and repeat the step"))
     elif noise == 0.0 and level > 0.0:  # a camera with a low black level may show zeros behind its cap
         text = f"all frames are equal ({level:.0f} counts)"

@@ -23,6 +23,7 @@ from flight.app.cli.check import check_values
 from flight.app.devices import emulated_bench, linux_rig, real_rig
 from flight.app.run import RunRequest
 from flight.app.service import requested_config, start_guardian
+from flight.schema.devices import coil_fields
 from flight.schema.document import config_path, to_yaml
 from flight.schema.sections import Config
 from ground.bringup.diagnosis import Finding
@@ -167,12 +168,12 @@ def _opened(
 
 def _coil_field(path: Path, text: str, config: Config) -> Any:
     """Return the field of each coil (n, 3), T/A, that the configuration describes, or None."""
-    if config.simulation is None:
-        return None
-    from sim_hal.rig import SimulationRequest  # noqa: PLC0415 - loads the simulator
+    rows = None
+    if config.simulation is not None:
+        from sim_hal.rig import SimulationRequest  # noqa: PLC0415 - loads the simulator
 
-    rows = SimulationRequest(path, text, Path()).section().coil_field
-    return None if rows is None else np.array(rows).T
+        rows = SimulationRequest(path, text, Path()).section().coil_field
+    return coil_fields(config) if rows is None else np.array(rows).T
 
 
 # Results that are kept.

@@ -30,7 +30,13 @@ _UPRIGHT = from_matrix(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0
 
 
 class HeldBody:
-    """A body that rests with its z axis up, or is turned about one of its axes."""
+    """A body that rests with its z axis up, or is turned about one of its axes.
+
+    Attributes:
+        held: marks a body on a bench, whose star camera sees neither the Earth nor the Sun.
+    """
+
+    held = True
 
     def __init__(self) -> None:
         self._start = _UPRIGHT

@@ -18,6 +18,10 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.errors import UsageError
 
+_PERMEABILITY = 1e-7
+"""Vacuum permeability divided by 4 pi, T m/A."""
+_SEGMENTS = 128
+"""Number of segments of a loop."""
 LEAST_SPREAD = 0.05
 """Singular value of the unit vectors along the coils below which the coils lie nearly in a plane."""
 _STEPS = 200
@@ -28,6 +32,29 @@ _NEWTON_STEPS, _EXACT = 60, 1e-9
 """Largest number of Newton steps for limited currents, and relative accuracy of their dipole moment."""
 _SATURATED = 1e-4
 """Weight of a coil at its limit in the Newton matrix, relative to a coil below its limit."""
+
+
+def coil_field(moment: FloatArray, offset: FloatArray, area: float | None = None) -> FloatArray:
+    """Return the magnetic field (3,), T, of a coil with the dipole moment `moment` (3,), A m^2.
+
+    The field is that at the vector `offset` (3,), m, from the coil's centre. A coil with an `area` (m^2) is a
+    circular loop (Biot-Savart law, summed over segments); without an area it is a point dipole.
+    """
+    size = float(np.linalg.norm(moment))
+    axis = moment / size
+    if area is None:
+        distance = float(np.linalg.norm(offset))
+        along = offset / distance
+        return np.asarray(_PERMEABILITY * (3.0 * along * (along @ moment) - moment) / distance**3)
+    across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    across /= np.linalg.norm(across)
+    angles = 2.0 * np.pi * np.arange(_SEGMENTS)[:, None] / _SEGMENTS
+    radial = np.cos(angles) * across + np.sin(angles) * np.cross(axis, across)
+    radius = np.sqrt(area / np.pi)
+    elements = np.cross(axis, radial) * (2.0 * np.pi * radius / _SEGMENTS)
+    away = offset - radius * radial
+    cubes = np.linalg.norm(away, axis=1, keepdims=True) ** 3
+    return np.asarray(_PERMEABILITY * size / area * np.sum(np.cross(elements, away) / cubes, axis=0))
 
 
 def missing_direction(dipoles: FloatArray) -> FloatArray | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import pytest
 from flight.app.devices import emulated_bench
 from flight.app.run import RunRequest
 from flight.app.service import requested_config
+from flight.schema.devices import coil_fields
 from flight.schema.document import config_path, to_yaml
 from flight.schema.sections import Config
 from ground.bringup.diagnosis import UNRECOGNISED
@@ -66,7 +67,6 @@ class Case:
     alter: Callable[[Any], Any] | None = None
     says: str = ""
     base: str = "step_demo"
-    more: Change = field(default_factory=dict)
 
 
 X_AND_Y = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -240,6 +240,29 @@ def test_a_wiring_fault_is_named_and_no_other(name: str, tmp_path: Path) -> None
     findings = [one for outcome in outcomes(session(case, tmp_path), case.steps) for one in outcome.findings]
     assert [f"{one.part} {one.kind}" for one in findings] == list(case.expected)
     assert case.says in "\n".join(one.line() for one in findings)
+
+
+PLACES = {"x": [0.03, 0.02, -0.01], "y": [0.02, 0.05, 0.03], "z": [-0.02, 0.03, 0.06]}
+
+
+@pytest.mark.parametrize(
+    ("change", "truth", "expected"),
+    [
+        ({}, {}, []),
+        ({"z": {"sign": -1}}, {}, ["coils.windings[2] reversed"]),
+        ({}, {"supply_voltage": 2.2}, ["coils wrong supply voltage"]),
+    ],
+)
+def test_the_positions_of_the_coils_give_their_fields(
+    change: dict[str, Change], truth: Change, expected: list[str], tmp_path: Path
+) -> None:
+    placed = {name: {"position": place} for name, place in PLACES.items()}
+    wired = windings(**{name: one | change.get(name, {}) for name, one in placed.items()})
+    opened = session(Case(wired | {"simulation": {"truth": truth}}, "", []), tmp_path)
+    (tmp_path / "config.yaml").write_text(to_yaml({"extends": "step_demo", **windings(**placed)}))
+    opened.coil_field = coil_fields(requested_config(RunRequest(tmp_path / "config.yaml", Path()))[1])
+    (found,) = outcomes(opened, "coils")
+    assert [f"{one.part} {one.kind}" for one in found.findings] == expected
 
 
 def test_a_sound_bench_has_no_finding(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog, minimize
 
 from knightcube.errors import UsageError
-from knightcube.gnc.control.coil_map import CoilMap, limited
+from knightcube.gnc.control.coil_map import CoilMap, coil_field, limited
 
 TILTED = np.array([[0.8, 0.2, 0.0], [0.1, 0.5, 0.3], [0.0, 0.0, 0.2]])
 LIMITS = np.array([0.1, 0.2, 0.3])
@@ -169,3 +169,14 @@ def test_the_covariance_of_coils_along_the_body_axes_is_that_of_gain_and_misalig
     assert not CoilMap(TILTED, LIMITS, OHMS).aligned
     expected = np.where(np.eye(3, dtype=bool), 0.2**2, 0.05**2).ravel() / 3.0
     np.testing.assert_allclose(coils.error_covariance(0.2, 0.05), np.diag(expected), atol=1e-15)
+
+
+def test_the_field_of_a_coil_is_that_of_a_loop_on_its_axis_and_of_a_dipole_far_away() -> None:
+    """On the axis of a loop, B = mu0 m / (2 pi (a^2 + z^2)^1.5) (Jackson, section 5.5)."""
+    area, height = 0.0081, 0.04
+    moment = 0.648 * np.array([0.6, 0.0, 0.8])
+    near = coil_field(moment, height * moment / 0.648, area)
+    assert near == pytest.approx(2e-7 * moment / (area / np.pi + height**2) ** 1.5, rel=1e-9)
+    offset = np.array([10.0, -20.0, 5.0])
+    assert coil_field(moment, offset, area) == pytest.approx(coil_field(moment, offset), rel=1e-3)
+    assert coil_field(moment, np.array([0.8, 0.0, -0.6])) == pytest.approx(-1e-7 * moment, rel=1e-9)
