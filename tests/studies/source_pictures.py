@@ -1,30 +1,46 @@
 """`python -m tests.studies.source_pictures`: figures of Sease 2013, of this camera and these estimators.
 
 2.1 the star table over the whole sky; 3.1 to 3.4 a streak and its four cornerness maps; 3.5 the centre of
-rotation and the vectors of a streak; 4.2 to 4.4 the indicators of an object among stars, with their outlier.
+rotation and the vectors of a streak; 3.7 to 3.10 the errors of attitude and rate by the four detectors, from
+the campaign `streaks-thesis`, which is resumed in the folder; 4.2 to 4.4 the indicators of an object among
+stars, with their outlier; 5.4 to 5.6 the planned slew; 5.7 and 5.8 the simulated steps. Fig. 3.6 is a sketch.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from flight.bodies.testbed.control import plant_of
+from flight.schema import reader as configuration
+from flight.schema.testbed import as_testbed
+from ground.campaigns.runner import fly as fly_campaign
+from ground.report import panels
+from ground.report.figures import path_figure
+from ground.telemetry import Run
 from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.gnc.guidance.one_axis.vmc import plan
 from knightcube.reference.corner_streaks.detectors import cornerness
 from knightcube.reference.corner_streaks.rate import estimate_rate
 from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.objects.detect import lengths, olae_residuals, slopes, star_ends
 from knightcube.vision.objects.streak_ends import centre_of_rotation, measure_streaks, segment_frame
+from sim_hal.settings import Simulation
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.rso import EXPOSURE, draw_sky
+from tests.studies.campaigns.streaks import PERCENTS, STREAKS_THESIS, THESIS, THETAS_DEG
+from tests.support.flights import fly
 from tests.support.scenes import FIELD, YEAR, slew
 
 STREAK_SEED, CENTRE_SEED, OBJECT_SEED = 1, 1, 1
@@ -32,6 +48,10 @@ TURN = 1.0
 """Of the frame of the centre of rotation, in parts of the field: long arcs."""
 OBJECT_MAGNITUDE = 1.0
 """As in the thesis, "for visualization purposes"."""
+STREAKS_SEED = 12
+SIMULATION = Path(__file__).resolve().parents[2] / "config" / "step_simulation.yaml"
+NODES = 10
+"""Nodes of the planned path, as in the thesis's Simulation Results."""
 _ORANGE, _BLUE, _GREEN = "#D55E00", "#0072B2", "#009E73"
 
 
@@ -39,9 +59,15 @@ def main(arguments: list[str] | None = None) -> int:
     """Draw all figures and name them."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.source_pictures", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs") / "source_pictures", metavar="DIR")
-    folder: Path = parser.parse_args(arguments).out
+    parser.add_argument("--only", default="", metavar="TEXT", help="only pictures whose name contains it")
+    parser.add_argument("--runs", type=int, default=2, help="of `streaks-thesis`, default %(default)s")
+    options = parser.parse_args(arguments)
+    folder: Path = options.out
     folder.mkdir(parents=True, exist_ok=True)
-    for name, draw in PICTURES.items():
+    pictures = PICTURES | {ACCURACIES: partial(draw_accuracies, folder / "streaks-thesis", options.runs)}
+    for name, draw in sorted(pictures.items()):
+        if options.only not in name:
+            continue
         path = folder / f"{name}.png"
         draw().savefig(path, dpi=100, facecolor="white")
         sys.stdout.write(f"{path}\n")
@@ -132,6 +158,72 @@ def draw_centre() -> Figure:
     return figure
 
 
+def draw_accuracies(folder: Path, runs: int) -> Figure:
+    """Draw the errors of attitude and rate over theta and streak length: Fig. 3.7 to 3.10."""
+    cells = accuracies(folder, runs)
+    figure = Figure(figsize=(14.0, 7.4), layout="constrained")
+    panels_of = figure.subplots(2, 4, sharex=True, sharey=True)
+    for row, (key, unit, scale, printed) in enumerate(
+        (("across_px", "attitude, px", 1.0, (2, 3)), ("magnitude", "rate, %", 100.0, (0, 1)))
+    ):
+        for axes, name in zip(panels_of[row], DETECTOR_NAMES, strict=True):
+            values = np.full((len(THETAS_DEG), len(PERCENTS)), np.nan)
+            for cell in cells:
+                place = THETAS_DEG.index(cell["theta"]), PERCENTS.index(cell["percent"])
+                value = cell[name][key]
+                values[place] = np.nan if value is None else scale * value
+            axes.imshow(
+                np.log10(values), cmap="viridis_r", vmin=-2.0, vmax=1.0, aspect="auto", origin="lower"
+            )
+            for (theta, percent), value in np.ndenumerate(values):
+                axes.text(percent, theta, "" if np.isnan(value) else f"{value:.2f}", ha="center", va="center")
+            thesis = THESIS[name]
+            first, last = (thesis[index] for index in printed)
+            title = (
+                f"{name}, {unit}\nthesis < {first:g} at 10 %, < {last:g} at 50 %, theta > {thesis[4]:g} deg"
+            )
+            axes.set_title(title, fontsize=9)
+            axes.set_xticks(range(len(PERCENTS)), PERCENTS)
+            axes.set_yticks(range(len(THETAS_DEG)), THETAS_DEG)
+    figure.supxlabel("streak length, % of the field", fontsize=10)
+    figure.supylabel("angle between rotation axis and boresight, deg", fontsize=10)
+    return figure
+
+
+def accuracies(folder: Path, runs: int) -> list[dict[str, Any]]:
+    """Return the cells of the campaign `streaks-thesis`, flown or resumed in a folder."""
+    facts = fly_campaign(STREAKS_THESIS, runs, STREAKS_SEED, folder, progress=True).facts
+    found: list[dict[str, Any]] = facts["cells"]
+    return found
+
+
+def draw_path() -> Figure:
+    """Draw the slew that the thesis plans in 10 s and this coil makes in 13.8 s: Fig. 5.4 to 5.6."""
+    plant = plant_of(as_testbed(configuration.load(SIMULATION)))
+    return path_figure(plan(plant, 0.4, 0.015, -0.3, 0.0, 10.0, nodes=NODES), plant)
+
+
+def draw_steps() -> Figure:
+    """Draw attitude and current of the simulated steps: Fig. 5.7 and 5.8."""
+    signals = panels.RunSignals(flown_simulation())
+    figure = Figure(figsize=(10.0, 7.0), layout="constrained")
+    attitude, current = figure.subplots(2, 1, sharex=True)
+    panels.attitude(attitude, signals)
+    panels.current(current, signals)
+    attitude.set_xlabel("")
+    return figure
+
+
+def flown_simulation(duration: float = 700.0) -> Run:
+    """Return the thesis's simulation as this software flies it."""
+    config = configuration.replace(as_testbed(configuration.load(SIMULATION)), duration=duration)
+    steps = tuple(step for step in config.steps if step.at < duration)
+    text = SIMULATION.read_text(encoding="utf-8")
+    section = configuration.simulation_section(text, SIMULATION.name, Simulation)
+    with tempfile.TemporaryDirectory() as place:
+        return fly(configuration.replace(config, steps=steps), Path(place) / "run", section=section)
+
+
 def draw_indicators() -> Figure:
     """Draw slope, length and OLAE residual of every streak beside an object: Fig. 4.2 to 4.4."""
     camera = StarCameraModel(field_of_view=FIELD)
@@ -187,7 +279,10 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "fig_3_1_to_3_4_cornerness": draw_cornerness,
     "fig_3_5_centre_of_rotation": draw_centre,
     "fig_4_2_to_4_4_indicators": draw_indicators,
+    "fig_5_4_to_5_6_path": draw_path,
+    "fig_5_7_and_5_8_steps": draw_steps,
 }
+ACCURACIES = "fig_3_7_to_3_10_accuracies"
 
 if __name__ == "__main__":
     raise SystemExit(main())

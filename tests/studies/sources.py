@@ -233,7 +233,7 @@ def _counts(values: Sequence[int]) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.2g}"
+    return "" if value is None else f"{value:.3g}"
 
 
 if __name__ == "__main__":

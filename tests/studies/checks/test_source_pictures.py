@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image as Picture
 
-from knightcube.reference.corner_streaks.settings import StreakSettings
+from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
 from sim_hal.star_camera import StarCameraModel
 from tests.studies import source_pictures
@@ -17,10 +18,19 @@ from tests.support.scenes import FIELD
 
 
 @pytest.mark.slow
-def test_one_command_draws_every_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_command_draws_every_figure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The campaign's cells are made up and the flight is cut to 12 s; the command makes them in full."""
+    figures: dict[str, float | None] = {"magnitude": 0.003, "across_px": None}
+    cell: dict[str, Any] = {"theta": 45, "percent": 10}
+    cell |= dict.fromkeys(DETECTOR_NAMES, figures)
+    monkeypatch.setattr(source_pictures, "accuracies", lambda *_: [cell])
+    short = source_pictures.flown_simulation(12.0)
+    monkeypatch.setattr(source_pictures, "flown_simulation", lambda: short)
     assert source_pictures.main(["--out", str(tmp_path)]) == 0
     paths = [Path(line) for line in capsys.readouterr().out.splitlines()]
-    assert [path.stem for path in paths] == list(source_pictures.PICTURES)
+    assert {path.stem for path in paths} == {*source_pictures.PICTURES, source_pictures.ACCURACIES}
     for path in paths:
         with Picture.open(path) as picture:
             pixels = np.asarray(picture.convert("L"))
