@@ -50,6 +50,8 @@ OBJECT_MAGNITUDE = 1.0
 """As in the thesis, "for visualization purposes"."""
 STREAKS_SEED = 12
 SIMULATION = Path(__file__).resolve().parents[2] / "config" / "step_simulation.yaml"
+PRINTED_SIGMAS = 3.6, 3.5, 3.6
+"""Deviations of the thesis's object in its Fig. 4.2 to 4.4, in standard deviations of the frame."""
 NODES = 10
 """Nodes of the planned path, as in the thesis's Simulation Results."""
 _ORANGE, _BLUE, _GREEN = "#D55E00", "#0072B2", "#009E73"
@@ -97,10 +99,10 @@ def draw_cornerness() -> Figure:
     scene = slew(np.random.default_rng(STREAK_SEED), np.pi / 3.0, 0.04, 0.2, model=camera)
     window = _window_of_a_streak(scene.pixels, camera)
     figure = Figure(figsize=(12.0, 5.6), layout="constrained")
-    panels = figure.subplots(1, 5)
-    panels[0].imshow(window, cmap="gray")
-    panels[0].set_title("a streak", fontsize=10)
-    for axes, name in zip(panels[1:], DETECTOR_NAMES, strict=True):
+    first, *others = figure.subplots(1, 5)
+    first.imshow(window, cmap="gray")
+    first.set_title("a streak", fontsize=10)
+    for axes, name in zip(others, DETECTOR_NAMES, strict=True):
         response = cornerness(window, StreakSettings.of(name))
         axes.imshow(np.maximum(response, 0.0), cmap="inferno")
         row, column = np.unravel_index(response.argmax(), response.shape)
@@ -130,7 +132,7 @@ def draw_centre() -> Figure:
     found = estimate_rate(scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0)
     ends = found.endpoints[found.used]
     centre = centre_of_rotation(ends)
-    figure = Figure(figsize=(13.0, 6.6), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     _show(left, scene.pixels)
     for middle in ends.mean(axis=1):
@@ -162,11 +164,11 @@ def draw_accuracies(folder: Path, runs: int) -> Figure:
     """Draw the errors of attitude and rate over theta and streak length: Fig. 3.7 to 3.10."""
     cells = accuracies(folder, runs)
     figure = Figure(figsize=(14.0, 7.4), layout="constrained")
-    panels_of = figure.subplots(2, 4, sharex=True, sharey=True)
+    grid = figure.subplots(2, 4, sharex=True, sharey=True)
     for row, (key, unit, scale, printed) in enumerate(
         (("across_px", "attitude, px", 1.0, (2, 3)), ("magnitude", "rate, %", 100.0, (0, 1)))
     ):
-        for axes, name in zip(panels_of[row], DETECTOR_NAMES, strict=True):
+        for axes, name in zip(grid[row], DETECTOR_NAMES, strict=True):
             values = np.full((len(THETAS_DEG), len(PERCENTS)), np.nan)
             for cell in cells:
                 place = THETAS_DEG.index(cell["theta"]), PERCENTS.index(cell["percent"])
@@ -179,10 +181,8 @@ def draw_accuracies(folder: Path, runs: int) -> Figure:
                 axes.text(percent, theta, "" if np.isnan(value) else f"{value:.2f}", ha="center", va="center")
             thesis = THESIS[name]
             first, last = (thesis[index] for index in printed)
-            title = (
-                f"{name}, {unit}\nthesis < {first:g} at 10 %, < {last:g} at 50 %, theta > {thesis[4]:g} deg"
-            )
-            axes.set_title(title, fontsize=9)
+            limits = f"thesis: {first:g} at 10 %, {last:g} at 50 %\n(theta > {thesis[4]:g} deg)"
+            axes.set_title(f"{name}, {unit}\n{limits}", fontsize=9)
             axes.set_xticks(range(len(PERCENTS)), PERCENTS)
             axes.set_yticks(range(len(THETAS_DEG)), THETAS_DEG)
     figure.supxlabel("streak length, % of the field", fontsize=10)
@@ -234,18 +234,21 @@ def draw_indicators() -> Figure:
     ends = streaks.endpoints
     item = int(np.linalg.norm(ends.mean(axis=1) - sky.path.mean(axis=0), axis=1).argmin())
     figure = Figure(figsize=(8.0, 8.4), layout="constrained")
-    panels = figure.subplots(3, 1, sharex=True)
-    for axes, (label, values) in zip(panels, indicators(ends, sky.rate, camera.pinhole), strict=True):
+    rows = figure.subplots(3, 1, sharex=True)
+    shown = indicators(ends, sky.rate, camera.pinhole)
+    for axes, (label, values), printed in zip(rows, shown, PRINTED_SIGMAS, strict=True):
         mean, spread = float(values.mean()), float(values.std())
         axes.plot(values, "o", color=_BLUE, markersize=4)
         axes.plot(item, values[item], "o", color=_ORANGE, markersize=9, markerfacecolor="none")
         axes.axhline(mean, color="black", linewidth=0.8)
         axes.axhspan(mean - spread, mean + spread, color="gray", alpha=0.2, linewidth=0.0)
         beyond = abs(values[item] - mean) / spread
-        axes.set_title(f"{label}: the object lies {beyond:.1f} sigma from the mean", fontsize=10)
+        axes.set_title(
+            f"{label}: the object lies {beyond:.1f} sigma from the mean (thesis {printed:g})", fontsize=10
+        )
         axes.set_ylabel(label)
         axes.grid(alpha=0.3)
-    panels[-1].set_xlabel("streak index (the object circled; the band is 1 sigma)")
+    rows[-1].set_xlabel("streak index (the object circled; the band is 1 sigma)")
     return figure
 
 

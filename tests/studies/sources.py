@@ -35,12 +35,14 @@ from knightcube.reference.star_identification import (
     propose_pyramids,
     search,
 )
+from knightcube.reference.star_tables import KnownSky
+from knightcube.vision.startracker.index.build import default_index
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns import lost_in_space, rso_orbits
 from tests.studies.campaigns.rso import EXPOSURE, draw_sky, look
 from tests.studies.campaigns.rso_orbits import corner_rate, mean_errors, rate_error
 from tests.studies.campaigns.streaks import THESIS_BIAS, measured_bias
-from tests.support.scenes import FIELD
+from tests.support.scenes import BRIGHTEST, FIELD
 from tests.support.star_lists import ListKind, draw
 
 Rows = list[list[str]]
@@ -99,7 +101,7 @@ def table_4_4(runs: int, seed: int) -> Rows:
         if case.parameters["magnitude"] == rso_orbits.TABLE_MAGNITUDE
     ]
     facts = rso_orbits.RSO_ORBITS.summarise([rso_orbits.run(case) for case in cases], _NO_FOLDER).facts
-    skies = [facts["skies"][name] for name in (f"brightest {rso_orbits.BRIGHTEST}", "whole")]
+    skies = [facts["skies"][name] for name in (f"brightest {BRIGHTEST}", "whole")]
     rows = [["correct / overlapping / false", "thesis", "7,000 brightest stars", "all stars to V 8.5"]]
     names = ("centre of rotation", "magnitude of rotation", "combined indicator")
     for number, (name, printed) in enumerate(zip(names, rso_orbits.THESIS, strict=True)):
@@ -133,7 +135,7 @@ def image_matching_errors(runs: int, seed: int) -> Rows:
         "q-method, arcsec",
         *(f"{n} step{'s' * (n > 1)}" for n in steps),
     ]
-    rows, stars = [head], lost_in_space.known_sky(15.0).index.stars
+    rows, stars = [head], default_index().stars
     for field_deg in (12.0, 20.0):
         for prior_deg in (0.01, 0.1, 1.0, 5.0):
             off: dict[int, list[FloatArray]] = {number: [] for number in (0, *steps)}
@@ -155,6 +157,8 @@ def image_matching_errors(runs: int, seed: int) -> Rows:
     return rows
 
 
+FIELD_DEG = 15.0
+"""Field of the lists of `cosine_limits`, as in the campaign `lost-in-space`."""
 _WITH_ANGLES: dict[str, Propose] = {
     "angle": propose_angles,
     "pyramid": propose_pyramids,
@@ -165,9 +169,11 @@ _WITH_ANGLES: dict[str, Propose] = {
 def cosine_limits(runs: int, seed: int) -> Rows:
     """Return identifications with limits from eq. 31 and from first-order angles, on the same lists."""
     rows = [["method", "lists", "right; wrong, angle", "right; wrong, eq. 31", "ms, angle", "ms, eq. 31"]]
-    sky = lost_in_space.known_sky(15.0)
+    half = float(np.tan(np.radians(0.5 * FIELD_DEG)))
+    sky = KnownSky(default_index(), (half, half))
+    _ = sky.pairs, sky.tree
     faintest = float(sky.stars.magnitude[-1])
-    nominal = ListKind(15.0, 0.3, 2, faintest, magnitude_error=0.2, lost=0.1, known_deg=0.0)
+    nominal = ListKind(FIELD_DEG, 0.3, 2, faintest, magnitude_error=0.2, lost=0.1, known_deg=0.0)
     for label, kind in (("", nominal), (", 2 px of noise", replace(nominal, noise_px=2.0))):
         drawn = [draw(kind, sky.index.stars, np.random.default_rng((seed, run))) for run in range(runs)]
         for name, propose in _WITH_ANGLES.items():

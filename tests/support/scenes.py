@@ -19,6 +19,8 @@ EXPOSURES = (0.2, 1.0)
 """Exposure times (s) of random slews."""
 MOST_TURN = 0.5
 """Largest rotation of a random slew, as a fraction of the field."""
+BRIGHTEST = 7000
+"""Number of stars with which the tables of the thesis are reached; the thesis states none."""
 LEAST_USABLE = 5
 """Smallest number of usable stars in a random slew."""
 _MOST_SKIES = 1000
@@ -54,6 +56,12 @@ def catalogue(limit: float) -> tuple[StarCatalogue, FloatArray]:
     """Return the stars brighter than `limit` and their directions (n, 3)."""
     stars = load().brighter_than(limit)
     return stars, stars.directions_at(YEAR)
+
+
+@lru_cache(maxsize=4)
+def faintest(stars: int) -> float:
+    """Return the magnitude below which the catalogue has at least `stars` stars."""
+    return float(np.nextafter(np.sort(load().magnitude)[stars - 1], np.inf))
 
 
 def slew(

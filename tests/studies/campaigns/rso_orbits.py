@@ -44,7 +44,7 @@ from tests.support.opportunities import (
     opportunities,
     table_4_3,
 )
-from tests.support.scenes import FIELD, catalogue
+from tests.support.scenes import BRIGHTEST, FIELD, catalogue, faintest
 
 # 2026-05-18 0 h TT: with a frame a second and the Sun and Earth kept out of half the field, as in 2.17 and
 # 2.19, the thesis's number of opportunities.
@@ -61,8 +61,6 @@ FAINTER_MAG = 4.0
 # Table 4.4: correct, overlapping streak, false.
 THESIS = ((12, 0, 3), (10, 2, 0), (12, 2, 0))
 RULES = ("strict", "bounded")
-BRIGHTEST = 7000
-"""Number of stars in the smaller sky of Table 4.4; the thesis does not state how many stars it drew."""
 ESTIMATORS = ("harris", "likelihood")
 
 
@@ -77,14 +75,6 @@ def cases(runs: int, seed: int) -> list[Case]:
         for run in range(runs)
         for magnitude, stars in [*((each, None) for each in MAGNITUDES), (TABLE_MAGNITUDE, BRIGHTEST)]
     ]
-
-
-@lru_cache(maxsize=4)
-def faintest(stars: int | None) -> float:
-    """Return the magnitude below which the catalogue has at least `stars` stars; None stands for all."""
-    if stars is None:
-        return STAR_LIMIT
-    return float(np.nextafter(np.sort(catalogue(STAR_LIMIT)[0].magnitude)[stars - 1], np.inf))
 
 
 @lru_cache(maxsize=4)
@@ -112,7 +102,8 @@ def run(case: Case) -> Result:
 def one_frame(scenario: Scenario, at: Opportunity, case: Case, number: int) -> Result:
     """Expose at an opportunity, and count what each indicator and the judge of pixels single out."""
     camera = StarCameraModel(field_of_view=FIELD)
-    magnitude, limit = case.parameters["magnitude"], faintest(case.parameters.get("stars"))
+    magnitude, stars = case.parameters["magnitude"], case.parameters.get("stars")
+    limit = STAR_LIMIT if stars is None else faintest(stars)
     pixels = expose(scenario, at, magnitude, np.random.default_rng((*case.seed, number)), limit)
     report, seconds = look(pixels, camera, RATE)
     truth = np.array([at.first, at.last])
@@ -121,10 +112,10 @@ def one_frame(scenario: Scenario, at: Opportunity, case: Case, number: int) -> R
     result["harris"] = rate_error(corner_rate(pixels, camera, RATE))
     result["likelihood"] = rate_error(None if report is None else report.rotation / EXPOSURE)
     if report is not None:
-        stars = star_streaks(scenario, at, limit)
-        result |= {rule: count_indicators(report, truth, *stars, rule) for rule in RULES}
+        near = star_streaks(scenario, at, limit)
+        result |= {rule: count_indicators(report, truth, *near, rule) for rule in RULES}
         result["overlapping"] = sum(
-            _overlap(item.endpoints, *stars)
+            _overlap(item.endpoints, *near)
             for item in report.objects
             if ends_error(item.endpoints, truth) >= MATCH_PX
         )
