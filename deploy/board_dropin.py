@@ -18,8 +18,6 @@ from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Any
 
-from flight.app.cli.check import check_values
-from flight.app.flight import placing
 from flight.schema.devices import DRIVERS, AravisDevice, driver_of
 from flight.schema.document import ConfigError, read_document, read_text
 from flight.schema.reader import LOOPBACK, load, peer_networks
@@ -178,6 +176,9 @@ def check_single(path: Path) -> None:
 
 def main(words: list[str]) -> int:
     """Make the drop-ins for the configuration file in the arguments, and return the exit status."""
+    from flight.app.cli.check import check_values  # noqa: PLC0415 - open_bundle.py does not need the flight,
+    from flight.app.flight import placing  # noqa: PLC0415 - which is slow to load
+
     path, folder = Path(words[0]), Path(words[1]) if words[1:] else None
     try:
         check_single(path)

@@ -307,7 +307,8 @@ def class_path() -> str:
 
 def compile_link(folder: Path) -> None:
     """Compile the data link of the configuration in a folder. Raises FlightError with the compiler's text."""
-    compiler = ["java", "-cp", class_path(), "-m", "jdk.compiler/com.sun.tools.javac.Main", "-proc:none"]
+    compiler = ["java", "-XX:TieredStopAtLevel=1", "-XX:+UseSerialGC", "-cp", class_path()]
+    compiler += ["-m", "jdk.compiler/com.sun.tools.javac.Main", "-proc:none"]
     command = [*compiler, "-d", str(folder), str(folder / LINK_SOURCE)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
