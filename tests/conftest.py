@@ -2,8 +2,9 @@
 
 `make slow-list` measures and writes both lists. A test is slow if all its cases together take more than
 `LIMIT_S` of processor time, fixtures included. `make quick` leaves slow tests out; a listed test that was
-renamed is not slow until the list is made again. Files that take more than `LONG_S` come first, in falling
-order: then the workers that share the files of `make test` finish at nearly the same time.
+renamed is not slow until the list is made again. Files that last longer than `LONG_S` come first, in falling
+order: then the workers that share the files of `make test` finish at nearly the same time. A file that waits
+for processes or sockets lasts longer than its processor time.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import fcntl
 import gc
 import os
 import resource
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,6 +34,9 @@ LONG_S = 1.0
 LIST = Path(__file__).with_name("slow.txt")
 ORDER = Path(__file__).with_name("order.txt")
 _spent: dict[str, float] = {}
+"""Processor time (s) of each test."""
+_lasted: dict[str, float] = {}
+"""Duration (s) of each test file, or its processor time if that is longer."""
 
 
 @pytest.fixture(scope="session")
@@ -79,18 +84,20 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _seconds(path: Path) -> dict[str, float]:
-    """Return the processor time (s) of each test or test file of a list."""
+    """Return the time (s) of each test or test file of a list."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     return {name: float(spent) for name, _, spent in (line.rpartition(" ") for line in lines)}
 
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Measure a test's processor time, its fixtures and child processes included."""
-    begun = _processor_s()
+    """Measure a test's processor time and duration, its fixtures and child processes included."""
+    begun, clock = _processor_s(), time.monotonic()
     yield
-    name = _function(item)
-    _spent[name] = _spent.get(name, 0.0) + _processor_s() - begun
+    name, spent = _function(item), _processor_s() - begun
+    file = name.partition("::")[0]
+    _spent[name] = _spent.get(name, 0.0) + spent
+    _lasted[file] = _lasted.get(file, 0.0) + max(spent, time.monotonic() - clock)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
@@ -98,12 +105,8 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     if session.config.getoption("--write-slow-list"):
         slow = sorted(f"{name} {spent:.1f}" for name, spent in _spent.items() if spent > LIMIT_S)
         LIST.write_text("\n".join(slow) + "\n", encoding="utf-8")
-        of_file: dict[str, float] = {}
-        for name, spent in _spent.items():
-            file = name.partition("::")[0]
-            of_file[file] = of_file.get(file, 0.0) + spent
-        longest = sorted(of_file.items(), key=lambda entry: -entry[1])
-        lines = [f"{file} {spent:.0f}\n" for file, spent in longest if spent > LONG_S]
+        longest = sorted(_lasted.items(), key=lambda entry: -entry[1])
+        lines = [f"{file} {seconds:.0f}\n" for file, seconds in longest if seconds > LONG_S]
         ORDER.write_text("".join(lines), encoding="utf-8")
 
 
