@@ -42,7 +42,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     """Return the folder with a flight, what the command said of it, and the fragment."""
     place = tmp_path_factory.mktemp("identify")
     config = place / "first.yaml"
-    config.write_text(f"extends: orbit_3u\nname: first\nduration: 65.0\n{WORLD}")
+    seen = "camera: {objects: null}\nwide_cameras: []"  # the horizon and objects teach nothing here
+    config.write_text(f"extends: orbit_3u\nname: first\nduration: 65.0\n{seen}\n{WORLD}")
     fly(config, place / "first")
     done = command("identify", place / "first", "--out", place / "learned.yaml", "--json")
     assert done.returncode == 0, done.stderr

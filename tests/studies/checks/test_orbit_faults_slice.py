@@ -39,7 +39,7 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def flown(fault: str, mode: str, folder: Path) -> Run:
     entry = FaultEntry(fault=fault, at=AT, span=SPAN)
-    config = configuration.replace(config_for(mode), duration=BRIEF)
+    config = configuration.replace(config_for(mode), duration=BRIEF, wide_cameras=())
     return fly(config, folder, section=world_for(mode, 3, (entry,)))
 
 

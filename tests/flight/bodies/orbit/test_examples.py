@@ -26,7 +26,7 @@ DOUBLED = tuple(
     )
 )
 """Three axes of which z has two unequal coils, in opposite directions."""
-SECONDS, FIELD = 60.0, 3.0e-5
+SECONDS, FIELD = 36.0, 3.0e-5
 """s and T."""
 
 
@@ -79,7 +79,7 @@ def test_a_satellite_with_four_coils_flies_on_when_one_of_them_fails(
     # The fourth coil is isolated, and the other coils continue to brake the body.
     (event,) = [row for row in run["event"] if row["name"] == b"coil-broken"]
     assert event["text"].startswith(b"coil 4 open")
-    assert event["time_ns"] < 45_000_000_000
+    assert event["time_ns"] < 25_000_000_000
     assert int(run["health"]["coils_in_use"][-1]) == 0b0111
     after = told["time_ns"] > event["time_ns"] + 1_000_000_000
     assert not told["command"][after, broken].any()
@@ -100,7 +100,7 @@ def test_a_satellite_with_four_coils_flies_on_when_one_of_them_fails(
 
 def test_a_satellite_with_two_coils_detumbles_and_no_coil_is_accused(tmp_path: Path) -> None:
     path = FOLDER / "orbit.yaml"
-    config = without_cameras(as_orbit(configuration.load(path)), SECONDS)
+    config = without_cameras(as_orbit(configuration.load(path)), 60.0)
     coils = configuration.replace(config.coils, windings=config.coils.windings[:2])
     section = configuration.simulation_section(path.read_text(encoding="utf-8"), str(path), Simulation)
     run = fly(configuration.replace(config, coils=coils), tmp_path, section=section)
