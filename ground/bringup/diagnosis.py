@@ -51,7 +51,6 @@ class Finding:
         kind: kind of the fault in one or two words, for example `reversed`.
         text: measured value and its meaning.
         cure: remedy.
-        coil: index of the coil whose resistance differs, or None.
         factor: factor by which the resistance differs, or None.
     """
 
@@ -59,7 +58,6 @@ class Finding:
     kind: str
     text: str
     cure: str
-    coil: int | None = None
     factor: float | None = None
 
     def line(self) -> str:
@@ -616,8 +614,8 @@ def _wrong_size(part: str, name: str, size: float, drawn: float) -> list[Finding
         cure = f"check turns and place of the coil; multiply its dipole moment per ampere by {size:.2f}"
         return [Finding(part, "wrong strength", text, cure)]
     if drawn > 0.0 and abs(drawn / size - 1.0) <= _NEAR:
-        cure, index = f"multiply `resistance` by {1.0 / drawn:.2f}", int(part.partition("[")[2][:-1])
-        return [Finding(part, "wrong resistance", text, cure, index, 1.0 / drawn)]
+        cure = f"multiply `resistance` by {1.0 / drawn:.2f}"
+        return [Finding(part, "wrong resistance", text, cure, 1.0 / drawn)]
     if drawn > 1.3:
         return [Finding(part, "short", text, "separate the shorted turns or wires")]
     return [Finding(part, "unlike", f"{text}, {UNRECOGNISED}", "check coil, plug and bridge")]
