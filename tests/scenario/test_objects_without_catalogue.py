@@ -5,11 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from flight.schema import reader as configuration
 from flight.schema.devices import ObjectTracking, StarTrackerSection
+from flight.schema.document import FOLDER
+from flight.schema.orbit import as_orbit
 from ground.messages import orbits_of
 from ground.telemetry import Run
+from sim_hal.settings import Simulation
 from tests.scenario.object_flights import _LINES, _PIXEL, _place, two_objects
 from tests.support.flights import demo_config, demo_world, event_names, fly
 
@@ -67,3 +71,28 @@ def test_a_damaged_sky_index_leaves_detection_by_motion(
     assert "vision-failed" in names
     assert any(b"stars are not identified" in row["text"] for row in run["event"])
     assert set(run["track"]["number"].tolist()) == {1, 2}
+
+
+@pytest.mark.slow
+def test_a_satellite_follows_an_object_without_a_star_catalogue(tmp_path: Path) -> None:
+    """A KnightCube with a coarse attitude turns with an object that passes at 0.4 deg/s."""
+    path, seconds = FOLDER / "orbit_object_1u.yaml", 75.0
+    config = as_orbit(configuration.load(path))
+    assert config.camera is not None
+    camera = configuration.replace(config.camera, star_tracker=None)
+    config = configuration.replace(config, camera=camera, duration=seconds)
+    section = configuration.simulation_section(path.read_text(encoding="utf-8"), str(path), Simulation)
+    run = fly(config, tmp_path, section=section)
+    names = event_names(run)
+    assert names.count("object-found") == names.count("object-followed") == 1
+    assert "object-lost" not in names
+    assert set(run["track"]["number"].tolist()) == {1}, "the object, and no false track"
+    assert run["track"]["seen"].mean() > 0.9
+    last = run["truth"]["time_ns"] > (seconds - 20.0) * 1e9
+    turned = np.degrees(np.linalg.norm(run["truth"]["rate"][last], axis=1))
+    assert turned.min() > 0.3, "the body turns with the object"
+    seen = run["sightings"][run["sightings"]["middle_ns"] > (seconds - 20.0) * 1e9]
+    centre = np.array([0.5 * (camera.columns - 1), 0.5 * (camera.rows - 1)])
+    away = np.hypot(seen["x"] - centre[0], seen["y"] - centre[1])
+    near = np.nanmin(away[seen["found"] > 0], axis=1)
+    assert np.median(near) < 80.0, "the object is within 3 deg of the boresight"
