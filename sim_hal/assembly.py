@@ -14,6 +14,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
+import msgspec
 import numpy as np
 
 from flight.schema.devices import Camera, UnitCalibration, WideCamera, driver_of
@@ -133,6 +134,13 @@ def assemble(
         "inertial_unit", wires, config, section, generator, *times, world, sense, circuit.mean_supply
     )
     unit = emulated(given)
+    if (magnetometer := config.magnetometer) is not None:
+        # The second magnetometer has errors of its own.
+        own = msgspec.structs.replace(config, inertial_unit=magnetometer)
+        other = msgspec.structs.replace(section, seed=section.seed + 1)
+        generator = np.random.default_rng([section.seed, ORBIT_STREAM, 3])
+        felt = _sense(own, other, world, circuit)
+        emulated(replace(given, kind="magnetometer", generator=generator, sense=felt))
     objects = sky_objects(section, start_ns, world)
     camera = _star_camera(config, section, world, now_ns, objects, expose) if config.camera else None
     orbit = OrbitDevices(

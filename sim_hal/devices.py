@@ -24,6 +24,7 @@ from flight.schema.document import ConfigError, imported
 from hal.drivers.ads1115 import StringWiring
 from hal.drivers.coils import CoilSettings, wirings
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.emulation import ORBIT_STREAM, Emulation
 from sim_hal.emulators.coil_circuit import CoilCircuit, CoilCondition, EmulatedIna219
 from sim_hal.emulators.drv8830 import BridgeCircuit
@@ -153,7 +154,7 @@ def emulate_drv8830(emulation: Emulation, coils: Coils) -> BridgeCircuit:
 
 def emulate_sensors(emulation: Emulation, unit: SensorsSection) -> tuple[Any, ...]:
     """Connect the sensors of an inertial unit. Raises ConfigError for a sensor without an emulator."""
-    to_unit, made = emulation.to_sensor(), []
+    to_unit, made = attitude_matrix(np.array(unit.mounting)).T, []
     for number, sensor in enumerate(unit.sensors):
         axes: dict[str, FloatArray] = {
             quantity: axis_matrix(names).T @ to_unit for quantity, names in sensor.measures.items()

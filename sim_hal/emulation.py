@@ -18,8 +18,6 @@ from flight.schema.sections import Config
 from hal.buses.i2c_bus import device_file
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SerialPort, SpiDevice
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.clock import SerialEnd
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.serial_line import EmulatedSerialLine, PtyLine
@@ -127,10 +125,6 @@ class Emulation:
     def connect(self, device: str, baud_rate: int) -> SerialEnd:
         """Make the device's serial line, and return the device's end of the line."""
         return self.wires.connect(self.kind, device, baud_rate)
-
-    def to_sensor(self) -> FloatArray:
-        """Return the matrix (3, 3) from body axes to the axes of the inertial unit."""
-        return attitude_matrix(np.array(self.config.inertial_unit.mounting)).T
 
 
 def emulated(emulation: Emulation) -> object | None:

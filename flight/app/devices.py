@@ -26,6 +26,7 @@ from flight.schema.devices import (
     Coils,
     Gps,
     InertialUnitSection,
+    MagnetometerSection,
     PowerMonitorSection,
     Sensor,
     SensorsSection,
@@ -153,6 +154,7 @@ class Devices:
     """
 
     unit: InertialUnit
+    magnetometer: InertialUnit | None
     coils: TorqueCoils
     power: PowerMonitor | None
     camera: FrameSource | None
@@ -171,8 +173,10 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
     coils.start(patient=patient)
     power: PowerMonitor | None = opened("power_monitor", config, rig, stack)
     unit: InertialUnit = opened("inertial_unit", config, rig, stack)
-    with suppress(DeviceError) if patient else nullcontext():
-        unit.configure()
+    magnetometer: InertialUnit | None = opened("magnetometer", config, rig, stack)
+    for one in filter(None, (unit, magnetometer)):
+        with suppress(DeviceError) if patient else nullcontext():
+            one.configure()
     cameras = [config.camera, *config.wide_cameras]
     if rig.cameras is None:
         frames = [open_camera(one, rig, stack, patient) if one is not None else None for one in cameras]
@@ -184,7 +188,8 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
     strings: SolarStrings | None = opened("solar_strings", config, rig, stack)
     supply = [] if config.power is None else config.power.monitors().items()
     monitors = tuple(_opened("power_monitor", one, rig, stack, key) for key, one in supply)
-    return Devices(unit, coils, power, frames[0], gps, strings, tuple(filter(None, frames[1:])), monitors)
+    wide = tuple(filter(None, frames[1:]))
+    return Devices(unit, magnetometer, coils, power, frames[0], gps, strings, wide, monitors)
 
 
 def opened(kind: str, config: Config, rig: Rig, stack: ExitStack) -> Any:
@@ -325,8 +330,9 @@ def files_vn100(unit: InertialUnitSection) -> Sequence[str]:
 def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
     """Return the driver of an inertial unit of separate sensors. Raises ConfigError for an unknown sensor."""
     parts, measured = [], set[str]()
+    kind = "magnetometer" if isinstance(unit, MagnetometerSection) else "inertial_unit"
     for number, sensor in enumerate(unit.sensors):
-        key = f"inertial_unit.sensors[{number}]"
+        key = f"{kind}.sensors[{number}]"
         part = imported(f"{key}.part", sensor.part, SENSOR_PARTS, os.environ)
         if (sensor.spi is not None) != hasattr(part, "SPEED_HZ"):
             problem = (
@@ -339,7 +345,7 @@ def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
         parts.append(SensorPart(sensor.part, partial(_started, part, rig, sensor), axes))
         measured |= set(axes)
     if "magnetic" not in measured:
-        raise ConfigError("inertial_unit.sensors", "measure no magnetic field: add a sensor of `magnetic`")
+        raise ConfigError(f"{kind}.sensors", "measure no magnetic field: add a sensor of `magnetic`")
     known = unit.calibration
     settings = SensorUnitSettings(
         mounting=attitude_matrix(np.array(unit.mounting)),

@@ -471,7 +471,7 @@ def _tasks(
         round(SECOND_NS / CONTROL_RATE_HZ),
         config.inertial_unit.has_gyro(),
     )
-    navigation = Navigation(devices.unit, body.estimation, ages, services)
+    navigation = Navigation(devices.unit, body.estimation, ages, services, devices.magnetometer)
     imaging = _imaging(config, opened, navigation, body, services)
     horizon_cameras = None
     if config.wide_cameras and devices.horizon_cameras and body.estimation.horizon_cameras is not None:

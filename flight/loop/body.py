@@ -375,6 +375,12 @@ class BodyEstimation(Protocol):
         """
         del used
 
+    def magnetometer_changed(self) -> None:
+        """Accept that later magnetic fields come from another magnetometer.
+
+        The default method does nothing, for a body that estimates no errors of the magnetometer.
+        """
+
     def is_accurate(self, estimate: Estimate) -> bool:
         """Return whether an estimate without a gyro is accurate enough for driving the coils."""
         return True

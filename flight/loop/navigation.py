@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,9 +123,18 @@ class Navigation:
     """Owns the filter, and monitors the serial line of the inertial unit."""
 
     def __init__(
-        self, unit: InertialUnit, estimation: BodyEstimation, settings: NavigationSettings, services: Services
+        self,
+        unit: InertialUnit,
+        estimation: BodyEstimation,
+        settings: NavigationSettings,
+        services: Services,
+        magnetometer: InertialUnit | None = None,
     ) -> None:
+        """Read the inertial unit or, while it gives no readings, the `magnetometer`."""
         self._unit = unit
+        self._magnetometer = magnetometer
+        self._replaced = False  # whether the magnetometer replaces the inertial unit
+        self._unit_ns = 0  # time (ns) of the unit's newest reading
         self._estimation = estimation
         self._filter = estimation.filter
         self._feed = estimation.feed
@@ -152,7 +162,7 @@ class Navigation:
     def begin(self, time_ns: int) -> None:
         """Ignore readings made before the release of the body at `time_ns`."""
         self._since_ns = time_ns
-        self._received_ns = self._agreed_ns = time_ns
+        self._received_ns = self._agreed_ns = self._unit_ns = time_ns
         self._bytes_since_ns = time_ns
         self._link = self._unit.link()
 
@@ -183,8 +193,13 @@ class Navigation:
             polled = self._unit.poll()
         except DeviceError as error:
             self._facts.update(facts.IMU_LINE_LOST, True, now_ns, str(error))
-            return ()
-        self._facts.update(facts.IMU_LINE_LOST, False, now_ns, "the serial port is back")
+            if self._magnetometer is None:
+                return ()
+            polled = []
+        else:
+            self._facts.update(facts.IMU_LINE_LOST, False, now_ns, "the serial port is back")
+        if self._magnetometer is not None:
+            polled = self._or_magnetometer(polled, self._magnetometer, now_ns)
         readings = tuple(reading for reading in polled if self._is_usable(reading, now_ns))
         for reading in readings:
             self._ingest(reading)
@@ -202,6 +217,21 @@ class Navigation:
         text = "the body rate contradicts the commands" if doubted else "the rate follows the commands"
         self._facts.update(facts.COMMANDS_DOUBTED, doubted, now_ns, text)
         return readings
+
+    def _or_magnetometer(
+        self, polled: list[ImuReading], magnetometer: InertialUnit, now_ns: int
+    ) -> list[ImuReading]:
+        """Return the unit's readings or, once the unit has been silent for a while, the magnetometer's."""
+        if polled:
+            self._unit_ns = polled[-1].time_ns
+        fields: list[ImuReading] = []
+        with suppress(DeviceError):  # a failed magnetometer gives no readings, which other facts report
+            fields = magnetometer.poll()
+        replaced = now_ns - self._unit_ns > self._settings.max_age_ns
+        if replaced is not self._replaced:
+            self._replaced = replaced
+            self._estimation.magnetometer_changed()
+        return [one for one in fields if one.time_ns > self._received_ns] if replaced else polled
 
     def is_current(self, now_ns: int) -> bool:
         """Return whether the newest reading will be recent enough for control until the next cycle."""
@@ -224,7 +254,10 @@ class Navigation:
         """Return whether the filter can use a reading, and report a reading without a valid rate."""
         if reading.time_ns < self._since_ns:
             return False
-        text = "the rate is valid again" if reading.has_rate else f"invalid: {self._unit.link().rejection}"
+        text = "the rate is valid again"
+        if not reading.has_rate:
+            text = f"invalid: {self._unit.link().rejection}"
+            text = "the magnetometer replaces the silent inertial unit" if self._replaced else text
         lost = self._settings.has_gyro and not reading.has_rate
         self._facts.update(facts.GYRO_LOST, lost, now_ns, text)
         return reading.has_rate or self._estimation.uses_readings_without_rate

@@ -145,6 +145,15 @@ class SensorsSection(UnitSection, frozen=True, kw_only=True):
         return any("gyro" in sensor.measures for sensor in self.sensors)
 
 
+class MagnetometerSection(SensorsSection, frozen=True, kw_only=True):
+    """A magnetometer of its own, which is read while the inertial unit is silent.
+
+    Without a section `inertial_unit`, it is the only source of readings.
+    """
+
+    driver: DriverName = "sensors"
+
+
 class Winding(Section, frozen=True, kw_only=True):
     """One coil of a satellite, which is a torque rod or an air coil, with its H-bridge.
 
@@ -721,6 +730,7 @@ VN100 = _ours(
     check=later("flight.app.devices:unit_settings"),
 )
 SENSORS = _ours("inertial_unit", SensorsSection, "sensors")
+MAGNETOMETER = _ours("magnetometer", MagnetometerSection, "sensors")
 PCA9685 = _ours(
     "coils",
     Coils,
@@ -744,6 +754,7 @@ ARAVIS = _ours("camera", AravisDevice, "aravis")
 
 DRIVERS: Mapping[str, Mapping[str, str]] = {
     "inertial_unit": {"vn100": f"{__name__}:VN100", "sensors": f"{__name__}:SENSORS"},
+    "magnetometer": {"sensors": f"{__name__}:MAGNETOMETER"},
     "coils": {"pca9685": f"{__name__}:PCA9685", "drv8830": f"{__name__}:DRV8830"},
     "power_monitor": {"ina219": f"{__name__}:INA219"},
     "gps": {"ublox": f"{__name__}:UBLOX", "nmea": f"{__name__}:NMEA"},

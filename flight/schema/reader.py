@@ -22,6 +22,7 @@ from flight.schema.devices import (
     Coils,
     Power,
     SolarStringsSection,
+    UnitSection,
     V4l2Device,
     structure_mask,
     with_drivers,
@@ -88,9 +89,9 @@ def check_consistency(config: Config, document: Document) -> None:
     if config.camera is not None:
         _check_camera(config.camera, refuse)
         _check_length("camera.mounting", config.camera.mounting, refuse)
-    _check_length("inertial_unit.mounting", config.inertial_unit.mounting, refuse)
-    for name in ("gyro_matrix", "field_matrix"):
-        _check_matrix(f"inertial_unit.calibration.{name}", getattr(unit.calibration, name), refuse)
+    _check_unit("inertial_unit", unit, refuse)
+    if config.magnetometer is not None:
+        _check_unit("magnetometer", config.magnetometer, refuse)
     for index, camera in enumerate(config.wide_cameras):
         _check_length(f"wide_cameras[{index}].mounting", camera.mounting, refuse)
         try:
@@ -280,6 +281,12 @@ def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
         refuse(dotted, f"has length {norm:.6g}: a quaternion must have length 1")
 
 
+def _check_unit(kind: str, unit: UnitSection, refuse: Refuse) -> None:
+    _check_length(f"{kind}.mounting", unit.mounting, refuse)
+    for name in ("gyro_matrix", "field_matrix"):
+        _check_matrix(f"{kind}.calibration.{name}", getattr(unit.calibration, name), refuse)
+
+
 def _check_matrix(dotted: str, matrix: tuple[Vector, Vector, Vector], refuse: Refuse) -> None:
     largest = float(np.abs(np.array(matrix) - np.eye(3)).max())
     if largest > _LARGEST_CORRECTION:
@@ -400,14 +407,30 @@ def load(path: Path) -> Config:
 def parse(text: str, name: str = "configuration") -> Config:
     """Validate a configuration text. Error messages name the file `name`. Raises ConfigError."""
     document = read_document(text, name)
-    for optional in ("camera", "power_monitor", "power", "gps", "solar_strings"):
+    optionals = "inertial_unit", "magnetometer", "camera", "power_monitor", "power", "gps", "solar_strings"
+    for optional in optionals:
         if document.values.get(optional) == "none":
             document.values[optional] = None
+    _replace_unit(document)
     # A body defined outside this repository uses the sections of the testbed.
     shape = OrbitConfig if document.values.get("body") == "orbit" else TestbedConfig
     config: Config = convert(document, with_drivers(shape, document))
     check_consistency(config, document)
     return config
+
+
+def _replace_unit(document: Document) -> None:
+    """Use the magnetometer as an inertial unit without a gyro, if there is no inertial unit.
+
+    Raises ConfigError for a file whose `inertial_unit` is none, and which has no magnetometer.
+    """
+    values = document.values
+    if values.get("inertial_unit") is not None:
+        return
+    if isinstance(values.get("magnetometer"), dict):
+        values["inertial_unit"] = {"driver": "sensors", **values.pop("magnetometer")}
+    elif "inertial_unit" in values:
+        raise document.error("inertial_unit", "is none: give a `magnetometer`, which then replaces the unit")
 
 
 def load_testbed(path: Path) -> TestbedConfig:

@@ -17,6 +17,7 @@ from flight.schema.devices import (
     Coils,
     Gps,
     InertialUnitSection,
+    MagnetometerSection,
     Power,
     PowerMonitorSection,
     SolarStringsSection,
@@ -245,7 +246,8 @@ class Separation(Section, frozen=True, kw_only=True):
 class Config(Section, frozen=True, kw_only=True):
     """The configuration sections of every body; the configuration of a body adds more sections.
 
-    The value `body` names the body; a body outside this repository is named as `module:object`.
+    The value `body` names the body; a body outside this repository is named as `module:object`. Without an
+    `inertial_unit`, the `magnetometer` becomes an inertial unit without a gyro.
     """
 
     name: Annotated[
@@ -256,6 +258,7 @@ class Config(Section, frozen=True, kw_only=True):
     ]
     body: Annotated[str, Meta(min_length=1, max_length=200)] = "testbed"
     inertial_unit: InertialUnitSection
+    magnetometer: MagnetometerSection | None = None
     coils: Coils
     power_monitor: PowerMonitorSection | None = None
     power: Power | None = None
@@ -286,7 +289,8 @@ class Config(Section, frozen=True, kw_only=True):
 
     def hardware(self) -> tuple[Section, ...]:
         """Return the hardware sections on which the validity of learned parameters depends."""
-        return (self.coils, self.inertial_unit)
+        spare = () if self.magnetometer is None else (self.magnetometer,)
+        return (self.coils, self.inertial_unit, *spare)
 
     def shortened(self, duration: float) -> Self:
         """Return the configuration with another flight duration, s."""

@@ -52,8 +52,7 @@ targets: [{at: 0.0, point: nadir}]
 
 MAGNETOMETER = """
 extends: {name}
-inertial_unit:
-  driver: sensors
+magnetometer:
   sensors: [{{part: lis3mdl, address: 0x1e, measures: {{magnetic: [-y, x, z]}}, set: {{data_rate: 1}}}}]
 camera: none
 wide_cameras: []
@@ -62,11 +61,11 @@ duration: {duration}
 """
 
 
-def flown(text: str, folder: Path, *expected: str) -> Run:
+def flown(text: str, folder: Path, *expected: str, fault: str = "") -> Run:
     """Fly a configuration in lock-step, and return its logs; only the `expected` faults may be noticed."""
     path = folder / "config.yaml"
     path.write_text(text, encoding="utf-8")
-    result = fly(RunRequest(path, folder / "run"))
+    result = fly(RunRequest(path, folder / "run", faults=(fault,) if fault else ()))
     assert set(result.ending.faults) == set(expected)
     assert result.ending.coils_at_zero
     return read_run(folder / "run")
@@ -102,21 +101,26 @@ def test_a_satellite_flies_with_a_sensor_on_spi_and_a_receiver_with_nmea_sentenc
     assert link["sentences"] >= 2
 
 
-@pytest.mark.parametrize(("name", "duration"), [("step_demo", 13.0), ("orbit", 6.0)])
-def test_a_magnetometer_alone_carries_a_flight_without_an_inertial_unit(
-    tmp_path: Path, name: str, duration: float
+def test_a_magnetometer_of_its_own_carries_the_testbed_while_the_inertial_unit_is_off(
+    tmp_path: Path,
 ) -> None:
-    """The testbed reaches its step, and the satellite knows its rate across the field and brakes."""
+    """Without a camera, the coils rest now and then, so that the magnetometer is undisturbed."""
     pytest.importorskip("adafruit_lis3mdl")
-    text = MAGNETOMETER.format(name=name, duration=duration)
-    if name == "step_demo":
-        text = text.replace("wide_cameras: []\nsolar_strings: none\n", "steps: [{at: 0.0, q2: -0.1}]\n")
-    # Without a camera, the coils of the testbed rest now and then, so that the magnetometer is undisturbed.
-    run = flown(text, tmp_path, *(["control-lost"] if name == "step_demo" else []))
+    text = MAGNETOMETER.format(name="step_demo", duration=13.0)
+    text = text.replace("wide_cameras: []\nsolar_strings: none\n", "steps: [{at: 0.0, q2: -0.1}]\n")
+    run = flown(text, tmp_path, "control-lost", "gyro-lost", "imu-silent", fault="imu: off @ 2")
+    times, dead = run["imu"]["sample_time_ns"] * 1e-9, np.isnan(run["imu"]["rate"][:, 0])
+    assert not dead[times < 2.0].any()
+    assert dead[times > 2.1].all()
+    assert np.diff(times).max() < 0.2
+    assert np.abs(run["truth"]["quaternion"][-80:, 1] + 0.1).max() < 0.01, "q2 of the last 2 s"
+
+
+def test_a_satellite_without_an_inertial_unit_brakes_by_its_magnetometer(tmp_path: Path) -> None:
+    pytest.importorskip("adafruit_lis3mdl")
+    text = MAGNETOMETER.format(name="orbit\ninertial_unit: none", duration=6.0)
+    run = flown(text, tmp_path)
     assert np.isnan(run["imu"]["rate"]).all()
-    if name == "step_demo":
-        assert np.abs(run["truth"]["quaternion"][-80:, 1] + 0.1).max() < 0.01, "q2 of the last 2 s"
-        return
     spin, truth = run["spin"], run["truth"]
     known = spin["known"] == 1
     assert known[len(known) // 2 :].all()

@@ -308,6 +308,10 @@ class SatelliteEstimation(BodyEstimation):
         """Return the satellite's position and velocity (ICRS), or None while the orbit is unknown."""
         return self.environment.state(time_ns)
 
+    def magnetometer_changed(self) -> None:
+        """Discard the learned errors of the magnetometer that was used before."""
+        self.orbit_filter.renew_magnetometer()
+
     def is_accurate(self, estimate: Estimate) -> bool:
         """Return whether the rate of an estimate is certain to a body that counts as detumbled."""
         return float(estimate.covariance.diagonal()[RATE].max()) <= self._low_rate**2

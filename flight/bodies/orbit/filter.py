@@ -198,8 +198,15 @@ class StepReplay:
 
     def renew_coils(self, covariance: FloatArray) -> None:
         """Reset the learned matrix of the coils to a covariance (9, 9), and process the steps again."""
-        self.free.renew_coils(covariance, self._memories)
+        self.free.renew(states.COILS, covariance, self._memories)
         self.take_again(0)
+
+    def renew_magnetometer(self) -> None:
+        """Reset bias and matrix of the magnetometer, and discard the fields that the last one measured."""
+        for step in self.steps:
+            step.field = None
+        for block in (states.MAGNET, states.FIELD_MATRIX):
+            self.free.renew(block, self.free.layout.prior[block, block], self._memories)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
         """Treat the dipoles since a time as unknown, if the gate then accepts a rejected attitude.
@@ -638,6 +645,12 @@ class OrbitFilter:
         self._close()
         self._shares = self._settings.coils.linear_shares(used)
         self._replay.renew_coils(covariance)
+
+    def renew_magnetometer(self) -> None:
+        """Reset bias and matrix of the magnetometer, because another one is read from now on."""
+        self._close()
+        self._by_field.restart()
+        self._replay.renew_magnetometer()
 
     def accept(self, reading: ImuReading) -> bool:
         """Accept a reading, and return whether there is an estimate that agrees with the gyro."""

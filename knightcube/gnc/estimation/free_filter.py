@@ -528,17 +528,17 @@ class FreeFilter:
             covariance[:] = kept @ covariance @ kept.T
             covariance[COILS, COILS] += fresh
 
-    def renew_coils(self, covariance: FloatArray, memories: Sequence[FreeMemory] = ()) -> None:
-        """Reset the learned matrix of the coils to the identity with a covariance (9, 9), row by row.
+    def renew(self, at: slice, covariance: FloatArray, memories: Sequence[FreeMemory] = ()) -> None:
+        """Reset the block `at` of slow states (n,) to zero with a covariance (n, n).
 
-        The estimate and its copies `memories` are changed. The reset is necessary for more than three coils
-        when coils are isolated or corrected, because the matrix depends on the allocation of currents.
+        The estimate and its copies `memories` are changed. The reset is necessary when the block describes
+        another device: another magnetometer, or coils among which the currents are allocated differently.
         """
         self.changes += 1
-        estimated = self.layout.prior[COILS, COILS].any()
+        estimated = self.layout.prior[at, at].any()
         for constants, whole in self._with(memories):
-            constants[COILS] = whole[COILS] = whole[:, COILS] = 0.0
-            whole[COILS, COILS] = covariance if estimated else 0.0
+            constants[at] = whole[at] = whole[:, at] = 0.0
+            whole[at, at] = covariance if estimated else 0.0
 
     def widen(self, at: IntArray, memories: Sequence[FreeMemory] = (), *, drop: bool = False) -> None:
         """Reset the covariance of the slow states with the indices `at` (k,) to that of the settings.

@@ -419,3 +419,30 @@ def test_two_coils_leave_the_third_axis_without_a_coil() -> None:
         reader.parse(parallel)
     with pytest.raises(ConfigError, match="has 2 entries: the testbed has three coils"):
         reader.parse(re.sub(r"\n    - \{axis: \[0.0, 0.0, 1.0\].*", "", DEMO, count=1))
+
+
+FIELD_SENSOR = "magnetometer: {max_age: 0.2, sensors: [{part: lis3mdl, measures: {magnetic: [x, y, z]}}]}\n"
+
+
+@pytest.mark.parametrize("word", ["inertial_unit: none\n", ""])
+def test_a_magnetometer_becomes_the_unit_of_a_file_without_an_inertial_unit(word: str) -> None:
+    """The section of the VN-100 is removed from the demonstration, or replaced by none."""
+    without = re.sub(r"(?m)^inertial_unit:.*\n(?:  .*\n)*", word, DEMO)
+    config = reader.parse(without + FIELD_SENSOR)
+    assert (config.inertial_unit.driver, config.inertial_unit.max_age) == ("sensors", 0.2)
+    assert not config.inertial_unit.has_gyro()
+    assert config.magnetometer is None
+    wrong = "`inertial_unit` is none: give a `magnetometer`" if word else "inertial_unit"
+    with pytest.raises(ConfigError, match=wrong):
+        reader.parse(without)
+
+
+def test_a_magnetometer_beside_the_inertial_unit_is_checked_like_the_unit() -> None:
+    config = reader.parse(DEMO + FIELD_SENSOR)
+    assert config.inertial_unit.has_gyro()
+    assert config.magnetometer is not None
+    assert (config.magnetometer.driver, config.magnetometer.has_gyro()) == ("sensors", False)
+    assert config.hardware() != reader.parse(DEMO).hardware(), "learned parameters are not kept"
+    tilted = FIELD_SENSOR.replace("max_age: 0.2", "mounting: [0.0, 0.0, 0.0, 2.0]")
+    with pytest.raises(ConfigError, match=r"`magnetometer\.mounting`"):
+        reader.parse(DEMO + tilted)

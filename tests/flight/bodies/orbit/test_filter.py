@@ -22,7 +22,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.control.coil_map import CoilMap
-from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Knowledge
+from knightcube.gnc.estimation.estimate import ATTITUDE, FIELD_BIAS, RATE, Knowledge
 from knightcube.gnc.estimation.free_filter import (
     COILS,
     GYRO,
@@ -505,3 +505,29 @@ def test_the_magnetometer_gives_the_rate_while_nothing_else_does() -> None:
     off = flown.rate - early.rate
     assert np.linalg.norm(off - across * (across @ off)) < 0.01
     assert across @ early.covariance @ across > 0.1**2
+
+
+@pytest.mark.parametrize("renewed", [True, False])
+def test_another_magnetometer_begins_without_the_learned_bias(renewed: bool) -> None:
+    """A filter that keeps the bias of the first magnetometer refuses the fields of the second one."""
+    flown = Flown(pulses=True)
+    flown.rate, flown.magnet = TUMBLE, np.array([6e-7, 0.0, -6e-7])
+    flown.fly(3.0)
+    assert flown.filter.begin(flown.stars(flown.time_ns - 24 * PERIOD_NS))
+    for _ in range(16):
+        flown.fly(5.0)
+        assert flown.see(24 * PERIOD_NS)
+    assert flown.filter.refused == 0
+    if renewed:
+        learned = flown.filter.at(flown.time_ns)
+        flown.filter.renew_magnetometer()
+        fresh = flown.filter.at(flown.time_ns)
+        assert learned.field_bias.any()
+        assert not fresh.field_bias.any()
+        assert (fresh.covariance.diagonal()[FIELD_BIAS] > learned.covariance.diagonal()[FIELD_BIAS]).all()
+    flown.magnet = -flown.magnet
+    for _ in range(4):
+        flown.fly(5.0)
+        assert flown.see(24 * PERIOD_NS)
+    assert (flown.filter.refused == 0) is renewed
+    assert flown.error() < 5.0 * flown.filter.worst_sigma

@@ -18,6 +18,7 @@ from flight.loop.navigation import Navigation, NavigationSettings
 from flight.schema.reader import replace
 from ground.telemetry import Run
 from hal.interfaces.devices import ImuReading
+from hal.interfaces.errors import DeviceError
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
@@ -103,7 +104,9 @@ def test_an_estimate_that_the_resting_coils_field_refutes_is_discarded(current: 
     assert angle_about_axis_y(filter_.at(step * PERIOD_NS).quaternion) == pytest.approx(2.5, abs=0.1)
 
 
-def navigation(uses: bool, *polled: ImuReading, accurate: Any = None) -> tuple[Navigation, Any, Any]:
+def navigation(
+    uses: bool, *polled: ImuReading, accurate: Any = None, spare: Any = None
+) -> tuple[Navigation, Any, Any]:
     """Return the navigation of a body, the mocked feed and the mocked facts; the unit gives `polled`."""
     unit, estimation, services = Mock(), Mock(), Mock()
     unit.poll.return_value, services.recorder.epoch_ns = polled, 0
@@ -111,7 +114,30 @@ def navigation(uses: bool, *polled: ImuReading, accurate: Any = None) -> tuple[N
     unit.link.return_value = link
     estimation.uses_readings_without_rate, estimation.is_accurate = uses, accurate
     settings = NavigationSettings(100_000_000, 1_200_000_000, PERIOD_NS)
-    return Navigation(unit, estimation, settings, services), estimation.feed, services.facts
+    return Navigation(unit, estimation, settings, services, spare), estimation.feed, services.facts
+
+
+def test_a_magnetometer_replaces_a_silent_unit_until_the_unit_answers_again() -> None:
+    spare = Mock()
+    found, feed, known = navigation(True, spare=spare)
+    unit, changed = found._unit, found._estimation.magnetometer_changed
+    unit.poll.side_effect = [[reading(0, FIELD, 0.1)], [], DeviceError("unit", "gone"), [], [], []]
+    given: list[ImuReading] = []
+    for step in range(5):
+        now_ns = step * 50_000_000
+        spare.poll.return_value = [reading(now_ns - 1, FIELD)]
+        given += found.update(now_ns)
+    # After 0.1 s of silence, the readings of the magnetometer are used.
+    assert [one.time_ns for one in given] == [0, 149_999_999, 199_999_999]
+    assert changed.call_count == 1
+    assert [one.has_rate for one in given] == [True, False, False]
+    unit.poll.side_effect = [[reading(249_000_000, FIELD, 0.1)]]
+    spare.poll.side_effect = DeviceError("magnetometer", "gone")
+    assert [one.time_ns for one in found.update(250_000_000)] == [249_000_000]
+    assert changed.call_count == 2
+    texts = [call.args[3] for call in known.update.call_args_list if call.args[0] is facts.GYRO_LOST]
+    assert texts[1] == "the magnetometer replaces the silent inertial unit"
+    assert feed.accept.call_count == 4
 
 
 def test_a_body_that_needs_the_gyro_receives_no_reading_without_a_rate() -> None:

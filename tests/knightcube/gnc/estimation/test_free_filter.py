@@ -215,7 +215,7 @@ def test_redundant_coils_start_again_with_the_covariance_of_their_new_allocation
     found._constants[COILS] = np.arange(1.0, 10.0)
     then, changes = found.memory(), found.changes
     fresh = np.diag(np.arange(1.0, 10.0)) + 0.1
-    found.renew_coils(fresh, [then])
+    found.renew(COILS, fresh, [then])
     others = np.r_[0 : COILS.start, COILS.stop : STATES]
     for constants, covariance in ((found._constants, found.covariance), (then.constants, then.covariance)):
         assert not constants[COILS].any()
@@ -227,7 +227,7 @@ def test_redundant_coils_start_again_with_the_covariance_of_their_new_allocation
         )
     assert found.changes == changes + 1
     known = FreeFilter(INERTIA, EXACT)
-    known.renew_coils(fresh)
+    known.renew(COILS, fresh)
     assert not known.covariance[COILS, COILS].any(), "coils that are known exactly stay known"
 
 
