@@ -380,6 +380,7 @@ class BodyEstimation(Protocol):
 
         The default method does nothing, for a body that estimates no errors of the magnetometer.
         """
+        return
 
     def is_accurate(self, estimate: Estimate) -> bool:
         """Return whether an estimate without a gyro is accurate enough for driving the coils."""

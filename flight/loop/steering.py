@@ -71,6 +71,7 @@ class CoilDrive:
         self._events = services.events
         self._reported: set[int] = set()  # axes whose verdict was reported
         self._braked = NO_AXES
+        self._has_rate = True  # without a rate, a self-test of the coils shows nothing
         self.available = watch.available
         self._nothing: FloatArray = np.zeros(len(settings.limits))
         self._limits, self._share = settings.limits, 1.0
@@ -119,7 +120,10 @@ class CoilDrive:
             watch.commanded(now_ns, in_force.current, in_force.braked, in_force.written_ns)
         if not known:
             watch.interrupted(now_ns)
-        for reading in filter(lambda reading: reading.has_rate, readings):
+        for reading in readings:
+            self._has_rate = reading.has_rate
+            if not reading.has_rate:
+                continue
             watch.observe_motion(reading.time_ns, reading.rate, reading.field)
         answer = self._power.latest() if self._power is not None and not self._power.error() else None
         if answer is not None:
@@ -201,7 +205,7 @@ class CoilDrive:
                     settings.resistance,
                 ).currents
         probe = watch.probe
-        if probe is None and testable:
+        if probe is None and testable and self._has_rate:
             probe = watch.test_wave(currents)
         wire = watch.correction.wire(currents) if probe is None else probe
         if watch.at_rest:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from flight.loop.coil_response import CoilCorrection
 from flight.loop.facts import EventLog, Facts, Services
 from flight.loop.steering import CoilDrive, CoilDriveSettings
 from flight.schema.sections import Modes
-from hal.interfaces.devices import CoilState, ImuReading, TorqueCoils
+from hal.interfaces.devices import NO_AXES, CoilState, ImuReading, TorqueCoils
 from knightcube.astro.arrays import FloatArray
 
 FIELD = np.array([2e-5, -1e-5, 3e-5])
@@ -81,6 +82,24 @@ def test_a_probe_replaces_the_commands_of_all_coils_and_the_filter_gets_it() -> 
     watch.at_rest = True
     drive.send(np.array([0.02, 0.03, -0.01]), lambda: FIELD)
     assert not coils.currents.any()
+
+
+def test_coils_are_not_tested_without_a_gyro_whose_rate_would_show_the_result() -> None:
+    drive, coils, watch = _drive([False, False, False])
+    drive._facts = drive._events = cast(Any, Mock())
+    watch.test_wave = lambda _: np.array([0.05, 0.0, 0.0])
+    for name in ("commanded", "observe_motion", "interrupted"):
+        setattr(watch, name, Mock())
+    watch.news, watch.verdicts, watch.braked = list, (), NO_AXES
+    watch.begin_trial, watch.tested, watch.monitor_doubted = (lambda _: None), (lambda _: ""), ""
+    in_force = CoilState(np.zeros(3), np.zeros(3), 0, False, 0, False, 0, "")
+    for rate, sent in ((0.0, 0.05), (np.nan, 0.02), (0.0, 0.05)):
+        reading = ImuReading(0, 0, 0, np.zeros(4), np.full(3, rate), FIELD, np.zeros(3))
+        drive.look(in_force, [reading], 0)
+        drive.look(in_force, [], 0)
+        drive.send(np.array([0.02, 0.0, 0.0]), lambda: FIELD, testable=True)
+        assert coils.currents[0] == sent
+    assert watch.observe_motion.call_count == 2
 
 
 def test_a_loaded_parameter_changes_the_rate_below_which_coils_are_reviewed() -> None:
