@@ -120,7 +120,8 @@ def navigation(
 def test_a_magnetometer_replaces_a_silent_unit_until_the_unit_answers_again() -> None:
     spare = Mock()
     found, feed, known = navigation(True, spare=spare)
-    unit, changed = found._unit, found._estimation.magnetometer_changed
+    unit: Any = found._unit
+    changed: Any = found._estimation.magnetometer_changed
     unit.poll.side_effect = [[reading(0, FIELD, 0.1)], [], DeviceError("unit", "gone"), [], [], []]
     given: list[ImuReading] = []
     for step in range(5):
