@@ -85,12 +85,15 @@ def find(config: Config, rig: Rig, stack: Any) -> Iterator[Found]:
     }
     sections = {kind: getattr(config, kind) for kind in DRIVERS}
     sections |= {f"wide_cameras[{number}]": camera for number, camera in enumerate(config.wide_cameras)}
+    power = getattr(config, "power", None)
+    sections |= {} if power is None else power.monitors()
+    taken = {getattr(section, "address", None) for section in sections.values()}
     for kind, section in sections.items():
         if section is None:
             continue
         camera = "camera" in kind
         wired = section.device if camera else section  # an emulated camera needs no `device`
-        driver = None if wired is None else driver_of("camera" if camera else kind, wired)
+        driver = None if wired is None else driver_of(_family(kind), wired)
         place = _place(config, kind, section, driver)
         try:
             if camera and rig.cameras is None:
@@ -98,8 +101,13 @@ def find(config: Config, rig: Rig, stack: Any) -> Iterator[Found]:
             answer = "opens" if driver is None or camera else driver.probe(rig, section)
             finding = _wrong_part(kind, section, rig, serial)
         except DeviceError as error:
-            answer, finding = "", _missing(kind, section, rig, serial, error)
+            answer, finding = "", _missing(kind, section, rig, serial, taken, error)
         yield Found(kind, place, answer, finding)
+
+
+def _family(kind: str) -> str:
+    """Return the section that has the same drivers as the section `kind`."""
+    return "camera" if "camera" in kind else "power_monitor" if kind.startswith("power.") else kind
 
 
 def _place(config: Config, kind: str, section: Any, driver: Any) -> str:
@@ -115,7 +123,7 @@ def _place(config: Config, kind: str, section: Any, driver: Any) -> str:
 def _wrong_part(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -> Finding | None:
     """Return a finding if another kind of device answers in the place of a section, else None."""
     named = getattr(section, "driver", "")
-    if kind in {"coils", "power_monitor"} and named in {"pca9685", "ina219"}:
+    if named in {"pca9685", "ina219"}:
         chip = chip_at(rig.wires.i2c(section.bus), section.address)
         if chip != named and chip:
             text = f"a chip of type {chip} answers at 0x{section.address:02x}"
@@ -125,23 +133,25 @@ def _wrong_part(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -> Fi
     return None
 
 
-def _missing(kind: str, section: Any, rig: Rig, serial: dict[str, Any], error: DeviceError) -> Finding:
+def _missing(
+    kind: str, section: Any, rig: Rig, serial: dict[str, Any], taken: set[Any], error: DeviceError
+) -> Finding:
     """Return the finding about a device that does not answer."""
     finding = None
     with suppress(DeviceError):  # the bus or the line itself is missing, which `error` says
         if kind in serial:
             finding = _serial_finding(kind, section, rig, serial)
         elif getattr(section, "driver", "") in {"pca9685", "ina219"}:
-            finding = _wrong_address(kind, section, rig)
+            finding = _wrong_address(kind, section, rig, taken)
     problem, _, cure = error.message.partition(": ")
     return finding or Finding(kind, "no answer", problem, cure or "check power, cable and address")
 
 
-def _wrong_address(kind: str, section: Any, rig: Rig) -> Finding | None:
-    """Search a missing chip on all addresses of its bus."""
+def _wrong_address(kind: str, section: Any, rig: Rig, taken: set[Any]) -> Finding | None:
+    """Search a missing chip on all addresses of its bus that no section names."""
     bus, named = rig.wires.i2c(section.bus), section.driver
     chips = {address: chip for address in _ADDRESSES if (chip := chip_at(bus, address)) is not None}
-    where = [address for address, chip in chips.items() if chip == named]
+    where = [address for address, chip in chips.items() if chip == named and address not in taken]
     if where:
         text = f"no answer at 0x{section.address:02x}, but a chip of type {named} answers at 0x{where[0]:02x}"
         return Finding(kind, "wrong address", text, f"set `address: 0x{where[0]:02x}`, or change its jumpers")

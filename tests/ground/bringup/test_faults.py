@@ -269,3 +269,12 @@ def test_a_sound_bench_has_no_finding(tmp_path: Path) -> None:
     found = outcomes(session(Case({}, "", []), tmp_path), "find rest axes coils dark light focus")
     assert [one.line() for outcome in found for one in outcome.findings] == []
     assert [outcome.values for outcome in found if "skipped" in outcome.values] == []
+
+
+def test_a_monitor_of_the_power_system_is_not_taken_for_that_of_the_coils(tmp_path: Path) -> None:
+    power = {"power": {"battery": {"capacity": 2.0}}}
+    opened = session(Case(power | fault("monitor: off"), "", [], base="orbit"), tmp_path)
+    opened.config = requested_config(RunRequest(tmp_path / "wired.yaml", Path()))[1]
+    (found,) = outcomes(opened, "find")
+    assert [f"{one.part} {one.kind}" for one in found.findings] == ["power_monitor no answer"]
+    assert {"power.battery_monitor", "power.bus_monitor"} <= found.values["answers"].keys()
