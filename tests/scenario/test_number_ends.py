@@ -88,6 +88,7 @@ def test_every_integer_of_the_testbed_may_pass_its_end(
         "fix",
         "gps_link",
         "directions",
+        "separate_attitudes",
         "power",
         "true_power",
         "truth",
