@@ -1,4 +1,4 @@
-"""Calibrate a lens from images of the night sky, and solve another image with it.
+"""Calibrate a lens from images of the night sky, solve another image with it, and learn it image by image.
 
 The script draws the images as a camera with 2 % of barrel distortion at its corners takes them.
 """
@@ -13,7 +13,9 @@ from knightcube import Lens, StarTracker, calibrate_lens
 from knightcube.astro import catalogue
 from knightcube.astro.arrays import Image
 from knightcube.astro.quaternion import attitude_matrix
+from knightcube.vision.camera.lens import CameraKnowledge
 from knightcube.vision.startracker.sky_map import Pointing
+from knightcube.vision.startracker.solve import SolveSettings
 
 TRUE_LENS = Lens(800, 600, focal_length=2250.0, centre=(404.0, 297.0), k1=-0.41, k2=0.0)
 STARS = catalogue.load()
@@ -51,3 +53,15 @@ print(f"omitted       {', '.join(found.determined.omitted) or 'nothing'}")
 
 solution = StarTracker(camera=lens).solve(draw(84.0, -1.0, 0.0))
 print(f"pointing      {solution.right_ascension_deg:.4f}, {solution.declination_deg:.4f} deg (true 84, -1)")
+
+settings = SolveSettings(lens=CameraKnowledge(centre=5.0, distortion=0.02))
+tracker = StarTracker(fov_deg=20.0, settings=settings, learn=True)
+for number, night in enumerate(nights, start=1):
+    tracker.solve(night)
+    known = tracker.lens
+    if known is not None and number in {1, 3, 6}:
+        focal_length, x, y, _, _ = known.values[:5]
+        print(
+            f"learned {number}     {focal_length:.1f} +- {known.sigma[0]:.1f} px, "
+            f"axis {x:.1f}, {y:.1f} +- {known.sigma[1]:.1f} px"
+        )

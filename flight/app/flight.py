@@ -83,6 +83,7 @@ from knightcube.vision.camera import images
 from knightcube.vision.camera.images import KeptFrames
 from knightcube.vision.camera.lens import CameraKnowledge, Exposures
 from knightcube.vision.frame_job import StreakEstimator, TrackerSettings
+from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.index.build import ensure_default_index
@@ -321,7 +322,39 @@ def body_kind(config: Config) -> BodyKind:
     return kind
 
 
-def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> ImagingSettings:
+def lens_knowledge(
+    config: Config, learned: Mapping[str, Learned], problems: list[str]
+) -> LensKnowledge | None:
+    """Return the lens from which the star tracker starts, or None if the lens is not learned.
+
+    The `learned` parameters of earlier boots are used unless they contradict the configuration, which is
+    added to `problems`.
+    """
+    camera = config.camera
+    if camera is None or camera.star_tracker is None or not camera.learn_lens:
+        return None
+    accuracy = camera.accuracy
+    known = LensKnowledge.of(
+        camera_model(camera),
+        CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion, accuracy.line_time),
+        scale_error=camera.star_tracker.scale_error,
+        line_time=camera.line_time,
+        psf_sigma=camera.psf_sigma,
+    )
+    if not known.uncertain:
+        return None
+    if imaging_task.LENS not in learned:
+        return known
+    values, covariance = learned[imaging_task.LENS].arrays()
+    restored = known.restored(values, covariance, config.estimation.changed)
+    if restored is None:
+        problems.append(f"{imaging_task.LENS} {values.tolist()}: not within 5 sigma of the configuration")
+    return restored or known
+
+
+def imaging_settings(
+    camera: Camera, body: FlightBody, frames: Path | None, lens: LensKnowledge | None = None
+) -> ImagingSettings:
     """Return the settings of imaging. Frames are stored in the folder `frames`."""
     model, (least, most) = camera_model(camera), camera.streak_exposure or (camera.exposure, camera.exposure)
     kept = KeptFrames(frames, camera.keep_frames) if frames is not None and camera.keep_frames else None
@@ -347,6 +380,7 @@ def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> I
         seeks=body.control.follows_objects,
         calm=body.control.exposure_start,
         kept=kept,
+        lens=lens,
     )
 
 
@@ -472,7 +506,8 @@ def _tasks(
         config.inertial_unit.has_gyro(),
     )
     navigation = Navigation(devices.unit, body.estimation, ages, services, devices.magnetometer)
-    imaging = _imaging(config, opened, navigation, body, services)
+    learned = keeper.learned if keeper else {}
+    imaging = _imaging(config, opened, navigation, body, services, learned)
     horizon_cameras = None
     if config.wide_cameras and devices.horizon_cameras and body.estimation.horizon_cameras is not None:
         times = horizon_camera_settings(config.wide_cameras)
@@ -544,7 +579,12 @@ def _sun(config: Config, devices: Devices, body: FlightBody, services: Services)
 
 
 def _imaging(
-    config: Config, opened: Opened, navigation: Navigation, body: FlightBody, services: Services
+    config: Config,
+    opened: Opened,
+    navigation: Navigation,
+    body: FlightBody,
+    services: Services,
+    learned: Mapping[str, Learned],
 ) -> Imaging | None:
     camera, source = config.camera, opened.devices.camera
     if camera is None or source is None:
@@ -553,5 +593,6 @@ def _imaging(
     if section is not None:
         tracks = TrackSettings(needed=section.needed, within=section.within, coast=section.coast)
         objects = ObjectTracks(tracks, body, services)
-    settings = imaging_settings(camera, body, opened.frames)
+    lens = lens_knowledge(config, learned, body.estimation.learned_problems)
+    settings = imaging_settings(camera, body, opened.frames, lens)
     return Imaging(source, settings, navigation, body.view, services, objects)

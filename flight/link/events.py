@@ -163,6 +163,7 @@ START_WAITED = _warning(99, "start-waited", "the start failed and was repeated; 
 CONFIG_DAMAGED = _warning(
     67, "config-damaged", "the configuration is not the accepted one; the last flown configuration is used"
 )
+LENS_CHANGED = _warning(157, "lens-changed", "a frame contradicts the learned lens, which is learned again")
 LEARNED_REFUSED = _warning(68, "learned-refused", "learned values were rejected: implausible or contradicted")
 UNCLEAN_SHUTDOWN = _warning(64, "unclean-shutdown", "the previous boot did not end cleanly")
 CLOCK_STEP = _warning(70, "clock-step", "the wall clock was changed; control does not use it")

@@ -328,8 +328,10 @@ class FlightLoop:
         for kind, text in keeper.notices():
             self._services.events.report(kind, now_ns, text)
         estimate = self._tasks.navigation.estimate(now_ns)
-        learned = self._body.estimation.learned(estimate) if estimate else None
-        keeper.note(self._tasks.modes.mode.label, learned)
+        learned = dict(self._body.estimation.learned(estimate)) if estimate else {}
+        if self._tasks.imaging is not None:
+            learned |= self._tasks.imaging.learned()
+        keeper.note(self._tasks.modes.mode.label, learned or None)
 
     def _record_performance(self, now_ns: int) -> None:
         for group in self._groups:

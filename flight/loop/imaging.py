@@ -16,12 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from flight.link import events
+from flight.link.telemetry.definitions import LENS as LENS_PACKET
 from flight.link.telemetry.definitions import MOST_SIGHTINGS, SIGHTINGS, STARS, STREAK, TRACK
 from flight.loop import facts
 from flight.loop.body import BodyView, FlightBody
 from flight.loop.executive import Cycle, JobResult
 from flight.loop.facts import Services
 from flight.loop.navigation import Navigation
+from flight.loop.state import Learned
 from flight.schema.devices import FAST
 from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import DeviceError
@@ -45,6 +47,7 @@ from knightcube.gnc.tracker import (
 from knightcube.vision.camera.images import KeptFrames
 from knightcube.vision.camera.lens import CameraModel, Exposures
 from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings
+from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import (
     FLOOR_PX,
     FieldPoints,
@@ -94,6 +97,7 @@ class ImagingSettings:
         velocity: function of a time that returns the velocity (3,), m/s, relative to the Sun, or None if the
             velocity in `tracker` is used.
         knowledge: function that returns how well the attitude is known.
+        lens: lens from which the star tracker starts to learn, or None if the lens is not learned.
     """
 
     camera: CameraModel
@@ -114,6 +118,7 @@ class ImagingSettings:
     objects: ObjectMeasurementSettings | None = None
     kept: KeptFrames | None = None
     detection: DetectionSettings = field(default_factory=DetectionSettings)
+    lens: LensKnowledge | None = None
 
 
 class CameraAttitude(NamedTuple):
@@ -312,6 +317,28 @@ class FrameReport:
             covariance=_packed(covariance),
             log10_false_alarm=solution.log10_false_alarm,
             accepted=int(bool(accepted)),
+        )
+
+    def lens(self, frame: Frame, before: LensKnowledge, lens: LensKnowledge, now_ns: int) -> None:
+        """Record the learned lens, and report that a frame has contradicted the lens `before` it."""
+        if lens.contradictions > before.contradictions:
+            text = f"frame {frame.sequence}: learned from {before.frames} frames, now learned again"
+            self._events.report(events.LENS_CHANGED, now_ns, text)
+        f, x, y, k1, k2, line_time, psf_sigma = lens.learned[0].tolist()
+        sigma = np.sqrt(np.diag(lens.learned[1]))
+        self._recorder.record(
+            LENS_PACKET,
+            now_ns,
+            sequence=frame.sequence,
+            frames=lens.frames,
+            contradictions=lens.contradictions,
+            focal_length=f,
+            centre=[x, y],
+            distortion=[k1, k2],
+            line_time=line_time,
+            psf_sigma=psf_sigma,
+            sigma=sigma.tolist(),
+            corner_sigma=lens.accuracy.distortion,
         )
 
     def record(
@@ -554,6 +581,8 @@ def _padded(values: FloatArray) -> list[float]:
 
 
 WORKER = "vision"
+LENS = "lens"
+"""Name of the learned lens among the parameters that are stored for the next boot."""
 
 
 class Imaging:
@@ -589,11 +618,18 @@ class Imaging:
         self._busy_since_ns = 0
         self._frames = 0
         self._objects = objects
+        self._lens, self._lens_ns = settings.lens, 0
         self._spare = True  # whether there was time to search the last frame for objects
 
     def counts(self) -> tuple[int, int]:
         """Return the number of frames, and the number of rates from streaks that the filter accepted."""
         return self._frames, self._report.accepted
+
+    def learned(self) -> dict[str, Learned]:
+        """Return the learned lens for the next boot; empty before it is learned."""
+        if self._lens is None or not self._lens.frames:
+            return {}
+        return {LENS: Learned.of(*self._lens.learned)}
 
     def busy_since_ns(self) -> int | None:
         """Return the time (ns) at which the worker received its present frame, or None while it is idle."""
@@ -683,11 +719,27 @@ class Imaging:
         self._last_sequence = frame.sequence
         if old:
             self._report.record(frame, StreakStatus.FAILED.value, None, now_ns, False)
-        elif self._jobs.submit(WORKER, self._measurer.job(frame, self._last_checksum, self._spare)):
+        elif self._jobs.submit(WORKER, self._job(frame)):
             self._frame = frame
             self._busy_since_ns = now_ns
         else:
             self._events.report(events.VISION_FAILED, now_ns, "the worker is busy or not running")
+
+    def _job(self, frame: Frame) -> FrameJob:
+        """Return the worker's job for a frame, with the learned lens."""
+        job = self._measurer.job(frame, self._last_checksum, self._spare)
+        if self._lens is None:
+            return job
+        elapsed = max(frame.exposure_start_ns - self._lens_ns, 0) * 1e-9 if self._lens_ns else 0.0
+        return replace(job, lens=(self._lens, elapsed))
+
+    def _keep_lens(self, frame: Frame, lens: LensKnowledge | None, now_ns: int) -> None:
+        """Accept the lens after a frame for the next frames. A frame without stars changes nothing."""
+        before = self._lens
+        if lens is None or before is None or lens.frames == before.frames:
+            return
+        self._lens, self._lens_ns = lens, frame.exposure_start_ns
+        self._report.lens(frame, before, lens, now_ns)
 
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Accept the worker's result, and pass its measurements to navigation."""
@@ -702,6 +754,7 @@ class Imaging:
         found: FrameFound = result.value
         motion = found.motion
         self._last_checksum = motion.checksum
+        self._keep_lens(frame, found.lens, now_ns)
         if motion.status is StreakStatus.FROZEN:
             text = f"frame {frame.sequence} repeats the pixels of the last frame"
             self._events.report(events.CAMERA_FROZEN, now_ns, text)

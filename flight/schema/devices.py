@@ -495,6 +495,10 @@ class Camera(Section, frozen=True, kw_only=True):
     given, no exposure begins while the body rotates faster than `max_rate` rad/s. A frame counts as late
     `late_after` s after the end of its exposure, and vision counts as slow if a frame takes longer than
     `vision_slow_after` s. The newest `keep_frames` frames are kept in the folder `frames` of the run.
+
+    With `learn_lens`, the star tracker learns lens, line time and point spread from its solved frames, and
+    the next boot continues with the learned values. Nothing is learned about a camera that is exact
+    according to `accuracy`.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -524,6 +528,7 @@ class Camera(Section, frozen=True, kw_only=True):
     late_after: Positive = 1.0
     vision_slow_after: Positive = 1.0
     keep_frames: Annotated[int, Meta(ge=0, le=1000)] = 0
+    learn_lens: bool = True
 
 
 class Gps(Section, frozen=True, kw_only=True):

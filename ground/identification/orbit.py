@@ -16,10 +16,12 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from flight.bodies.orbit.body import filter_settings
+from flight.schema.devices import Camera, camera_model
 from flight.schema.orbit import OrbitConfig
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
@@ -28,7 +30,10 @@ from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.errors import InputError
 from knightcube.gnc.estimation import free_filter as states
 from knightcube.gnc.estimation.rigid_body import BodyErrors, inertia_covariance, per_trace, tensor
+from knightcube.vision.camera.lens import Lens
+from knightcube.vision.lens_knowledge import axes_turn
 
+Object = dict[str, Any]
 LEARNED = 0.5
 """Maximum ratio of estimated to configured standard deviation (rms) at which a quantity counts as learned."""
 _UNIFORM = math.sqrt(3.0)
@@ -76,11 +81,15 @@ class LearnedQuantity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearnedDescription:
-    """The learned quantities by name, and the mission time (s) of the packet that holds them."""
+    """The learned quantities by name, and the mission time (s) of the packet that holds them.
+
+    The learned lens `lens` is None if the star camera has not learned its lens.
+    """
 
     config: OrbitConfig
     time: float
     quantities: dict[str, LearnedQuantity]
+    lens: Object | None = None
 
 
 def learned_description(run: Run, config: OrbitConfig) -> LearnedDescription:
@@ -136,7 +145,28 @@ def learned_description(run: Run, config: OrbitConfig) -> LearnedDescription:
         problem = "no quantity is known twice as well as the configuration states: fly longer"
         raise InputError(str(run.folder), problem)
     time = float(last["time_ns"]) * 1e-9
-    return LearnedDescription(config, time, {one.name: one for one in found})
+    return LearnedDescription(config, time, {one.name: one for one in found}, learned_lens(run))
+
+
+def learned_lens(run: Run) -> Object | None:
+    """Return the lens that the star camera had learned at the end of a run, or None if it learned none."""
+    packets = run["lens"]
+    if not len(packets):
+        return None
+    last = packets[-1]
+    sigma = last["sigma"].astype(float).tolist()
+    return {
+        "frames": int(last["frames"]),
+        "contradictions": int(last["contradictions"]),
+        "focal_length_px": [float(last["focal_length"]), sigma[0]],
+        "centre_px": last["centre"].astype(float).tolist(),
+        "centre_sigma_px": sigma[1:3],
+        "distortion": last["distortion"].astype(float).tolist(),
+        "distortion_sigma": sigma[3:5],
+        "corner_sigma": float(last["corner_sigma"]),
+        "line_time_s": [float(last["line_time"]), sigma[5]],
+        "psf_sigma_px": [float(last["psf_sigma"]), sigma[6]],
+    }
 
 
 def fragment(found: LearnedDescription, folder: Path, extends: str) -> str:
@@ -260,15 +290,46 @@ def _inertial_unit(found: LearnedDescription) -> list[str]:
 def _camera(found: LearnedDescription) -> list[str]:
     """Return the lines of the section `camera`."""
     one, camera = found.quantities.get("camera"), found.config.camera
-    if one is None or camera is None or not one.learned:
+    if one is None or camera is None:
         return []
-    mounting = multiply(np.array(camera.mounting), from_rotation_vector(one.value))
-    largest = min(math.degrees(_UNIFORM * one.claim.max()), camera.accuracy.mounting_deg)
-    return [
-        "camera:",
-        f"  mounting: {_row(mounting / np.linalg.norm(mounting), 10)}",
-        f"  accuracy: {{mounting_deg: {_above(largest)}}}",
+    lines, accuracies, mounting = [], [], np.array(camera.mounting)
+    if one.learned:
+        mounting = multiply(mounting, from_rotation_vector(one.value))
+        largest = min(math.degrees(_UNIFORM * one.claim.max()), camera.accuracy.mounting_deg)
+        accuracies = [f"mounting_deg: {_above(largest)}"]
+    if found.lens is not None:
+        # The mounting refers to the optical axis, which is another one with the learned lens.
+        focal, (k1, k2) = found.lens["focal_length_px"][0], found.lens["distortion"]
+        learned = Lens(camera.columns, camera.rows, focal, tuple(found.lens["centre_px"]), k1, k2)
+        mounting = multiply(axes_turn(camera_model(camera), learned), mounting)
+        lines, of_accuracy = _lens(found.lens, camera)
+        accuracies += of_accuracy
+    if one.learned or found.lens is not None:
+        lines = [f"  mounting: {_row(mounting / np.linalg.norm(mounting), 10)}", *lines]
+    return ["camera:", *lines, f"  accuracy: {{{', '.join(accuracies)}}}"] if lines else []
+
+
+def _lens(lens: Object, camera: Camera) -> tuple[list[str], list[str]]:
+    """Return the lines of the learned lens in the section `camera`, and the entries of `accuracy`."""
+    (focal, focal_sigma), (line_time, line_time_sigma) = lens["focal_length_px"], lens["line_time_s"]
+    k1, k2 = lens["distortion"]
+    shape = "" if camera.lens is None else f", aspect: {camera.lens.aspect!r}, shear: {camera.lens.shear!r}"
+    shape += "" if camera.lens is None else f", p1: {camera.lens.p1!r}, p2: {camera.lens.p2!r}"
+    lines = [
+        f"  field_of_view_deg: {2.0 * math.degrees(math.atan(0.5 * camera.columns / focal)):.6f}",
+        f"  lens: {{focal_length: {focal:.4f}, centre: {_row(np.array(lens['centre_px']))},"
+        f" k1: {k1:.8f}, k2: {k2:.8f}{shape}}}   # learned from {lens['frames']} frames",
+        f"  line_time: {max(line_time, 0.0):.4g}",
+        f"  psf_sigma: {lens['psf_sigma_px'][0]:.4g}",
     ]
+    centre = math.hypot(*lens["centre_sigma_px"]) / math.sqrt(2.0)
+    accuracies = [
+        f"focal_length: {_above(focal_sigma / focal)}",
+        f"centre: {_above(centre)}",
+        f"distortion: {_above(lens['corner_sigma'])}",
+        f"line_time: {_above(line_time_sigma)}",
+    ]
+    return lines, accuracies
 
 
 def _row(numbers: FloatArray, digits: int = 7) -> str:

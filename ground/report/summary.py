@@ -20,6 +20,7 @@ from flight.loop.facts import FACTS, StreamState
 from flight.schema import reader
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
+from ground.identification.orbit import learned_lens
 from ground.report.orbit import detumbling, knowledge, objects, pointing, requirements
 from ground.report.signals import (
     PowerHistory,
@@ -74,6 +75,7 @@ def summarise(run: Run) -> Object:
         "streaks": streaks(run),
         "stars": star_attitudes(run),
         "star_camera": seen,
+        "lens": learned_lens(run),
         "failed_frames": failed_frames(run),
         "objects": objects(run),
         "modes": _modes(run["mode"]),

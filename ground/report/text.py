@@ -367,6 +367,7 @@ def _sensing(summary: Object) -> list[str]:
         )
         lines += _errors(stars, "about x, y, z", "arcsec", 2, ARCSECONDS, "attitudes")
     lines += _star_camera(summary["star_camera"])
+    lines += _lens(summary["lens"])
     return lines + _failed_frames(summary["failed_frames"])
 
 
@@ -404,6 +405,23 @@ def _star_camera(found: Object | None) -> list[str]:
         f"instants{share}; longest gap {number(found['longest_gap_s'], 0)} s",
         f"  {found['instants']} scheduled instants, {found['slow']} of them below camera.max_rate; "
         "unobstructed: also outside pointing.cones of Sun and Earth",
+    ]
+
+
+def _lens(found: Object | None) -> list[str]:
+    """Return the lines of the learned lens, or nothing if no lens was learned."""
+    if found is None:
+        return []
+    (focal, focal_sigma), (x, y), (x_sigma, y_sigma) = (
+        found[key] for key in ("focal_length_px", "centre_px", "centre_sigma_px")
+    )
+    (delay, delay_sigma), (psf, psf_sigma) = found["line_time_s"], found["psf_sigma_px"]
+    return [
+        f"Learned lens: focal length {focal:.2f} +- {focal_sigma:.2f} px, optical axis "
+        f"{x:.2f} +- {x_sigma:.2f}, {y:.2f} +- {y_sigma:.2f} px, radius of a corner "
+        f"+- {100.0 * found['corner_sigma']:.4f} %",
+        f"  line time {1e6 * delay:.2f} +- {1e6 * delay_sigma:.2f} us, point spread {psf:.2f} +- "
+        f"{psf_sigma:.2f} px; from {found['frames']} frames, {found['contradictions']} contradictions",
     ]
 
 

@@ -25,6 +25,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import FlightError
 from knightcube.vision.camera.images import KeptFrames, keep_frame
 from knightcube.vision.camera.lens import CameraModel, Pinhole
@@ -148,7 +149,11 @@ class FrameJob:
     detection: DetectionSettings = field(default_factory=DetectionSettings)
 
     def with_lens(self) -> FrameJob:
-        """Return the job with the learned lens, if it is usable, instead of the configured lens."""
+        """Return the job with the learned lens, if it is usable, instead of the configured lens.
+
+        The priors are in the axes of the configured lens, and those of the result in the axes of the learned
+        lens.
+        """
         if self.lens is None or not self.lens[0].usable:
             return self
         known, estimator, tracker = self.lens[0], self.estimator, self.tracker
@@ -159,7 +164,21 @@ class FrameJob:
             detection = replace(tracker.solve.detection, psf_sigma=psf_sigma)
             solve = replace(tracker.solve, detection=detection, lens=accuracy)
             tracker = replace(tracker, solve=solve, scale=(1.0, 1.0))
-        return replace(self, camera=known.camera, estimator=estimator, tracker=tracker)
+        attitude, rate, turn = self.attitude_prior, self.rate_prior, known.turn
+        if attitude is not None:
+            attitude = replace(attitude, quaternion=multiply(turn, attitude.quaternion))
+        if rate is not None:
+            matrix, course = attitude_matrix(turn), rate.course
+            course = None if course is None else replace(course, terms=course.terms @ matrix.T)
+            rate = replace(rate, rate=matrix @ rate.rate, course=course)
+        return replace(
+            self,
+            camera=known.camera,
+            estimator=estimator,
+            tracker=tracker,
+            attitude_prior=attitude,
+            rate_prior=rate,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +193,8 @@ class FrameFound:
         lens: knowledge of the lens after the frame, or None if the lens is not learned.
         field: points of light, for the search for objects without a star catalogue; None if not measured.
         problem: reason why no sky index could be used; empty if there is none.
+        turn: quaternion (4,) from the axes of the configured lens to those of the lens with which the frame
+            was solved; None: the same axes.
     """
 
     motion: FrameMotion
@@ -182,6 +203,26 @@ class FrameFound:
     lens: LensKnowledge | None = None
     field: FieldPoints | None = None
     problem: str = ""
+    turn: FloatArray | None = None
+
+    def in_configured_axes(self) -> FrameFound:
+        """Return the result with rate and attitude in the axes of the configured lens."""
+        if self.turn is None:
+            return self
+        motion, solution, back = self.motion, self.solution, conjugate(self.turn)
+        matrix = attitude_matrix(back)
+        if motion.rate is not None and motion.covariance is not None:
+            covariance = matrix @ motion.covariance @ matrix.T
+            motion = replace(motion, rate=matrix @ motion.rate, covariance=covariance)
+        if solution is not None and solution.fix is not None:
+            fix, quaternion = solution.fix, multiply(back, solution.fix.quaternion)
+            fix = replace(
+                fix,
+                quaternion=quaternion if quaternion[3] >= 0.0 else -quaternion,
+                covariance=matrix @ fix.covariance @ matrix.T,
+            )
+            solution = replace(solution, fix=fix)
+        return replace(self, motion=motion, solution=solution, turn=None)
 
 
 def run(job: FrameJob) -> FrameFound:
@@ -189,7 +230,7 @@ def run(job: FrameJob) -> FrameFound:
     tracker = job.tracker
     sky, problem = _sky(tracker)
     if tracker is None or sky is None:
-        found = _without_catalogue(job.with_lens(), problem)
+        found = _without_catalogue(job, problem)
     else:
         found = run_with_lens(job, tracker, sky)
         if job.objects is not None and found.solution is not None:
@@ -200,6 +241,7 @@ def run(job: FrameJob) -> FrameFound:
                 job.pixels, found.solution, job.exposure, sky.stars.epoch, velocity, detection, job.objects
             )
             found = replace(found, objects=objects)
+        found = found.in_configured_axes()
     if job.kept is not None:
         keep_frame(job.kept, job.pixels, _facts(job, found))
     return found
@@ -208,12 +250,15 @@ def run(job: FrameJob) -> FrameFound:
 def run_with_lens(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
     """Return attitude and rate from a frame with the learned lens, and the lens after the frame.
 
+    Rate and attitude are in the axes of the lens with which the frame was solved.
     If the frame contradicts the learned lens, the frame is solved again with the configured lens.
     """
     through = job.with_lens()
     found = attitude_and_rate(through, through.tracker or tracker, sky)
     if job.lens is None:
         return found
+    if through is not job:
+        found = replace(found, turn=job.lens[0].turn)
     before, elapsed = job.lens
     if found.solution is None:
         return replace(found, lens=before)

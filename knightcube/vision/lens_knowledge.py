@@ -334,6 +334,17 @@ _ROBUST_ROUNDS, _MOST_ROUNDS, _SETTLED = 5, 8, 1e-4
 """Numbers of fit steps with and without robust weights, and decrease of chi-square that ends the steps."""
 
 
+def axes_turn(configured: CameraModel, learned: CameraModel) -> FloatArray:
+    """Return the quaternion (4,) from the camera axes of a configured lens to those of a learned lens.
+
+    The boresight of either lens is its optical axis. The pixel on the optical axis of the configured lens
+    shows the same direction through both lenses, so that a learned axis does not change the mounting.
+    """
+    x, y, _ = learned.unit_vectors(np.array([configured.centre]))[0].tolist()
+    sine = math.hypot(x, y)
+    return from_rotation_vector(np.array([y, -x, 0.0]) * (math.asin(sine) / sine if sine > 0.0 else 1.0))
+
+
 def _exact(lens: Lens) -> FloatArray:
     """Return the standard deviations (11,) of exactly known parameters, so small that they do not change."""
     return NONE * np.array([lens.focal_length, *[1.0] * 8, 1e-5, 1.0])
@@ -413,6 +424,11 @@ class LensKnowledge:
             return self.configured
         f, x, y, k1, k2 = self.values[:5].tolist()
         return replace(self.configured, focal_length=f, centre=(x, y), k1=k1, k2=k2)
+
+    @property
+    def turn(self) -> FloatArray:
+        """The quaternion (4,) from the axes of the configured lens to those of the learned lens."""
+        return axes_turn(self.configured, self.camera)
 
     @property
     def psf_sigma(self) -> float:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.schema import reader as configuration
+from flight.schema.devices import CameraAccuracy
 from flight.schema.orbit import OrbitConfig
 from ground.telemetry import Run
 from sim_hal.settings import Simulation
@@ -20,8 +21,11 @@ LATER = "2026-03-20T12:10:00Z"
 
 
 def _config(state: Path, duration: float) -> OrbitConfig:
-    section = configuration.replace(navigating().state, folder=str(state), period=1.0)
-    return configuration.replace(navigating(), state=section, elements=None, duration=duration)
+    begun = navigating()
+    section = configuration.replace(begun.state, folder=str(state), period=1.0)
+    assert begun.camera is not None
+    uncalibrated = configuration.replace(begun.camera, accuracy=CameraAccuracy(), line_time=None)
+    return configuration.replace(begun, state=section, elements=None, duration=duration, camera=uncalibrated)
 
 
 def _world(utc: str | None = None) -> Simulation:
@@ -54,3 +58,10 @@ def test_the_gyro_bias_is_known_at_once_after_a_kill(tmp_path: Path) -> None:
     assert "unclean-shutdown" in event_names(again)
     assert "learned-refused" not in event_names(again)
     assert np.isfinite(again["navigation"]["gyro_bias"][-1]).all()
+    # The optical axis of the uncalibrated camera, described to 2 px, is also known at once.
+    axis, known = first["lens"]["centre"][-1] - 255.5, first["lens"]["sigma"][-1, 1:3]
+    assert len(first["lens"]) > 3
+    assert np.all(np.abs(axis) < 5.0 * known)
+    assert np.all(known < 1.0)
+    assert np.all(again["lens"]["sigma"][0, 1:3] < np.hypot(known, 0.3 * 2.0))
+    assert again["lens"]["contradictions"][-1] == 0

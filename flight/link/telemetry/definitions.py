@@ -696,6 +696,25 @@ STARS = Packet(
     ),
 )
 
+LENS = Packet(
+    "lens",
+    0x125,
+    "each frame from which the lens is learned",
+    "The lens of the star camera as learned from its frames",
+    (
+        counter("sequence", "frame number of the camera"),
+        Field("frames", "u4", "-", "frames from which the lens was learned"),
+        Field("contradictions", "u4", "-", "frames that have contradicted the learned lens"),
+        Field("focal_length", "f8", "px", "focal length"),
+        Field("centre", "f8", "px", "pixel (x, y) of the optical axis", 2),
+        Field("distortion", "f8", "-", "coefficients k1 and k2 of the radial distortion", 2),
+        Field("line_time", "f8", "s", "delay between the exposures of successive rows"),
+        Field("psf_sigma", "f8", "px", "standard deviation of the point spread"),
+        Field("sigma", "f8", "-", _ONE_SIGMA + "the seven values above, each in its unit", 7),
+        Field("corner_sigma", "f8", "-", "relative standard deviation of an image corner's radius"),
+    ),
+)
+
 MOST_SIGHTINGS = 8
 """Maximum number of sightings in a `sightings` packet."""
 
@@ -876,7 +895,7 @@ JOB_TIMING = Packet(
 
 PACKETS: tuple[Packet, ...] = (
     RUN, IMU, CONTROL, ATTITUDE, COIL_CURRENTS, SPIN, NAVIGATION, DESCRIPTION, FIX, GPS_LINK, DIRECTIONS,
-    SEPARATE_ATTITUDES, TARGET, MODE, PLAN, STREAK, STARS, SIGHTINGS, TRACK, EVENT, HOUSEKEEPING, HEALTH,
-    POWER, COMMAND, PARAMETERS, LINK, VERIFICATION, TRANSFER, TRUTH, TRUE_COIL_CURRENTS, ORBIT_TRUTH,
+    SEPARATE_ATTITUDES, TARGET, MODE, PLAN, STREAK, STARS, LENS, SIGHTINGS, TRACK, EVENT, HOUSEKEEPING,
+    HEALTH, POWER, COMMAND, PARAMETERS, LINK, VERIFICATION, TRANSFER, TRUTH, TRUE_COIL_CURRENTS, ORBIT_TRUTH,
     TRUE_DESCRIPTION, TRUE_POWER, CYCLE_TIMING, RATE_GROUP, JOB_TIMING,
 )  # fmt: skip

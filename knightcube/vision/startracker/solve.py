@@ -37,7 +37,7 @@ from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
 from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, apparent, known_bend, usual_bend
 from knightcube.vision.startracker.verification import PRIOR_SIGMAS, expected_stars, track
-from knightcube.vision.streaks.geometry import Course
+from knightcube.vision.streaks.geometry import PIXEL_VARIANCE, Course
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
@@ -412,7 +412,9 @@ def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSe
         return solution
     measured = float(np.median(width))
     doubt = _SHAPE_DOUBT * abs(measured - given) / solution.camera.focal_length
-    return replace(solution, psf_sigma=measured).wider(np.diag([doubt**2, doubt**2, 0.0]))
+    # The measured width is that of pixels, whose own variance is not part of the point spread.
+    psf_sigma = math.sqrt(max(measured**2 - PIXEL_VARIANCE, 0.0))
+    return replace(solution, psf_sigma=psf_sigma).wider(np.diag([doubt**2, doubt**2, 0.0]))
 
 
 def _identify(

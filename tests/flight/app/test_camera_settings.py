@@ -7,9 +7,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
-from flight.app.flight import horizon_camera_settings, imaging_settings
+from flight.app.flight import horizon_camera_settings, imaging_settings, lens_knowledge
+from flight.loop.state import Learned
 from flight.schema.devices import Camera, CameraAccuracy, ObjectTracking, StarTrackerSection, WideCamera
 from flight.schema.document import ConfigError
 from knightcube.vision.streaks.settings import LikelihoodSettings
@@ -77,6 +79,33 @@ def test_the_star_tracker_knows_lens_scale_and_velocity() -> None:
     assert plain is not None
     assert (plain.index, plain.scale, plain.solve.velocity) == (None, (1.0, 1.0), None)
     assert plain.solve.detection.saturation == 900.0
+
+
+def test_the_lens_is_learned_from_the_last_boot_unless_it_is_exact_or_switched_off() -> None:
+    def configured(**changes: Any) -> Any:
+        camera = Camera(**{"star_tracker": StarTrackerSection(), **changes})
+        return SimpleNamespace(camera=camera, estimation=SimpleNamespace(changed=0.3))
+
+    problems: list[str] = []
+    exact = CameraAccuracy(centre=0.0, distortion=0.0)
+    assert lens_knowledge(configured(learn_lens=False), {}, problems) is None
+    assert lens_knowledge(configured(star_tracker=None), {}, problems) is None
+    assert lens_knowledge(configured(accuracy=exact, line_time=0.0), {}, problems) is None
+    begun = lens_knowledge(configured(), {}, problems)
+    assert begun is not None
+    assert not begun.usable
+    values, covariance = begun.learned
+    moved = values + np.array([0.0, 1.5, -1.0, 0.0, 0.0, 1e-5, 0.1])
+    found = lens_knowledge(configured(), {"lens": Learned.of(moved, 0.01 * covariance)}, problems)
+    assert found is not None
+    assert found.usable
+    assert np.array_equal(found.learned[0], moved)
+    assert problems == []
+    moved[1] += 15.0  # the configuration states 2 px
+    other = lens_knowledge(configured(), {"lens": Learned.of(moved, 0.01 * covariance)}, problems)
+    assert other is not None
+    assert not other.usable
+    assert problems[0].startswith("lens [")
 
 
 def test_the_estimator_of_streaks_is_that_of_the_section_or_of_the_body() -> None:

@@ -30,7 +30,7 @@ _PLAIN = {
         101 gps-lost  103 gps-refused  104 strings-lost  106 sun-unclear  115 parameters-left
         123 object-escapes  130 clock-off  131 field-refused  133 wide-lost  135 wide-false  141 sun-missed
         142 astray  143 coil-corrected  150 returned  151 gps-link  152 field-extrapolated  153 gps-set-up
-        154 camera-saturated  160 battery-low  161 battery-very-low  165 power-sensor-lost
+        154 camera-saturated  157 lens-changed  160 battery-low  161 battery-very-low  165 power-sensor-lost
         """,
     "fault": """
         4 task-failed  9 no-progress  10 imu-silent  13 imu-line-lost  16 imu-unusable  49 worker-rests

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from flight.link import events
-from flight.link.telemetry.definitions import MOST_SIGHTINGS, SIGHTINGS, STARS, STREAK, TRACK
+from flight.link.telemetry.definitions import LENS, MOST_SIGHTINGS, SIGHTINGS, STARS, STREAK, TRACK
 from flight.loop import facts
 from flight.loop.executive import JobResult
 from flight.loop.imaging import FrameMeasurer, Imaging, ImagingSettings, ObjectTracks, _packed
@@ -24,8 +24,9 @@ from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.gnc.tracker import TrackSettings
 from knightcube.vision.camera.images import KeptFrames
-from knightcube.vision.camera.lens import Exposures, Pinhole
+from knightcube.vision.camera.lens import CameraKnowledge, Exposures, Pinhole
 from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings
+from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.detection.survey import FrameKind
 from knightcube.vision.startracker.solve import FrameSolution, SolveSettings, SolveStatus
@@ -558,3 +559,37 @@ def test_the_packed_covariance_is_in_the_order_of_the_table() -> None:
     matrix = np.array([[1.0, 4.0, 5.0], [4.0, 2.0, 6.0], [5.0, 6.0, 3.0]])
     assert _packed(matrix) == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     assert multiply(conjugate(MOUNTING), MOUNTING) == pytest.approx([0.0, 0.0, 0.0, 1.0])
+
+
+def test_the_learned_lens_goes_from_frame_to_frame_and_to_the_next_boot() -> None:
+    begun = LensKnowledge.of(CAMERA, CameraKnowledge(), psf_sigma=1.2)
+    bench = Bench(lens=begun)
+    assert bench.task.learned() == {}
+    bench.take(1, 10 * S, 11 * S)
+    assert bench.jobs[-1].lens == (begun, 0.0)
+    better = replace(begun, values=begun.values + 0.5, covariance=begun.covariance / 4.0, frames=3)
+    bench.finish(FrameFound(motion(), None, lens=better), 12 * S)
+    values = bench.only(LENS)
+    assert (values["frames"], values["contradictions"], values["sequence"]) == (3, 0, 1)
+    assert values["centre"] == [160.0, 120.0]  # half a pixel beside the image centre (159.5, 119.5)
+    assert np.allclose(values["sigma"], better.sigma[[0, 1, 2, 3, 4, 9, 10]])
+    stored = bench.task.learned()["lens"]
+    assert np.array_equal(stored.arrays()[0], better.learned[0])
+    bench.take(2, 15 * S, 16 * S)
+    assert bench.jobs[-1].lens == (better, 5.0)
+    bench.finish(FrameFound(motion(), None, lens=better), 17 * S)
+    bench.only(LENS)  # a frame that taught nothing is not recorded
+    assert events.LENS_CHANGED not in bench.reports
+    bench.take(3, 35 * S, 36 * S)
+    assert bench.jobs[-1].lens == (better, 25.0), "the lens may have changed since the last frame that taught"
+    again = replace(begun, frames=1, contradictions=1)
+    bench.finish(FrameFound(motion(), None, lens=again), 37 * S)
+    assert bench.reports.count(events.LENS_CHANGED) == 1
+
+
+def test_a_camera_whose_lens_is_not_learned_has_jobs_without_a_lens() -> None:
+    bench = Bench()
+    bench.take(1, 10 * S, 11 * S)
+    assert bench.jobs[-1].lens is None
+    bench.finish(FrameFound(motion(), None), 12 * S)
+    assert bench.task.learned() == {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flight.schema.devices import camera_model
 from flight.schema.orbit import as_orbit
 from flight.schema.reader import load
 from ground.identification.orbit import fragment, learned_description
 from ground.telemetry import read_run
-from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.errors import InputError
 from tests.ground.commands.in_process import command
 from tests.support.packed_run import packed_run
@@ -177,3 +179,40 @@ def test_the_learned_sensors_are_combined_with_the_configured_ones(tmp_path: Pat
     assert flown.craft.residual_dipole == pytest.approx((1e-3, 0.0, -2e-3))
     assert flown.dipole_errors()[0] == pytest.approx(np.sqrt(3.0) * 1e-4, rel=0.01)
     assert flown.craft.accuracy.moments == as_orbit(load(config)).craft.accuracy.moments, "not learned"
+
+
+def test_the_fragment_has_the_learned_lens_with_its_accuracy(flown: tuple[Path, dict[str, Any]]) -> None:
+    """The accuracies of the fragment are those of the packet `lens`, rounded up."""
+    place, _ = flown
+    config = as_orbit(load(place / "first" / "config.yaml"))
+    found = learned_description(read_run(place / "first"), config)
+    lens = {
+        "frames": 12,
+        "focal_length_px": [1460.0, 0.292],
+        "centre_px": [255.0, 257.25],
+        "centre_sigma_px": [0.125, 0.125],
+        "distortion": [-0.05, 0.01],
+        "corner_sigma": 4e-4,
+        "line_time_s": [2.5e-5, 1e-7],
+        "psf_sigma_px": [1.25, 0.01],
+    }
+    text = fragment(dataclasses.replace(found, lens=lens), place / "first", "first/config.yaml")
+    (place / "lens.yaml").write_text(text)
+    camera = as_orbit(load(place / "lens.yaml")).camera
+    assert camera is not None
+    assert camera.lens is not None
+    assert (camera.lens.focal_length, camera.lens.centre, camera.lens.k1) == (1460.0, (255.0, 257.25), -0.05)
+    accuracy = camera.accuracy
+    stated = (accuracy.focal_length, accuracy.centre, accuracy.distortion, accuracy.line_time)
+    assert stated == pytest.approx((2e-4, 0.125, 4e-4, 1e-7), rel=0.02)
+    assert (camera.line_time, camera.psf_sigma) == (2.5e-5, 1.25)
+    # The pixel on the configured axis still shows the same direction in the body.
+    (place / "plain.yaml").write_text(fragment(found, place / "first", "first/config.yaml"))
+    plain = as_orbit(load(place / "plain.yaml")).camera
+    assert plain is not None
+    pixel = np.array([camera_model(plain).centre])
+    shown = [
+        attitude_matrix(np.array(one.mounting)).T @ camera_model(one).unit_vectors(pixel)[0]
+        for one in (plain, camera)
+    ]
+    assert np.allclose(shown[0], shown[1], atol=1e-7)

@@ -13,7 +13,9 @@ from flight.link.telemetry.definitions import Packet
 from flight.link.telemetry.packets import Layout, PacketArray
 from flight.schema import reader
 from flight.schema.orbit import OrbitConfig, as_orbit
+from ground.identification.orbit import learned_lens
 from ground.report.star_camera import star_camera
+from ground.report.text import _lens
 from ground.telemetry import Run
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.quaternion import from_rotation_vector
@@ -129,3 +131,18 @@ def test_without_a_truth_log_nothing_is_said() -> None:
     run = cast(dict[str, PacketArray], flight([21.0]))
     run["truth"] = run["truth"][:0]
     assert star_camera(cast(Run, run), config()) is None
+
+
+def test_the_learned_lens_is_that_of_the_last_packet() -> None:
+    sigma = [[0.5, 0.4, 0.3, 2e-3, 6e-2, 2e-7, 0.02], [0.1, 0.2, 0.2, 1e-3, 3e-2, 1e-7, 0.01]]
+    rows = packets(table.LENS, [1.0, 6.0], frames=[1, 2], focal_length=[900.0, 901.0], sigma=sigma)
+    rows["corner_sigma"][1] = 4e-4
+    run = cast(Run, {"lens": rows})
+    found = learned_lens(run)
+    assert found is not None
+    assert (found["frames"], found["focal_length_px"]) == (2, [901.0, 0.1])
+    text = "\n".join(_lens(found))
+    assert "focal length 901.00 +- 0.10 px" in text
+    assert "radius of a corner +- 0.0400 %" in text
+    assert "line time 0.00 +- 0.10 us" in text
+    assert learned_lens(cast(Run, {"lens": rows[:0]})) is None

@@ -28,6 +28,7 @@ EMPTY: dict[str, Any] = {
     "streaks": {"frames": 0},
     "stars": {"frames": 0},
     "star_camera": None,
+    "lens": None,
     "failed_frames": [],
     "objects": [],
     "modes": [],
