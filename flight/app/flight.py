@@ -333,16 +333,18 @@ def lens_knowledge(
     camera = config.camera
     if camera is None or camera.star_tracker is None or not camera.learn_lens:
         return None
-    accuracy = camera.accuracy
+    accuracy, scale_error = camera.accuracy, camera.star_tracker.scale_error
+    line_time_unknown = accuracy.line_time is None and camera.line_time is None
+    stated = (accuracy.focal_length, accuracy.centre, accuracy.distortion, accuracy.line_time, scale_error)
+    if not any(stated) and not line_time_unknown:
+        return None  # the camera is exact
     known = LensKnowledge.of(
         camera_model(camera),
         CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion, accuracy.line_time),
-        scale_error=camera.star_tracker.scale_error,
+        scale_error=scale_error,
         line_time=camera.line_time,
         psf_sigma=camera.psf_sigma,
     )
-    if not known.uncertain:
-        return None
     if imaging_task.LENS not in learned:
         return known
     values, covariance = learned[imaging_task.LENS].arrays()

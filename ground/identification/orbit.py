@@ -292,7 +292,8 @@ def _camera(found: LearnedDescription) -> list[str]:
     one, camera = found.quantities.get("camera"), found.config.camera
     if one is None or camera is None:
         return []
-    lines, accuracies, mounting = [], [], np.array(camera.mounting)
+    lines: list[str] = []
+    accuracies, mounting = [], np.array(camera.mounting)
     if one.learned:
         mounting = multiply(mounting, from_rotation_vector(one.value))
         largest = min(math.degrees(_UNIFORM * one.claim.max()), camera.accuracy.mounting_deg)

@@ -408,11 +408,6 @@ class LensKnowledge:
         return cls(lens, prior, sigma, prior, np.diag(sigma**2))
 
     @property
-    def uncertain(self) -> bool:
-        """Whether the configuration leaves anything about lens or line time to learn."""
-        return bool(np.any(self.spread[:_PSF] > 2.0 * _exact(self.configured)[:_PSF]))
-
-    @property
     def usable(self) -> bool:
         """Whether the learned lens is accurate enough to replace the configured lens."""
         return self.frames > 0 and math.sqrt(self.covariance[0, 0]) < _FOCAL_KNOWN * float(self.values[0])

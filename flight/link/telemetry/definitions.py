@@ -685,9 +685,7 @@ STARS = Packet(
         ),
         Field("found", "u2", "-", "detected stars"),
         Field("matched", "u2", "-", "detected stars that match guide stars"),
-        Field(
-            "quaternion", "f8", "-", "rotation of reference frame into body, scalar last; NaN if unknown", 4
-        ),
+        Field("quaternion", "f8", "-", "rotation of reference frame into body, scalar last or NaN", 4),
         Field("covariance", "f8", "rad^2", _COVARIANCE, 6),
         Field(
             "log10_false_alarm", "f8", "-", "log10 of the expected number of chance matches in the whole sky"

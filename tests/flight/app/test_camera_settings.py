@@ -91,6 +91,7 @@ def test_the_lens_is_learned_from_the_last_boot_unless_it_is_exact_or_switched_o
     assert lens_knowledge(configured(learn_lens=False), {}, problems) is None
     assert lens_knowledge(configured(star_tracker=None), {}, problems) is None
     assert lens_knowledge(configured(accuracy=exact, line_time=0.0), {}, problems) is None
+    assert lens_knowledge(configured(accuracy=exact), {}, problems) is not None, "its line time is unknown"
     begun = lens_knowledge(configured(), {}, problems)
     assert begun is not None
     assert not begun.usable

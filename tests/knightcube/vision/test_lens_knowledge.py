@@ -201,13 +201,6 @@ def test_stored_values_start_the_next_boot_unless_they_are_implausible() -> None
     assert begun.restored(values[:6], covariance[:6, :6], 0.1) is None
 
 
-def test_an_exact_camera_has_nothing_to_learn() -> None:
-    exact = CameraKnowledge(centre=0.0, distortion=0.0)
-    assert not LensKnowledge.of(DESCRIBED, exact, line_time=0.0).uncertain
-    assert LensKnowledge.of(DESCRIBED, exact).uncertain  # its line time
-    assert LensKnowledge.of(DESCRIBED, exact, line_time=0.0, scale_error=0.01).uncertain
-
-
 @pytest.mark.parametrize(("k1", "k2"), [(-0.2, 0.0), (0.12, 0.9), (-0.15, -0.8)])
 def test_the_camera_of_the_streak_fit_images_like_the_learned_lens(k1: float, k2: float) -> None:
     lens = Lens(640, 480, 1800.0, (323.0, 236.5), k1, k2)
