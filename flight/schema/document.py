@@ -33,6 +33,8 @@ EXTENDS = "extends"
 """Key whose value names the file that a configuration extends."""
 _LONGEST = 1 << 20
 """Maximum length of a configuration file, in characters."""
+_LONGEST_PATH = 1024
+"""Maximum length of the path of an extended file, in characters."""
 
 
 class ConfigError(InputError):
@@ -234,8 +236,10 @@ def _extended(document: Document, above: tuple[str, ...]) -> Document:
         return document
     named = document.values.pop(EXTENDS)
     place = document.error(EXTENDS, "").where
-    if not isinstance(named, str) or "\0" in named:
-        problem = f"is {named!r}: give the path of a file, or the name of a configuration"
+    if not isinstance(named, str) or "\0" in named or len(named) > _LONGEST_PATH:
+        problem = (
+            f"is {repr(named)[:_LONGEST_VALUE]}: give the path of a file, or the name of a configuration"
+        )
         raise document.error(EXTENDS, problem)
     path = Path(document.name).parent / named
     if named in names() or (named.removesuffix(".yaml") in names() and not os.path.lexists(path)):

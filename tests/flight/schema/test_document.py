@@ -257,7 +257,7 @@ def test_a_packaged_configuration_is_extended_by_its_name(tmp_path: Path, named:
         ({"a.yaml": "x: 1\nextends: none.yaml\n"}, ["a.yaml:2", "'none.yaml'", "no such file", "orbit_3u"]),
         ({"a.yaml": "extends: [b]\n"}, ["a.yaml:1", "is ['b']: give the path of a file"]),
         ({"a.yaml": 'extends: "b\\0"\n'}, ["a.yaml:1", "give the path of a file"]),
-        ({"a.yaml": f"extends: {'b' * 5000}\n"}, ["a.yaml:1", "cannot be read"]),
+        ({"a.yaml": f"extends: {'b' * 5000}\n"}, ["a.yaml:1", "bb: give the path of a file"]),
         ({"a.yaml": "extends: .\n"}, ["a.yaml:1", "cannot be read"]),
         ({"a.yaml": "extends: b.yaml\n", "b.yaml": "x: [\n"}, ["b.yaml:2", "is not YAML"]),
         ({"a.yaml": "extends: b.yaml\n", "b.yaml": "x:\n  y: .inf\n"}, ["b.yaml:2", "`x.y` is inf"]),
