@@ -271,7 +271,7 @@ def test_a_sound_bench_has_no_finding(tmp_path: Path) -> None:
     assert [outcome.values for outcome in found if "skipped" in outcome.values] == []
 
 
-def test_a_monitor_of_the_power_system_is_not_taken_for_that_of_the_coils(tmp_path: Path) -> None:
+def test_a_monitor_of_the_power_system_is_not_mistaken_for_the_coil_monitor(tmp_path: Path) -> None:
     power = {"power": {"battery": {"capacity": 2.0}}}
     opened = session(Case(power | fault("monitor: off"), "", [], base="orbit"), tmp_path)
     opened.config = requested_config(RunRequest(tmp_path / "wired.yaml", Path()))[1]
