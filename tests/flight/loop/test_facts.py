@@ -45,7 +45,7 @@ DRIVEN = "detumble hold slew testbed-demo sun point"
 PERSISTENCE = {
     "boot-waits": (1, 1, "boot"),
     "task-failing": (1, None, ""),
-    "blind": (1, 1, DRIVEN),
+    "blind": (1, 1, f"{DRIVEN} acquire"),
     "tumbling": (8, 1, "hold slew testbed-demo acquire sun point"),
     "hold-impossible": (1, 1, "hold testbed-demo"),
     "slew-late": (1, 1, "slew"),
