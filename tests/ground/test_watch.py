@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -212,8 +211,8 @@ def test_the_state_and_events_of_an_answer_are_shown_and_each_event_once(
     listener = Listener(tmp_path / "socket")
     log = scan((growing / "flight-0001.ccsds").read_bytes()).packets
     control = log["control"][-1:].tobytes()
-    listener.will_say(answer(True) + control + event(Packer(), events.IMU_SILENT, 5.7, "no byte"))
-    threading.Timer(0.3, listener.will_say, [b"x"]).start()
+    said = answer(True) + control + event(Packer(), events.IMU_SILENT, 5.7, "no byte")
+    listener.will_say(said, said, said, b"x")
     lines = command("watch", tmp_path / "socket", "--patience", "0.2").stdout.splitlines()
     assert lines[0] == "    5.700 s  fault    imu-silent: no byte"
     assert len(lines) > 2
@@ -226,7 +225,7 @@ def test_the_state_and_events_of_an_answer_are_shown_and_each_event_once(
 def test_a_flight_that_stops_to_answer_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ground.commands.station._PING_S", 0.05)
     listener = Listener(tmp_path / "socket")
-    threading.Timer(0.2, listener.will_say, [b"x"]).start()
+    listener.will_say(answer(True), answer(True), b"x")
     done = command("watch", tmp_path / "socket", "--patience", "0.2")
     assert done.returncode == 1
     assert "  hold  answered in " in done.stdout

@@ -158,6 +158,8 @@ def test_its_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
     assert len(list((tmp_path / "figures").glob("*.png"))) == 7
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_the_bus_gives_the_same_charge_at_its_higher_voltage(demonstration: Run) -> None:
     """5 V at the bus and 3.4 V at the coils carry one current; the monitor is read once a second."""
     power = report.summarise(demonstration)["power"]

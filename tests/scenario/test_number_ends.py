@@ -89,6 +89,7 @@ def test_every_integer_of_the_testbed_may_pass_its_end(
         "gps_link",
         "directions",
         "separate_attitudes",
+        "lens",
         "power",
         "true_power",
         "truth",

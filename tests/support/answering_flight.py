@@ -22,7 +22,7 @@ def answer(obeyed: bool) -> bytes:
 
 
 class Listener:
-    """A flight's command socket that answers every command with the same reply."""
+    """A flight's command socket that gives replies in order and repeats the last one."""
 
     def __init__(self, path: Path) -> None:
         self._reply = [answer(True)]
@@ -31,9 +31,9 @@ class Listener:
         threading.Thread(target=_listen, args=(self._line, self._reply), daemon=True).start()
         weakref.finalize(self, self._line.shutdown, socket.SHUT_RDWR)
 
-    def will_say(self, reply: bytes) -> None:
-        """Use this reply from now on."""
-        self._reply[0] = reply
+    def will_say(self, *replies: bytes) -> None:
+        """Give these replies from now on, and repeat the last one."""
+        self._reply[:] = replies
 
 
 def _listen(line: socket.socket, reply: list[bytes]) -> None:
@@ -44,4 +44,4 @@ def _listen(line: socket.socket, reply: list[bytes]) -> None:
             line.close()
             return
         with contextlib.suppress(OSError):  # who asked has gone again
-            line.sendto(reply[0], sender)
+            line.sendto(reply.pop(0) if len(reply) > 1 else reply[0], sender)

@@ -192,7 +192,13 @@ def test_dates_have_microseconds(utc_ns: int, text: str) -> None:
 def test_sightings_without_a_position_give_no_orbit() -> None:
     track = np.zeros(
         3,
-        dtype=[("number", "u4"), ("middle_ns", "i8"), ("measured", "f8", 3), ("place", "f8", 3)],
+        dtype=[
+            ("number", "u4"),
+            ("middle_ns", "i8"),
+            ("measured", "f8", 3),
+            ("place", "f8", 3),
+            ("relative", "u1"),
+        ],
     )
     track["number"] = 2
     track["middle_ns"] = [10**9, 3 * 10**9, 8 * 10**9]
