@@ -75,6 +75,7 @@ def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> 
             page.click(".md-search__input")
             # All words at once: the results of the first letters would still be on the page.
             page.fill(".md-search__input", words)
+            page.keyboard.press("End")  # the page reads the words when a key is released
             page.wait_for_selector(item, timeout=60_000)
             first = str(page.get_attribute(item, "href")).partition("?")[0]
             if not first.endswith(f"/{right}"):
