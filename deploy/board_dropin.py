@@ -18,7 +18,7 @@ from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Any
 
-from flight.schema.devices import DRIVERS, AravisDevice, driver_of
+from flight.schema.devices import AravisDevice, driver_of, fitted_devices
 from flight.schema.document import ConfigError, read_document, read_text
 from flight.schema.reader import LOOPBACK, load, peer_networks
 from flight.schema.sections import Config
@@ -126,9 +126,9 @@ def _text(lines: list[str]) -> str:
 
 def _devices_of(config: Config) -> list[tuple[str, Any]]:
     """Return the kind and the section of each configured device, beginning with the coils."""
-    named = [(kind, getattr(config, kind)) for kind in ("coils", *DRIVERS) if kind != "camera"]
-    named += [("camera", camera) for camera in (config.camera, *config.wide_cameras)]
-    return [(kind, section) for kind, section in named if section is not None]
+    named = [("coils", config.coils), *((kind, section) for _, kind, section in fitted_devices(config))]
+    cameras = (config.camera, *config.wide_cameras)
+    return named + [("camera", camera) for camera in cameras if camera is not None]
 
 
 def _nodes(config: Config) -> list[tuple[str, tuple[str, ...]]]:

@@ -19,7 +19,6 @@ import numpy as np
 from flight.app.run import RunRequest
 from flight.loop.state import state_folder
 from flight.schema.devices import (
-    DRIVERS,
     SENSOR_PARTS,
     AravisDevice,
     Camera,
@@ -35,6 +34,7 @@ from flight.schema.devices import (
     WideCamera,
     axis_matrix,
     driver_of,
+    fitted_devices,
 )
 from flight.schema.document import ConfigError, imported
 from flight.schema.orbit import OrbitConfig
@@ -215,12 +215,7 @@ def _dated(rig: Rig, config: Config) -> Rig:
 
 def check_settings(config: Config) -> None:
     """Raise ConfigError, with the permitted range, for a value that a driver does not accept."""
-    sections = [(kind, kind, getattr(config, kind)) for kind in DRIVERS if kind != "camera"]
-    if config.power is not None:
-        sections += [("power_monitor", key, one) for key, one in config.power.monitors().items()]
-    for kind, name, section in sections:
-        if section is None:
-            continue
+    for name, kind, section in fitted_devices(config):
         try:
             driver_of(kind, section, f"{name}.driver").check(section)
         except OutOfRange as error:

@@ -782,6 +782,14 @@ def axis_matrix(names: Sequence[str]) -> FloatArray:
     return np.array([[(1.0, -1.0)[name[0] == "-"] * (name[-1] == axis) for axis in "xyz"] for name in names])
 
 
+def fitted_devices(config: Any) -> list[tuple[str, str, Any]]:
+    """Return the dotted key, the kind and the section of each configured device, without the cameras."""
+    found = [(kind, kind, getattr(config, kind)) for kind in DRIVERS if kind != "camera"]
+    if config.power is not None:
+        found += [(key, "power_monitor", one) for key, one in config.power.monitors().items()]
+    return [row for row in found if row[2] is not None]
+
+
 def driver_of(kind: str, section: Any, key: str = "") -> Driver:
     """Return the registration of the driver that a section names. Raises ConfigError.
 

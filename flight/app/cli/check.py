@@ -23,7 +23,7 @@ from flight.app.cli.run import counts_text, summary_facts
 from flight.app.devices import NO_CAMERA, open_camera, real_rig
 from flight.app.run import RunRequest, RunResult
 from flight.schema import reader as configuration
-from flight.schema.devices import DRIVERS, Camera, WideCamera, driver_of, structure_mask
+from flight.schema.devices import Camera, WideCamera, driver_of, fitted_devices, structure_mask
 from flight.schema.document import ConfigError, config_path, merged_text, names, read_document
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
@@ -46,17 +46,15 @@ class Probed:
 
 def probe(config: Config) -> list[Probed]:
     """Return the result of each device, file and folder that the configuration needs."""
-    sections = [(kind, getattr(config, kind)) for kind in DRIVERS if kind != "camera"]
-    sections += [("camera", config.camera)]
-    sections += config.power.monitors().items() if config.power is not None else ()
-    sections += [(f"wide_cameras[{number}]", camera) for number, camera in enumerate(config.wide_cameras)]
-    return [_probed(config, *named) for named in sections if named[1] is not None] + list(_files(config))
+    sections = fitted_devices(config)
+    sections += [("camera", "camera", config.camera)] if config.camera is not None else []
+    sections += [(f"wide_cameras[{k}]", "camera", camera) for k, camera in enumerate(config.wide_cameras)]
+    return [_probed(config, *named) for named in sections] + list(_files(config))
 
 
-def _probed(config: Config, name: str, section: Any) -> Probed:
+def _probed(config: Config, name: str, kind: str, section: Any) -> Probed:
     """Ask one device for a sign of life, with connections of its own."""
     camera = isinstance(section, Camera | WideCamera)
-    kind = "camera" if camera else "power_monitor" if name.startswith("power.") else name
     driver = driver_of(kind, section.device if camera else section)
     place = ", ".join(driver.files(section) or driver_of("coils", config.coils).files(config.coils))
     place = getattr(section.device, "name", "") or place if camera else place
