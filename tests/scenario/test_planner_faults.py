@@ -127,7 +127,7 @@ def test_with_a_good_planner_none_of_these_alarms_rings(
 def test_late_plans_are_refused_and_without_any_path_the_coils_stay_off(tmp_path: Path) -> None:
     run = fly(demo_config(12.0, camera=False), tmp_path, planner_latency=1.5)
     assert not run["plan"]["accepted"].any()
-    assert to_text(run["plan"]["status"][0]).startswith("late")
+    assert to_text(run["plan"]["status"][0]).startswith("the plan is late")
     assert not run["truth"]["current"].any()
 
 

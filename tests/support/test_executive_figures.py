@@ -107,7 +107,7 @@ def test_memory_that_a_process_touches_is_seen_and_its_processor_time_too() -> N
     for _ in range(3):
         before, alone = process_watch.look(me), process_watch.unshared(me)
         # Mapped, not from the heap, where memory freed by earlier tests would be reused.
-        held = np.frombuffer(mmap.mmap(-1, 32 << 20))
+        held = np.frombuffer(mmap.mmap(-1, 32 << 20, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))
         spent = time.process_time()
         while time.process_time() - spent < 0.1:
             held += 1.0
