@@ -3,6 +3,8 @@
 In each round the step demonstration flies twice in real time on its emulated devices beside its link process:
 quiet, and attacked. The attackers share one core. They send 30,000 datagrams a second from an address that is
 not a peer's, and open 200 TCP connections a second from a peer's address, each with bytes that form no frame.
+With `--forged N` they also send N forged frames a second from a peer's address: replayed, damaged and without
+the key. The link has to examine these frames, so that commands by UDP may be lost among them.
 In both flights the operator sends 40 commands, in turn by UDP, by a TCP connection that stays open and by a
 new one. Printed are the obeyed commands, the rates of the attackers and the lateness of the control cycles.
 The exit status is 1 if a command was not obeyed, or if the 99 % quantile of the lateness is more than twice
@@ -23,6 +25,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from random import Random
 from statistics import median
 from typing import Any
 
@@ -32,6 +35,7 @@ from ground.link.commanding import failed, obeyed
 from ground.link.terminal import open_terminal
 from knightcube.errors import FlightError
 from tests.support.flooded_flight import lateness, process, wait_for
+from tests.support.link_attacker import LinkAttacker
 from tests.support.linked_board import free_ports, write_linked_config
 
 DATAGRAMS, CONNECTIONS, COMMANDS = 30_000, 200, 40
@@ -39,6 +43,7 @@ DATAGRAMS, CONNECTIONS, COMMANDS = 30_000, 200, 40
 WITHIN = 2.0
 _STRANGER = "127.0.0.2"
 _BURST_S = 0.01
+_KINDS = 500
 _START_S, _ANSWER_S, _PAUSE_S = 12.0, 5.0, 1.0
 
 
@@ -49,13 +54,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--commands", type=int, default=COMMANDS, metavar="N", help=f"in each flight (default {COMMANDS})"
     )
+    text = "forged frames a second from a peer's address (default 0)"
+    parser.add_argument("--forged", type=int, default=0, metavar="N", help=text)
     options = parser.parse_args(arguments)
     p99: dict[str, list[float]] = {"quiet": [], "attacked": []}
     missing = 0
     for _ in range(options.rounds):
         for name, late in p99.items():
             with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
-                facts = measure(Path(place), options.commands, attacked=name == "attacked")
+                facts = measure(
+                    Path(place), options.commands, attacked=name == "attacked", forged=options.forged
+                )
             late.append(facts["lateness_ms"]["p99"])
             missing += len(facts["failures"])
             sys.stdout.write(json.dumps({"flight": name, **facts}) + "\n")
@@ -65,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return int(missing > 0 or ratio > WITHIN)
 
 
-def measure(place: Path, commands: int, *, attacked: bool) -> dict[str, Any]:
+def measure(place: Path, commands: int, *, attacked: bool, forged: int = 0) -> dict[str, Any]:
     """Fly once; return the commands that were obeyed, the lateness in ms and the strangers' rates."""
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
     with ExitStack() as stack:
@@ -80,7 +89,7 @@ def measure(place: Path, commands: int, *, attacked: bool) -> dict[str, Any]:
         link = stack.enter_context(process("link", config, "--log", run))
         wait_for(place / "commands")
         _wait_for_port(tcp)
-        rates = stack.enter_context(_strangers(udp, tcp)) if attacked else dict
+        rates = stack.enter_context(_strangers(udp, tcp, forged)) if attacked else dict
         time.sleep(_START_S / 2.0)
         failures = _command(commands, udp, tcp, place / "keys" / "ground")
         found = rates()
@@ -128,21 +137,23 @@ def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
 
 
 @contextmanager
-def _strangers(udp: int, tcp: int) -> Iterator[Callable[[], dict[str, float]]]:
-    """Run both floods on one core; yield a function that returns their rates until now."""
+def _strangers(udp: int, tcp: int, forged: int) -> Iterator[Callable[[], dict[str, float]]]:
+    """Run all floods on one core; yield a function that returns their rates until now."""
     context = multiprocessing.get_context("fork")
-    begun, counts = time.monotonic(), [context.Value("Q", 0), context.Value("Q", 0)]
+    begun = time.monotonic()
+    counts = {name: context.Value("Q", 0) for name in ("datagrams", "connections", "forged")}
     floods = [
-        context.Process(target=flood, args=(port, count), daemon=True)
-        for flood, port, count in zip((_datagrams, _connections), (udp, tcp), counts, strict=True)
+        context.Process(target=_datagrams, args=(udp, counts["datagrams"]), daemon=True),
+        context.Process(target=_connections, args=(tcp, counts["connections"]), daemon=True),
     ]
+    if forged:
+        floods.append(context.Process(target=_forged, args=(udp, forged, counts["forged"]), daemon=True))
     for one in floods:
         one.start()
 
     def rates() -> dict[str, float]:
         seconds = time.monotonic() - begun
-        names = ("datagrams_a_second", "connections_a_second")
-        return {name: round(count.value / seconds) for name, count in zip(names, counts, strict=True)}
+        return {f"{name}_a_second": round(count.value / seconds) for name, count in counts.items()}
 
     try:
         yield rates
@@ -176,6 +187,21 @@ def _connections(port: int, count: Any) -> None:
             lines[-1].sendall(b"GET / HTTP/1.1\r\n\r\n" * 8)
         while len(lines) > CONNECTIONS:
             lines.pop(0).close()
+
+
+def _forged(port: int, a_second: int, count: Any) -> None:
+    """Send frames of an attacker without the key from a peer's address."""
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    chance = Random(1)
+    with tempfile.TemporaryDirectory() as folder:
+        attacker = LinkAttacker(Path(folder))
+        frames = [attacker.frame(chance)[1] for _ in range(_KINDS)]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+        for _ in _grid(_BURST_S):
+            for _ in range(round(a_second * _BURST_S)):
+                with contextlib.suppress(OSError):
+                    line.sendto(chance.choice(frames), ("127.0.0.1", port))
+            count.value += round(a_second * _BURST_S)
 
 
 def _grid(period: float) -> Iterator[None]:
