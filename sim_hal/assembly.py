@@ -139,8 +139,8 @@ def assemble(
         own = msgspec.structs.replace(config, inertial_unit=magnetometer)
         other = msgspec.structs.replace(section, seed=section.seed + 1)
         generator = np.random.default_rng([section.seed, ORBIT_STREAM, 3])
-        felt = _sense(own, other, world, circuit)
-        emulated(replace(given, kind="magnetometer", generator=generator, sense=felt))
+        sense = _sense(own, other, world, circuit)
+        emulated(replace(given, kind="magnetometer", generator=generator, sense=sense))
     objects = sky_objects(section, start_ns, world)
     camera = _star_camera(config, section, world, now_ns, objects, expose) if config.camera else None
     orbit = OrbitDevices(

@@ -247,7 +247,7 @@ BATTERY_CHARGED = EventKind(
     164,
     "battery-charged",
     Severity.INFORMATION,
-    "the battery is no longer critical, so a flight that it brought to safe mode continues",
+    "the battery has recovered; a flight in SAFE because of the battery continues",
     Reaction.RETURN,
 )
 POWER_SENSOR_LOST = _warning(

@@ -394,7 +394,7 @@ class BodyEstimation(Protocol):
         return None
 
     def fastest_by_field(self) -> float:
-        """Return the largest likely body rate (rad/s) by the magnetometer, while there is no gyro.
+        """Return the largest likely body rate (rad/s) by the magnetometer while the gyro gives no rate.
 
         The default method returns infinity, for a body whose rate is not estimated from the magnetometer.
         """

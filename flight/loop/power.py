@@ -70,7 +70,7 @@ class MonitorWatch:
         self._low, self._high = math.inf, -math.inf  # range of the other monitor's voltage since `_since_ns`
 
     def read(self, now_ns: int) -> tuple[PowerReading | None, str]:
-        """Return the newest reading, or None and why there is no usable reading."""
+        """Return the newest reading, or None and the reason if it cannot be used."""
         reading, error = self._monitor.latest(), self._monitor.error()
         if error or reading is None:
             return None, f"{self.name}: {error or 'no reading yet'}"

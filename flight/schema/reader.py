@@ -420,7 +420,7 @@ def parse(text: str, name: str = "configuration") -> Config:
 
 
 def _replace_unit(document: Document) -> None:
-    """Use the magnetometer as an inertial unit without a gyro, if there is no inertial unit.
+    """Use the magnetometer as an inertial unit without a gyro if `inertial_unit` is `none`.
 
     Raises ConfigError for a file whose `inertial_unit` is none, and which has no magnetometer.
     """

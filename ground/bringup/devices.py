@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flight.app.devices import open_camera
-from flight.schema.devices import DRIVERS, driver_of
+from flight.schema.devices import driver_of, fitted_devices
 from flight.schema.sections import Config
 from ground.bringup.diagnosis import Finding
 from hal.drivers.ina219 import config_for
@@ -79,35 +79,27 @@ def talker(rig: Rig, device: str, rates: tuple[int, ...]) -> tuple[str, int]:
 
 
 def find(config: Config, rig: Rig, stack: Any) -> Iterator[Found]:
-    """Yield the answer of each configured device, or what is wrong with it and what to do."""
+    """Yield the answer of each configured device, or a finding with its cure."""
     serial = {
         kind: one for kind in ("inertial_unit", "gps") if hasattr(one := getattr(config, kind), "device")
     }
-    sections = {kind: getattr(config, kind) for kind in DRIVERS}
-    sections |= {f"wide_cameras[{number}]": camera for number, camera in enumerate(config.wide_cameras)}
-    power = getattr(config, "power", None)
-    sections |= {} if power is None else power.monitors()
-    taken = {getattr(section, "address", None) for section in sections.values()}
-    for kind, section in sections.items():
-        if section is None:
-            continue
-        camera = "camera" in kind
+    cameras: list[tuple[str, Any]] = [("camera", config.camera)] if config.camera is not None else []
+    cameras += [(f"wide_cameras[{number}]", one) for number, one in enumerate(config.wide_cameras)]
+    sections = fitted_devices(config) + [(key, "camera", section) for key, section in cameras]
+    taken = {getattr(section, "address", None) for _, _, section in sections}
+    for key, kind, section in sections:
+        camera = kind == "camera"
         wired = section.device if camera else section  # an emulated camera needs no `device`
-        driver = None if wired is None else driver_of(_family(kind), wired)
-        place = _place(config, kind, section, driver)
+        driver = None if wired is None else driver_of(kind, wired)
+        place = _place(config, key, section, driver)
         try:
             if camera and rig.cameras is None:
                 open_camera(section, rig, stack)
             answer = "opens" if driver is None or camera else driver.probe(rig, section)
-            finding = _wrong_part(kind, section, rig, serial)
+            finding = _wrong_part(key, section, rig, serial)
         except DeviceError as error:
-            answer, finding = "", _missing(kind, section, rig, serial, taken, error)
-        yield Found(kind, place, answer, finding)
-
-
-def _family(kind: str) -> str:
-    """Return the section that has the same drivers as the section `kind`."""
-    return "camera" if "camera" in kind else "power_monitor" if kind.startswith("power.") else kind
+            answer, finding = "", _missing(key, section, rig, serial, taken, error)
+        yield Found(key, place, answer, finding)
 
 
 def _place(config: Config, kind: str, section: Any, driver: Any) -> str:

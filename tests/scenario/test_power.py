@@ -1,4 +1,4 @@
-"""Flights with a battery that is far too small: what is shed in the loop, and what returns after sunrise."""
+"""Flights with a battery that is far too small: loads shed in the loop, and their return after sunrise."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ class OrbitFilterSettings:
 
     @property
     def by_field(self) -> FieldRateSettings:
-        """Settings of the filter that estimates the rate from the magnetometer while there is no gyro."""
+        """Settings of the filter that estimates the rate from the magnetometer if the gyro is silent."""
         return FieldRateSettings(
             inertia=self.inertia,
             field_sigma=math.hypot(self.field_noise, self.free.magnet[0]),

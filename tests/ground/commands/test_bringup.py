@@ -1,4 +1,4 @@
-"""`knightcube bringup`: keeps its steps, continues, and writes a configuration that cures what it found."""
+"""The command `knightcube bringup`: kept steps, continuation, and a configuration that cures its findings."""
 
 from __future__ import annotations
 
