@@ -105,9 +105,13 @@ def test_telemetry_can_be_readable_for_everybody_and_still_cannot_be_forged(
     link.collect = lambda: None  # type: ignore[method-assign]
     link.turn(1.5)
     seen = list(link.wire.down)
-    identifier = LAYOUTS[LINK.name].identifier.to_bytes(2, "big")
-    assert (identifier in b"".join(frame[20:-18] for frame in seen)) is not encrypted
-    assert len(list(link.terminal.take())) > 0
+    packets = [packet for _, packet in link.terminal.take()]
+    # Sixteen bytes: two of them occur by chance in one of a hundred encrypted downlinks.
+    starts = [
+        packet[:16] for packet in packets if packet[:2] == LAYOUTS[LINK.name].identifier.to_bytes(2, "big")
+    ]
+    assert starts
+    assert any(start in frame for start in starts for frame in seen) is not encrypted
     link.turn(1.1)
     genuine = link.wire.down.pop()
     link.wire.down.clear()
