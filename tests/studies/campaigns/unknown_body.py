@@ -9,7 +9,8 @@ are still tumbling; they show within minutes whether the filter is honest.
 The attitude is judged in each phase: tumble, acquisition, slew, and pointing in sunlight and in eclipse. NEES
 is that of one axis, from samples 10 s apart, about the body axes and about those of the star camera. The
 share of the samples beyond 5 sigma and the longest excursion are counted in all attitude packets (10 Hz)
-while the attitude is fine.
+while the attitude is fine. `learned_refused` counts the events `learned-refused`, which are false alarms in
+these flights.
 """
 
 from __future__ import annotations
@@ -124,6 +125,7 @@ def facts(flown: Run, config: OrbitConfig) -> Result:
         },
         "excursions": _excursions(flown, body),
         "restarts": int(packets["restarts"][-1]),
+        "learned_refused": int(np.sum(flown["event"]["code"] == events.LEARNED_REFUSED.code)),
         "refused": int(packets["refused"][-1]),
         "attitudes": [int(measured.sum()), int((measured & (stars["accepted"] == 0)).sum())],
         "rates": [int(rated.sum()), int((rated & (rates["accepted"] == 0)).sum())],
@@ -250,6 +252,7 @@ def _flights(mine: Sequence[Result]) -> dict[str, Any]:
         "excursion_s": max(one["longest_s"] for one in out),
         "sigmas": max(one["sigmas"] for one in out),
         "restarts": sum(result["restarts"] for result in mine),
+        "learned_refused": sum(result["learned_refused"] for result in mine),
         "refused": sum(result["refused"] for result in mine),
         "attitudes": attitudes,
         "rates": rates,
