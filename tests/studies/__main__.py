@@ -27,6 +27,10 @@ def names() -> list[str]:
 
 def main() -> int:
     """Run the study named first on the command line with the rest of the line."""
+    if sys.argv[1:2] in (["-h"], ["--help"]):
+        print(f"usage: python -m tests.studies NAME [arguments]\n\nstudies: {', '.join(names())}")  # noqa: T201
+        print("\n`python -m tests.studies NAME --help` shows the arguments of a study.")  # noqa: T201 - a command
+        return 0
     if len(sys.argv) < 2 or sys.argv[1] not in names():
         asked = f"there is no study {sys.argv[1]!r}; " if len(sys.argv) > 1 else ""
         print(f"{asked}studies: {', '.join(names())}", file=sys.stderr)  # noqa: T201 - a command

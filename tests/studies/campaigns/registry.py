@@ -21,7 +21,6 @@ from tests.studies.campaigns.horizon_methods import HORIZON_METHODS
 from tests.studies.campaigns.installer_kill import INSTALLER_KILL
 from tests.studies.campaigns.ionf import IONF
 from tests.studies.campaigns.knowledge import AGED_ELEMENTS, CALENDAR
-from tests.studies.campaigns.link_start import LINK_START
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
@@ -93,7 +92,6 @@ CAMPAIGNS: dict[str, Campaign] = {
         UNLIKE_INERTIA,
         SOAK,
         START,
-        LINK_START,
         COVERAGE,
         ORBIT_ATTITUDE,
         ORBIT_FRAMES,

@@ -43,6 +43,8 @@ FAULTS = 10
 _LONGEST_S = 120.0
 _CONFIG = "flight.yaml"
 _MOST_RESTARTS = 5
+_GROUNDED = 2
+"""Exit status after which the service manager does not start a flight again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,15 +57,13 @@ class Point:
     error: str
 
 
-def points(
-    counts: Counter[str], before: Counter[str], errors: Sequence[str] = ERRORS, calls: Sequence[str] = CALLS
-) -> list[Point]:
+def points(counts: Counter[str], before: Counter[str]) -> list[Point]:
     """Return all points of a start with these numbers of calls, in all and before the configuration."""
     return [
         Point(number > before[call], call, number, error)
-        for call in calls
+        for call in CALLS
         for number in range(1, counts[call] + 1)
-        for error in errors
+        for error in ERRORS
     ]
 
 
@@ -81,11 +81,7 @@ def in_turn(listed: Sequence[Point], seed: int) -> list[Point]:
 def cases(runs: int, seed: int) -> list[Case]:
     """Trace a start; return boards for the first `runs` points."""
     with _board() as board:
-        return cases_of(points(*board.trace()), runs, seed)
-
-
-def cases_of(listed: Sequence[Point], runs: int, seed: int) -> list[Case]:
-    """Return the cases of the first `runs` points."""
+        listed = points(*board.trace())
     chosen = [(point.call, point.number, point.error, point.begun) for point in in_turn(listed, seed)[:runs]]
     of = {"points": len(listed), "begun": sum(point.begun for point in listed)}
     return [
@@ -111,20 +107,20 @@ def _board() -> Iterator[Board]:
     """Provide a board; its devices run beside it. Raises UsageError without strace."""
     if shutil.which("strace") is None:
         raise UsageError("the campaign start needs strace")
-    check_injection()
+    _check_injection()
     # The socket's name must be short.
     with tempfile.TemporaryDirectory(prefix="kc-") as name:
         place = Path(name)
         (place / "devices").mkdir()
         with devices_running(place / "devices") as facts:
-            board = Board.of_flight(place, facts)
+            board = Board(place, facts)
             try:
                 yield board
             finally:
                 board.close()
 
 
-def check_injection() -> None:
+def _check_injection() -> None:
     """Raise UsageError if strace cannot make calls fail here, as in some containers."""
     fault = ["-e", "trace=none", "-e", "inject=openat:error=EIO:when=1+"]
     words = ["strace", "-o", "/dev/null", *fault, sys.executable, "-c", "open('/dev/null')"]
@@ -135,28 +131,9 @@ def check_injection() -> None:
 class Board:
     """A board with its configuration, state and archive, and the service manager's end of its line."""
 
-    def __init__(
-        self, place: Path, words: Sequence[object], state: Path, calls: Sequence[str] = CALLS
-    ) -> None:
-        """Start a program by `words`; a program of the flight is not started again after status 2."""
+    def __init__(self, place: Path, devices: Path) -> None:
+        """Write the configuration of a flight on emulated devices."""
         self._place = place
-        self._calls = calls
-        self._line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._line.bind(str(place / "notify"))
-        self._line.settimeout(0.1)
-        self._words = [sys.executable, "-m", "flight", *map(str, words)]
-        self._for_good = (2,) if "run" in words else ()
-        self._environment = {
-            **os.environ,
-            "NOTIFY_SOCKET": str(place / "notify"),
-            "WATCHDOG_USEC": "2000000",
-            "STATE_DIRECTORY": str(state),
-            "PYTHONDONTWRITEBYTECODE": "1",
-        }
-
-    @classmethod
-    def of_flight(cls, place: Path, devices: Path) -> Board:
-        """Return a board with a flight on emulated devices."""
         config, state = write_config(place), place / "state"
         state.mkdir()
         with config.open("a", encoding="utf-8") as file:
@@ -166,12 +143,22 @@ class Board:
         sum_file(config).write_text(f"{hashlib.sha256(data).hexdigest()}  {_CONFIG}\n", encoding="ascii")
         FlownConfig(data.decode(), state).keep()
         words = ["run", config, "--realtime", "--archive", place / "runs", "--devices", devices]
-        return cls(place, words, state)
+        self._line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._line.bind(str(place / "notify"))
+        self._line.settimeout(0.1)
+        self._words = [sys.executable, "-m", "flight", *map(str, words)]
+        self._environment = {
+            **os.environ,
+            "NOTIFY_SOCKET": str(place / "notify"),
+            "WATCHDOG_USEC": "2000000",
+            "STATE_DIRECTORY": str(state),
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
 
     def trace(self) -> tuple[Counter[str], Counter[str]]:
         """Return how often each call is made in a start, and how often before the configuration is opened."""
         path = self._place / "trace"
-        strace = ["strace", "-o", str(path), "-e", f"trace={','.join(self._calls)}"]
+        strace = ["strace", "-o", str(path), "-e", f"trace={','.join(CALLS)}"]
         begun = self._begin(strace)
         flies, said = self._ready(begun), self._end(begun)
         if not flies:
@@ -187,20 +174,17 @@ class Board:
         strace = ["strace", "-o", "/dev/null", "-e", "trace=none", "-e", f"inject={fault}"]
         begun_s = time.monotonic()
         restarts, flies, status, said = 0, False, 0, ""
-        statuses = []
-        while not flies and status not in self._for_good and restarts <= _MOST_RESTARTS:
+        while not flies and status != _GROUNDED and restarts <= _MOST_RESTARTS:
             begun = self._begin([] if restarts else strace)
             flies = self._ready(begun)
             said += self._end(begun)
             status = begun.returncode
-            statuses += [] if flies else [status]
             restarts += not flies
         return {
             "flies": flies,
             "restarts": restarts,
             "waited": "cannot begin yet" in said,
             "status": None if flies else status,
-            "statuses": statuses,
             "said": said[-600:],
             "took_s": time.monotonic() - begun_s,
         }

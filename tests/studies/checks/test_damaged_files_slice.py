@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.studies.campaigns import damaged_files, link_start
+from tests.studies.campaigns import damaged_files
 from tests.studies.campaigns.damaged_files import DamagedBoard
 
 pytestmark = pytest.mark.skipif(
@@ -39,12 +39,3 @@ def test_a_launcher_without_a_second_copy_is_found_out(tmp_path: Path) -> None:
     fly = board.board.prefix / "bin/fly"
     flip = board.flip(fly, 8 * fly.read_bytes().index(b"exec ") + 1)
     assert flip["problems"] or not flip["reported"]
-
-
-def test_a_link_that_never_came_up_and_a_wrong_verdict_are_counted(tmp_path: Path) -> None:
-    start = {"fault": "read 3: EIO", "begun": True, "flies": True, "restarts": 0, "waited": False}
-    start |= {"status": None, "statuses": [], "said": "", "took_s": 1.0}
-    bad = start | {"flies": False, "restarts": 6, "status": 2, "statuses": [2]}
-    of = {"points": 9, "begun": 4}
-    facts = link_start.summarise([{"faults": [start, bad], "of": of}], tmp_path).facts
-    assert (facts["grounded"], facts["judged_wrong"]) == (1, ["read 3: EIO"])

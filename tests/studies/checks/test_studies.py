@@ -23,6 +23,13 @@ def test_a_study_gets_the_rest_of_the_line(name: str) -> None:
     assert "usage:" in done.stdout
 
 
+def test_help_lists_the_studies() -> None:
+    done = _run("--help")
+    assert done.returncode == 0
+    assert "usage: python -m tests.studies NAME" in done.stdout
+    assert "campaigns" in done.stdout
+
+
 def test_an_unknown_study_is_wrong_use_and_the_known_ones_are_listed() -> None:
     done = _run("nosuch")
     assert done.returncode == 2
