@@ -286,6 +286,8 @@ def password_in(folder: Path) -> str:
 
 
 _BUNDLE = "fprime_yamcs_bundle"
+_FRUGAL = ("-XX:TieredStopAtLevel=1", "-XX:+UseSerialGC")
+"""Options of Java for a process of one user: the fast compiler, and garbage collection in one thread."""
 
 
 def missing() -> str:
@@ -307,7 +309,7 @@ def class_path() -> str:
 
 def compile_link(folder: Path) -> None:
     """Compile the data link of the configuration in a folder. Raises FlightError with the compiler's text."""
-    compiler = ["java", "-XX:TieredStopAtLevel=1", "-XX:+UseSerialGC", "-cp", class_path()]
+    compiler = ["java", *_FRUGAL, "-cp", class_path()]
     compiler += ["-m", "jdk.compiler/com.sun.tools.javac.Main", "-proc:none"]
     command = [*compiler, "-d", str(folder), str(folder / LINK_SOURCE)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -318,7 +320,7 @@ def compile_link(folder: Path) -> None:
 def command_line(folder: Path) -> list[str]:
     """Return the command that starts Yamcs with the configuration in a folder."""
     places = ["--etc-dir", str(folder / "etc"), "--data-dir", str(folder / "data")]
-    flags = ["-Djava.awt.headless=true", "-Djava.net.preferIPv4Stack=true", "-XX:TieredStopAtLevel=1"]
+    flags = ["-Djava.awt.headless=true", "-Djava.net.preferIPv4Stack=true", *_FRUGAL]
     java = ["java", *flags, "-cp", f"{class_path()}:{folder}"]
     return [*java, "org.yamcs.YamcsServer", *places, "--no-color"]
 
