@@ -97,7 +97,7 @@ def test_an_undamaged_log_is_intact() -> None:
     assert result.intact
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.binary(max_size=200), st.binary(max_size=200), st.binary(max_size=200))
 def test_garbage_around_packets_costs_none_of_them(before: bytes, between: bytes, after: bytes) -> None:
     first, second = timing_packets(2)
@@ -106,7 +106,7 @@ def test_garbage_around_packets_costs_none_of_them(before: bytes, between: bytes
     assert result.skipped_bytes + result.truncated_bytes == len(before + between + after)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     st.lists(
         st.one_of(

@@ -102,7 +102,7 @@ def refused(*_: Any) -> list[Path]:
 
 
 @pytest.mark.usefixtures("folder")
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(chance=chances())
 def test_any_command_line_ends_with_a_status_and_a_reason(chance: Random) -> None:
     words = words_of(chance, chance.choice(NAMES))

@@ -164,7 +164,7 @@ def test_one_wrong_bit_of_each_codeblock_and_of_the_start_is_corrected(kind: str
 
 
 @given(seed=st.integers(0, 2**16), kind=st.sampled_from(["plain", "randomised"]), step=st.integers(1, 60))
-@settings(max_examples=60)
+@settings(max_examples=40)
 def test_cltus_are_found_among_noise_and_cut_units(seed: int, kind: str, step: int) -> None:
     draw = np.random.default_rng(seed)
     frames = [telecommand(int(draw.integers(7, 200)), seed + i) for i in range(4)]

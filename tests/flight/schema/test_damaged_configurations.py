@@ -59,7 +59,7 @@ def assert_finite(value: Any) -> None:
     assert not isinstance(value, float) or math.isfinite(value)
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(chance=chances())
 def test_a_damaged_configuration_is_refused_in_one_line_or_usable(chance: Random) -> None:
     tree = chance.choice(TREES)

@@ -21,7 +21,7 @@ FINITE = st.floats(allow_nan=False, allow_infinity=False)
 USUAL = st.floats(-0.25, 0.25)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     command=st.tuples(USUAL | FINITE, USUAL | FINITE, USUAL | FINITE),
     limit=st.sampled_from([0.148, 0.1, 0.0201, 1.0]),

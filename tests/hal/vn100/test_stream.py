@@ -53,7 +53,7 @@ noise = st.lists(
 
 
 @given(st.lists(st.tuples(noise, good), max_size=6), noise, st.lists(st.integers(1, 60), min_size=1))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_every_chunking_gives_the_same(
     parts: list[tuple[bytes, bytes]], tail: bytes, sizes: list[int]
 ) -> None:
@@ -72,7 +72,7 @@ def test_every_chunking_gives_the_same(
 
 
 @given(st.lists(st.tuples(noise, good), min_size=1, max_size=6))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_good_packets_are_found_behind_any_garbage(parts: list[tuple[bytes, bytes]]) -> None:
     parser = StreamParser()
     data = b"".join(itertools.chain.from_iterable(parts))
@@ -85,7 +85,7 @@ def test_good_packets_are_found_behind_any_garbage(parts: list[tuple[bytes, byte
 
 
 @given(st.binary(max_size=400))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_whatever_comes_nothing_is_raised_and_nothing_corrupt_passes(data: bytes) -> None:
     for item in StreamParser().feed(0, data):
         raw = encoded(item)

@@ -25,7 +25,7 @@ def _found_by_hand(key: FloatArray, low: float, high: float) -> list[int]:
     return [place for place, value in enumerate(key) if low <= value < high]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(drawn=_KEYS, ends=_ENDS, cells=st.one_of(st.none(), st.integers(1, 90)))
 def test_ranges_hold_the_keys_that_a_search_through_all_finds(
     drawn: FloatArray, ends: list[tuple[float, float]], cells: int | None
@@ -38,7 +38,7 @@ def test_ranges_hold_the_keys_that_a_search_through_all_finds(
         assert list(range(begin, end)) == _found_by_hand(key, low, high)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(drawn=_KEYS.filter(lambda key: len(key) > 1), first=st.integers(0, 59), last=st.integers(0, 59))
 def test_a_key_that_is_the_low_end_is_in_and_one_that_is_the_high_end_is_out(
     drawn: FloatArray, first: int, last: int

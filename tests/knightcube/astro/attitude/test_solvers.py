@@ -49,7 +49,7 @@ def _least_eigenvalue(seen: Sight) -> float:
     return float(np.linalg.eigvalsh(information(seen.observed, seen.sigma))[0] / np.sum(seen.sigma**-2.0))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(2, 30),

@@ -98,7 +98,7 @@ VALUES = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(KEYWORDS), VALUES), min_size=1, max_size=3))
 def test_a_wrong_value_in_a_header_is_read_or_named_in_one_line(changes: list[tuple[str, str]]) -> None:
     """A refusal names a changed keyword, its value, or the size of the image that follows from it."""
