@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.studies.campaigns.__main__ import campaigns
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -21,6 +24,15 @@ def test_a_study_gets_the_rest_of_the_line(name: str) -> None:
     done = _run(name, "--help")
     assert done.returncode == 0
     assert "usage:" in done.stdout
+
+
+def test_every_campaign_is_listed_and_loads_under_its_name() -> None:
+    listed = campaigns()
+    assert len(listed) > 40
+    for module, constant in (("faults", "FAULTS"), ("knowledge", "AGED_ELEMENTS"), ("knowledge", "CALENDAR")):
+        loaded = getattr(importlib.import_module(f"tests.studies.campaigns.{module}"), constant)
+        assert listed[loaded.name].load() is loaded
+        assert listed[loaded.name].purpose == loaded.purpose
 
 
 def test_help_lists_the_studies() -> None:
