@@ -229,6 +229,8 @@ class Hypothesis:
     Attributes:
         fit: the fitted limb.
         members: mask of the image's edges that lie on the fitted horizon (n,).
+        squares: squared distance of each edge from the fitted horizon in standard deviations (n,); infinite
+            for an edge away from the horizon, and NaN for an edge near it to which the horizon is not fitted.
         limb: limb points from the edges on the fitted horizon.
         residual: rms distance of the fitted edges from the limb, px.
         guess: initial guess from which the fit started.
@@ -248,6 +250,7 @@ class Hypothesis:
 
     fit: FittedLimb
     members: BoolArray
+    squares: FloatArray
     limb: LimbPoints
     residual: float
     guess: InitialGuess
@@ -287,6 +290,8 @@ def examine(
     members = near_limb(view, observation, settings.tolerance)
     used = np.zeros(len(observation.edges), dtype=bool)
     used[limb.index[fit.used]] = True
+    squares = np.where(members, np.nan, np.inf)
+    squares[limb.index] = (fit.residuals / limb.sigma) ** 2
     night = 0.0
     if sun is not None and np.any(members):
         night = float(np.mean(sun_elevation(view, observation.rays.rays[members], sun) < _NIGHT))
@@ -305,6 +310,7 @@ def examine(
     return Hypothesis(
         fit,
         used,
+        squares,
         select(limb, fit.used),
         float(np.sqrt(np.mean(residuals**2))),
         guess,

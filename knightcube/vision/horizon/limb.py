@@ -221,21 +221,6 @@ class Prior:
     altitude: float = UNKNOWN
 
 
-@dataclass(frozen=True, slots=True)
-class Misfit:
-    """Misfit of a fitted limb.
-
-    Attributes:
-        loss: chi-square of the edges by Huber's loss, for independent residuals.
-        correlation: factor by which correlation of the residuals increases the variance of their mean.
-        prior: chi-square of the prior.
-    """
-
-    loss: float
-    correlation: float
-    prior: float
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedLimb:
     """A limb fitted to edges.
@@ -245,14 +230,16 @@ class FittedLimb:
         covariance: covariance (5, 5) of the fitted parameters.
         residuals: angles of the edges from the fitted limb (n,), rad, positive outside the limb.
         used: mask of the edges that lie within five standard deviations of the limb (n,).
-        misfit: misfit of the edges and of the prior.
+        correlation: factor by which correlation of the residuals increases the variance of their mean.
+        prior: chi-square of the prior.
     """
 
     view: LimbView
     covariance: FloatArray
     residuals: FloatArray
     used: BoolArray
-    misfit: Misfit
+    correlation: float
+    prior: float
 
     @property
     def nadir_covariance(self) -> FloatArray:
@@ -293,20 +280,13 @@ def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior)
             return None
         last = float(np.max(np.abs(step[:3])))
     factor = _correlation_factor(view.nadir, rays[used], (residuals / sigma)[used])
-    loss = _huber_loss(np.minimum(np.abs(residuals / sigma), _BEYOND))
     # The weights include the median residual; a few large residuals increase the variances further.
     fitted = weights[used] * residuals[used] ** 2
     excess = max(1.0, float(np.sum(fitted)) / max(len(fitted) - 3, 1))
     covariance = _solved((normal - information) / (factor * excess) + information, np.eye(PARAMETERS))
     if covariance is None:
         return None
-    misfit = Misfit(loss, factor, float(moved @ information @ moved))
-    return FittedLimb(view, covariance, residuals, used, misfit)
-
-
-def _huber_loss(scaled: FloatArray) -> float:
-    """Return the sum of Huber's loss over absolute residuals (n,), in standard deviations."""
-    return float(np.sum(np.where(scaled < _HUBER, scaled**2, _HUBER * (2.0 * scaled - _HUBER))))
+    return FittedLimb(view, covariance, residuals, used, factor, float(moved @ information @ moved))
 
 
 def shared_error(

@@ -51,7 +51,6 @@ from knightcube.vision.horizon.limb import (
     UNKNOWN,
     FittedLimb,
     LimbView,
-    Misfit,
     Prior,
     fit_limb,
     shared_error,
@@ -126,7 +125,6 @@ class HorizonSolution:
         limb: unit vectors (k, 3) to the limb points on the best horizon, camera axes.
         limb_sigma: standard deviations of the limb points normal to the limb (k,), rad.
         view: position and attitude of the camera from the best fit, even if refused, or None without a fit.
-        misfit: misfit of the best fit, or None without a fit.
         pixels_read: number of pixels that the search read.
     """
 
@@ -139,7 +137,6 @@ class HorizonSolution:
     limb: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     limb_sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
     view: LimbView | None = None
-    misfit: Misfit | None = None
     pixels_read: int = 0
 
     def __bool__(self) -> bool:
@@ -167,7 +164,7 @@ _MOST_CHANCE = -6.0
 _BREADTH = 0.125, 2.0
 """Minimum and maximum ratio of the width of the limb's edges to the width expected from the air."""
 _OFF = 9.0
-"""Chi-square of an edge that lies on no horizon, in the comparison of horizons of different focal lengths."""
+"""Largest chi-square of an edge in the comparison of horizons of different focal lengths."""
 _GAIN = 1.5
 """Minimum ratio by which a second search on more scan lines must increase the number of horizon edges."""
 
@@ -225,6 +222,8 @@ _FIELD_STEPS: FloatArray = np.linspace(-2.5, 2.5, 11)
 """Trial focal lengths, in standard deviations from the most probable one."""
 _FIELD_ROUNDS, _RESOLVED = 4, 0.3
 """Maximum number of refinements of the trial focal lengths, and standard deviation that ends them."""
+_MOST_REFUSED = 0.5
+"""Probability of focal lengths whose horizon contradicts the image, above which the image is refused."""
 
 
 def nadir_of_uncertain_field(
@@ -239,8 +238,10 @@ def nadir_of_uncertain_field(
 
     The image is searched with eleven focal lengths, which are refined around the most probable ones. The
     weight of a horizon is the probability of its focal length and of its misfit. Nadir and altitude are the
-    weighted means of all horizons, and their uncertainties include the differences between the horizons. The
-    other arguments are those of `find_nadir`.
+    weighted means of all horizons, and their uncertainties include the differences between the horizons.
+    The brightness of the image does not determine the focal length: horizons that contradict the brightness
+    have their weight too, and the image is refused if they have most of the weight. The other arguments are
+    those of `find_nadir`.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     first = find_nadir(image, camera, knowledge, settings, hidden)
@@ -248,15 +249,18 @@ def nadir_of_uncertain_field(
         return first
     edges = settings.edges
     for lines in (edges.lines, edges.more_lines):
-        trial = replace(settings, edges=replace(edges, lines=lines))
-        found, weights = _by_field(image, camera, sigma, knowledge, trial, hidden)
-        if found and max(each.nadir.used for each in found if each.nadir) >= settings.enough_edges:
+        settings = replace(settings, edges=replace(edges, lines=lines))
+        trials, weights = _by_field(image, camera, sigma, knowledge, settings, hidden)
+        if max((each.nadir.used for each in trials if each.solution), default=0) >= settings.enough_edges:
             break
-    nadirs = [each.nadir for each in found if each.nadir is not None]
-    if not nadirs:
+    sound = np.array([bool(each.solution) for each in trials], dtype=bool)
+    if weights[sound].sum() <= _MOST_REFUSED:
+        if trials:
+            return trials[int(np.argmax(np.where(sound, 0.0, weights)))].solution
         reason = first.reason or "no limb is found with other fields of view within the uncertainty"
         status = HorizonStatus.REFUSED if first.nadir is not None else first.status
         return replace(first, status=status, reason=reason, nadir=None)
+    nadirs = [trial.nadir for trial in trials]
     directions = np.array([each.direction for each in nadirs])
     mean = weights @ directions
     mean /= np.linalg.norm(mean)
@@ -265,15 +269,30 @@ def nadir_of_uncertain_field(
     altitudes = np.array([[each.altitude, each.altitude_sigma] for each in nadirs])
     altitude = float(weights @ altitudes[:, 0])
     variance = float(weights @ (altitudes[:, 1] ** 2 + (altitudes[:, 0] - altitude) ** 2))
-    best = found[int(np.argmax(weights))]
+    best = trials[int(np.argmax(np.where(sound, weights, 0.0)))]
     nadir = replace(
-        nadirs[int(np.argmax(weights))],
+        best.nadir,
         direction=mean,
         covariance=covariance + (off * weights[:, None]).T @ off,
         altitude=altitude,
         altitude_sigma=math.sqrt(variance),
     )
-    return replace(best, nadir=nadir)
+    return replace(best.solution, nadir=nadir)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FieldTrial:
+    """The best horizon of a search with a trial focal length.
+
+    Attributes:
+        solution: result of the search, which may be a refusal.
+        nadir: nadir of the horizon, even if the horizon was refused.
+        horizon: the horizon.
+    """
+
+    solution: HorizonSolution
+    nadir: NadirMeasurement
+    horizon: Hypothesis
 
 
 def _by_field(
@@ -283,37 +302,44 @@ def _by_field(
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
     hidden: BoolArray | None,
-) -> tuple[list[HorizonSolution], FloatArray]:
-    """Return the horizons found with trial focal lengths, and their probabilities (k,)."""
+) -> tuple[list[_FieldTrial], FloatArray]:
+    """Return the horizons of trial focal lengths, and their probabilities (k,).
+
+    A focal length with which the limb contradicts prior knowledge is omitted.
+    """
     centre, width = 0.0, 1.0
-    found: list[HorizonSolution] = []
-    misfits: list[Misfit] = []
+    trials: list[_FieldTrial] = []
     weights = np.zeros(0)
     for _ in range(_FIELD_ROUNDS):
-        steps, found, misfits = [], [], []
+        steps, trials = [], []
         for step in centre + width * _FIELD_STEPS:
-            lens = camera.rescaled(math.exp(step * sigma))
-            solution = _search(image, lens, knowledge, settings, hidden).solution()
-            if solution.nadir is not None and solution.misfit is not None:
+            search = _search(image, camera.rescaled(math.exp(step * sigma)), knowledge, settings, hidden)
+            if search.hypotheses and not _contradiction(search.hypotheses[0]):
+                best = search.hypotheses[0]
                 steps.append(step)
-                found.append(solution)
-                misfits.append(solution.misfit)
-        if not found:
+                trials.append(_FieldTrial(search.solution(), search.measured(best), best))
+        if not trials:
             break
-        places, loss = np.array(steps), np.array([each.loss for each in misfits])
+        places = np.array(steps)
+        squares = np.array([each.horizon.squares for each in trials])
+        # Only edges whose distance from the horizon is known for all focal lengths are compared.
+        squares = np.minimum(squares[:, ~np.isnan(squares).any(axis=0)], _OFF)
+        loss = squares.sum(axis=1)
         # The best fit shows how much of the misfit and of its correlation is due to ground and clouds.
-        used = np.array([np.count_nonzero(each.on_horizon) for each in found])
-        best = int(np.argmin(loss - _OFF * used))
-        scatter = max(1.0, loss[best] / used[best]) * misfits[best].correlation
-        cost = places**2 + (loss - _OFF * used) / scatter + np.array([each.prior for each in misfits])
+        best_fit = int(np.argmin(loss))
+        on = squares[best_fit] < _OFF
+        mean = float(squares[best_fit][on].sum()) / max(int(np.count_nonzero(on)), 1)
+        scatter = max(1.0, mean) * trials[best_fit].horizon.fit.correlation
+        prior = np.array([each.horizon.fit.prior for each in trials])
+        cost = places**2 + loss / scatter + prior
         weights = np.exp(-0.5 * (cost - cost.min()))
         weights /= weights.sum()
         centre = float(weights @ places)
         spread = math.sqrt(float(weights @ (places - centre) ** 2))
-        if spread > _RESOLVED * width or len(found) == 1:
+        if spread > _RESOLVED * width or len(trials) == 1:
             break
         width = max(spread, 0.25 * width)
-    return found, weights
+    return trials, weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -350,10 +376,7 @@ class _Search:
             )
         status, reason = _judged(hypotheses)
         best, found = hypotheses[0], status is HorizonStatus.FOUND
-        measured = [
-            _measurement(each.fit, each.covariance, each.guess.place, self.altitudes, each.residual)
-            for each in hypotheses
-        ]
+        measured = [self.measured(each) for each in hypotheses]
         return HorizonSolution(
             status,
             reason,
@@ -364,9 +387,12 @@ class _Search:
             best.limb.rays,
             best.limb.sigma,
             best.fit.view,
-            best.fit.misfit,
             self.read,
         )
+
+    def measured(self, one: Hypothesis) -> NadirMeasurement:
+        """Return the nadir of a horizon."""
+        return _measurement(one.fit, one.covariance, one.guess.place, self.altitudes, one.residual)
 
 
 def _search(
@@ -471,12 +497,9 @@ def _is_limb(one: Hypothesis) -> bool:
 
 def _flaw(one: Hypothesis) -> str:
     """Return why a hypothesis is refused, or an empty string if it is accepted."""
+    if contradiction := _contradiction(one):
+        return contradiction
     light = one.lighting
-    if one.guess.orientation.mismatch > MOST_MISMATCH:
-        return f"the nadir contradicts a coarse direction by {one.guess.orientation.mismatch:.1f} sigma"
-    if one.altitude_off > _MOST_ALTITUDE:
-        altitude = one.fit.view.surface.height_of(one.fit.view.position)
-        return f"the limb implies an altitude of {1e-3 * altitude:.0f} km: give the altitude if this is right"
     if light.stray > _STRAY:
         return f"{100.0 * light.stray:.0f} % of the sky and the night side are bright"
     if one.coverage < _COVERED:
@@ -484,6 +507,16 @@ def _flaw(one: Hypothesis) -> str:
     if one.night > _NIGHT:
         return f"{100.0 * one.night:.0f} % of the horizon's points lie on the night side"
     return one.not_space
+
+
+def _contradiction(one: Hypothesis) -> str:
+    """Return how a hypothesis contradicts prior knowledge, or an empty string if it does not."""
+    if one.guess.orientation.mismatch > MOST_MISMATCH:
+        return f"the nadir contradicts a coarse direction by {one.guess.orientation.mismatch:.1f} sigma"
+    if one.altitude_off > _MOST_ALTITUDE:
+        altitude = one.fit.view.surface.height_of(one.fit.view.position)
+        return f"the limb implies an altitude of {1e-3 * altitude:.0f} km: give the altitude if this is right"
+    return ""
 
 
 def _measurement(
