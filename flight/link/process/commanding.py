@@ -476,8 +476,12 @@ def utc_of(text: str) -> int:
 
 
 def text_of(entry: Entry) -> str:
-    """Return the number, UTC and command of a schedule entry as text."""
-    return f"{entry.number}: {_utc(entry.at_ns)} {entry.command}"
+    """Return the number, UTC and command of a schedule entry as text, with angles in degrees."""
+    try:
+        text = command_of_words(entry.command).text
+    except CommandError:  # the entry was scheduled by another software release
+        text = entry.command
+    return f"{entry.number}: {_utc(entry.at_ns)} {text}"
 
 
 def _utc(utc_ns: int) -> str:

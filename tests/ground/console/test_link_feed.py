@@ -69,7 +69,7 @@ def test_the_forms_of_a_link_schedule_a_command_and_list_it(satellite: Satellite
     assert forms.text("schedule", given) == "at 2099-01-01T00:00:00: slew 0.2"
     assert answered(satellite, lambda: forms.obey("schedule", given))["obeyed"] == 1
     listed = answered(satellite, lambda: forms.obey("list-schedule", {}))
-    assert listed["text"] == "1: 2099-01-01T00:00:00Z slew 0.2; 1 scheduled"
+    assert listed["text"] == "1: 2099-01-01T00:00:00Z slew to q2 +0.2000; 1 scheduled"
     with pytest.raises(UsageError, match="new-key: no such command"):
         forms.text("new-key", {})
 

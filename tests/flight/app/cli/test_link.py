@@ -125,7 +125,7 @@ def test_a_command_is_scheduled_listed_and_deleted(
     assert command(lines, "udp", "schedule", "2099-01-01T00:00:00", "safe", "end", "of", "pass") == 0
     assert command(lines, "udp", "list-schedule") == 0
     shown = capsys.readouterr().out
-    assert "started: 1: 2099-01-01T00:00:00Z safe end of pass\ncompleted: 1 scheduled" in shown
+    assert "started: 1: 2099-01-01T00:00:00Z mode safe: end of pass\ncompleted: 1 scheduled" in shown
     assert command(lines, "udp", "unschedule", "1") == 0
     assert command(lines, "udp", "schedule", "1999-01-01T00:00:00", "ping") == 1
     assert "1999-01-01T00:00:00 has passed" in capsys.readouterr().out

@@ -82,6 +82,12 @@ def test_an_entry_of_another_release_that_fits_no_packet_is_reported_and_not_exe
     assert link.obeyed == []
 
 
+def test_the_list_shows_angles_in_degrees(link: BothEnds) -> None:
+    at = in_seconds(link, 60)
+    send(link, Scheduled(at, "point ground 0.9162979 0.2338741 nan nan 1.5707963"))
+    assert texts(link, send(link, Listing()))[1] == f"1: {at}Z point ground 52.5000 13.4000 deg, roll 90 deg"
+
+
 def test_a_scheduled_command_outlives_a_restart_and_is_executed_once_at_its_time(link: BothEnds) -> None:
     late = send(link, Scheduled(in_seconds(link, 60), "ping 7"))
     soon = send(link, Scheduled(in_seconds(link, 20), "ping 3"))
@@ -107,7 +113,7 @@ def test_a_time_that_passes_during_a_stop_is_reported_and_not_executed(link: Bot
     assert link.obeyed == []
     assert link.stages(counter)[-1] == "failed"
     assert texts(link, counter)[-1].startswith("not executed, it is ")
-    assert texts(link, counter)[-1].endswith("slew 0.2")
+    assert texts(link, counter)[-1].endswith("slew to q2 +0.2000")
     assert texts(link, send(link, Listing()))[-1] == "0 scheduled"
 
 
