@@ -3,9 +3,9 @@
 `python -m ground.xtce [--epoch UTC] [--verified] > knightcube.xml`
 
 The document uses only features that the known clients read. The document has one flat space system, one
-parameter per array element (`rate_1`), names without `. / : [ ]`, zero-terminated texts, and a header of
-fixed values in each telecommand. A parameter is named `<packet>_<field>`. Yamcs counts mission time from the
-epoch in the document.
+parameter per array element (`rate_1`) and per bit of a bit field (`health_facts_gyro_lost`), names without
+`. / : [ ]`, zero-terminated texts, and a header of fixed values in each telecommand. A parameter is named
+`<packet>_<field>`. Yamcs counts mission time from the epoch in the document.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from flight.link.commands import LAYOUTS as COMMANDS
 from flight.link.process.commanding import Stage
 from flight.link.process.directives import LAYOUTS as DIRECTIVES
 from flight.link.process.directives import NEW_KEY, PORTION
-from flight.link.telemetry.definitions import STAGES, Field
+from flight.link.telemetry.definitions import NO_YES, STAGES, Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
 
 SPACE = "KnightCube"
@@ -32,6 +32,8 @@ TELECOMMANDS = {
 _XTCE = "http://www.omg.org/spec/XTCE/20180204"
 EPOCH = "2000-01-01T00:00:00"
 _BITS_OF = {"u1": 8, "u2": 16, "u4": 32, "u8": 64, "i8": 64, "f4": 32, "f8": 64}
+UNUSED = "_spare"
+"""End of the name of a parameter for the unused bits of a bit field."""
 _PRIMARY = (
     ("VERSION", 3),
     ("TYPE", 1),
@@ -83,10 +85,34 @@ def document(
 
 
 def spread(layout: Layout) -> Iterator[tuple[str, Field]]:
-    """Yield the name and the field of each parameter of a packet, with array elements numbered from 1."""
+    """Yield the name and the field of each parameter of a packet.
+
+    Array elements are numbered from 1. Each named bit of a bit field is a parameter, so that it can have an
+    alarm of its own.
+    """
     for field in layout.packet.fields:
         base = f"{layout.packet.name}_{field.name}"
-        yield from ((base if field.count == 1 else f"{base}_{i + 1}", field) for i in range(field.count))
+        if field.bits:
+            yield from ((f"{layout.packet.name}_{bit.name}", bit) for bit in _bits_of(field))
+        else:
+            yield from ((base if field.count == 1 else f"{base}_{i + 1}", field) for i in range(field.count))
+
+
+def _bits_of(field: Field) -> Iterator[Field]:
+    """Yield a field for the unused bits of a bit field, and one for each named bit, the highest bit first."""
+    spare = _size(field.kind) - len(field.bits)
+    levels = dict(field.alarms)
+    if spare:
+        yield Field(f"{field.name}{UNUSED}", f"b{spare}", "-", "unused bits")
+    for bit, label in reversed(field.bits):
+        alarms = ((1, levels[bit]),) if bit in levels else ()
+        name = f"{field.name}_{label.replace('-', '_')}"
+        yield Field(name, "b1", "-", f"{label}, one of the {field.meaning}", states=NO_YES, alarms=alarms)
+
+
+def _size(kind: str) -> int:
+    """Return the number of bits of a number; the kind `b3` has three bits."""
+    return int(kind[1:]) if kind.startswith("b") else _BITS_OF[kind]
 
 
 def _add_headers(types: Element, parameters: Element, epoch: str) -> None:
@@ -144,13 +170,13 @@ def _add_type(types: Element, name: str, field: Field, role: str) -> None:
     elif field.states:
         _add_enumeration(types, name, field, role)
     elif kind.startswith("f"):
-        bits = str(_BITS_OF[kind])
+        bits = str(_size(kind))
         number = SubElement(types, f"Float{role}Type", {"name": name, "sizeInBits": bits})
         _add_unit(number, field.unit)
         SubElement(number, "FloatDataEncoding", {"sizeInBits": bits, "encoding": "IEEE754_1985"})
         _add_ranges(number, field, role)
     else:
-        number = _add_integer(types, name, kind[0], _BITS_OF[kind], role, field.unit)
+        number = _add_integer(types, name, kind[0], _size(kind), role, field.unit)
         _add_ranges(number, field, role)
 
 
@@ -163,7 +189,7 @@ def _add_text_encoding(text: Element, size: int) -> None:
 
 def _add_enumeration(types: Element, name: str, field: Field, role: str) -> None:
     states = SubElement(types, f"Enumerated{role}Type", {"name": name})
-    bits = str(_BITS_OF[field.kind])
+    bits = str(_size(field.kind))
     SubElement(states, "IntegerDataEncoding", {"sizeInBits": bits, "encoding": "unsigned"})
     listed = SubElement(states, "EnumerationList")
     for number, label in field.states:

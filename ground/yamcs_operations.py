@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
 from flight.link.telemetry.packets import LAYOUTS
-from ground.xtce import SPACE, spread
+from ground.xtce import SPACE, UNUSED, spread
 
 if TYPE_CHECKING:
     from ground.passes import OrbitPrediction, Pass, Station
@@ -69,7 +69,7 @@ def stacks_and_displays() -> Mapping[str, str]:
             "advancement": advancement,
         }
         found[f"{STACKS}/{name}.ycs"] = json.dumps(stack, indent=2) + "\n"
-    shown = [f"/{SPACE}/{name}" for name, _ in spread(LAYOUTS["health"])]
+    shown = [f"/{SPACE}/{name}" for name, _ in spread(LAYOUTS["health"]) if not name.endswith(UNUSED)]
     display = {"$schema": f"{_SCHEMA}/parameter-table.schema.json", "scroll": False, "parameters": shown}
     found[f"{DISPLAYS}/health.par"] = json.dumps(display, indent=2) + "\n"
     return found

@@ -36,6 +36,7 @@ DOOR = Packet(
             "leaf", "u1", "-", "of each side", 2, states=((0, "shut"), (7, "ajar")), alarms=((7, "fault"),)
         ),
         Field("gap", "f4", "mm", "between the leaves", limits=Limits(warning=(-1.5, 2.0))),
+        Field("locks", "u1", "-", "closed", bits=((0, "top"), (1, "low-end")), alarms=((1, "warning"),)),
     ),
 )
 
@@ -75,7 +76,7 @@ def test_the_document_is_valid_by_the_schema_of_the_omg(schema: etree.XMLSchema,
 
 def test_a_field_with_states_appears_everywhere_from_its_row_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     layouts = compile_layouts([DOOR])
-    raw = Packer(layouts).pack(DOOR, 5, leaf=[7, 0], gap=1.5)
+    raw = Packer(layouts).pack(DOOR, 5, leaf=[7, 0], gap=1.5, locks=0b10)
     text = document(layouts, {})
     types = found(fromstring(text), "x:TelemetryMetaData/x:ParameterTypeSet")
     assert found(types, ".//x:Enumeration[@value='7']").get("label") == "ajar"
@@ -83,6 +84,13 @@ def test_a_field_with_states_appears_everywhere_from_its_row_alone(monkeypatch: 
     assert found(types, ".//x:WarningRange").attrib == {"minInclusive": "-1.5", "maxInclusive": "2"}
     read = definition_of(text).parse_bytes(raw)
     assert (read["door_leaf_1"], read["door_leaf_2"], read["door_gap"]) == ("ajar", "shut", 1.5)
+    assert (read["door_locks_low_end"], read["door_locks_top"], read["door_locks_spare"]) == ("yes", "no", 0)
+    alarms = {
+        each.get("name"): [alarm.attrib for alarm in each.iter(f"{{{SPACE['x']}}}EnumerationAlarm")]
+        for each in types
+    }
+    assert alarms["door_locks_low_end_Type"] == [{"alarmLevel": "warning", "enumerationLabel": "yes"}]
+    assert alarms["door_locks_top_Type"] == []
     monkeypatch.setattr(documentation, "LAYOUTS", layouts)
     assert "of each side; 0 shut, 7 ajar (fault)" in documentation.markdown()
     field = documentation.database()["packets"][0]["fields"][0]

@@ -18,6 +18,7 @@ from typing import Any
 import space_packet_parser as other
 from space_packet_parser.xtce.definitions import XtcePacketDefinition
 
+from flight.link.telemetry.definitions import Field
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import LAYOUTS, Layout, to_text
 from ground.telemetry import scan
@@ -66,8 +67,15 @@ def _wanted(layout: Layout, row: Any, raw: bytes) -> dict[str, Any]:
     flat: list[Any] = []
     for field in layout.packet.fields:
         value = to_text(row[field.name]) if field.kind.startswith("S") else row[field.name].tolist()
-        flat += value if field.count > 1 else [value]
+        flat += single_bits(field, value) if field.bits else value if field.count > 1 else [value]
     return values | dict(zip((name for name, _ in spread(layout)), flat, strict=True))
+
+
+def single_bits(field: Field, value: int) -> list[int]:
+    """Return the number in the unused bits of a bit field, if any, and its named bits from the highest."""
+    used, size = len(field.bits), 8 * int(field.kind[1:])
+    spare = [value >> used] if size > used else []
+    return spare + [value >> bit & 1 for bit in reversed(range(used))]
 
 
 def _alike(read: Any, wanted: Any) -> bool:

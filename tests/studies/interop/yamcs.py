@@ -40,6 +40,7 @@ from ground.xtce import spread
 from ground.yamcs import write
 from tests.studies.interop.sockets import beyond_loopback
 from tests.support.linked_flight import LinkedFlight, free_port, linked_flight
+from tests.support.xtce_fields import single_bits
 from tests.support.yamcs_server import Yamcs, missing, serving, troubles
 
 _CONFIGS = Path(__file__).resolve().parents[3] / "config"
@@ -201,6 +202,10 @@ def _columns(layout: Layout, rows: PacketArray) -> dict[str, list[Any]]:
     names = iter(spread(layout))
     for field in layout.packet.fields:
         column = rows[field.name]
+        if field.bits:
+            for values in zip(*(single_bits(field, value) for value in column.tolist()), strict=True):
+                found[next(names)[0]] = list(values)
+            continue
         for i in range(field.count):
             values = column if field.count == 1 else column[:, i]
             text = field.kind.startswith("S")
