@@ -66,7 +66,7 @@ def _wanted(layout: Layout, row: Any, raw: bytes) -> dict[str, Any]:
     }
     flat: list[Any] = []
     for field in layout.packet.fields:
-        value = to_text(row[field.name]) if field.kind.startswith("S") else row[field.name].tolist()
+        value: Any = to_text(row[field.name]) if field.kind.startswith("S") else row[field.name].tolist()
         flat += single_bits(field, value) if field.bits else value if field.count > 1 else [value]
     return values | dict(zip((name for name, _ in spread(layout)), flat, strict=True))
 

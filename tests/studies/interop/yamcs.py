@@ -203,8 +203,8 @@ def _columns(layout: Layout, rows: PacketArray) -> dict[str, list[Any]]:
     for field in layout.packet.fields:
         column = rows[field.name]
         if field.bits:
-            for values in zip(*(single_bits(field, value) for value in column.tolist()), strict=True):
-                found[next(names)[0]] = list(values)
+            for bits in zip(*(single_bits(field, value) for value in column.tolist()), strict=True):
+                found[next(names)[0]] = list(bits)
             continue
         for i in range(field.count):
             values = column if field.count == 1 else column[:, i]
