@@ -425,6 +425,7 @@ class CoilMonitor:
         self._probe = Probe(settings.probe_current, settings.probe_half_ns, coils)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
+        self._responses = [response for response in (self._response, self._slow) if response is not None]
         self._self_test: SelfTest | None = None
         if self._slow is not None and settings.slow is not None and settings.self_test is not None:
             self._self_test = SelfTest(self._slow, settings.slow.rate_noise, settings.self_test)
@@ -458,6 +459,11 @@ class CoilMonitor:
         return np.array([axis not in broken for axis in range(len(self._trials))])
 
     @property
+    def has_resting(self) -> bool:
+        """Whether any axis is kept at zero current because its sign changed too often."""
+        return bool(self._rests)
+
+    @property
     def resting(self) -> BoolArray:
         """Flags (n,) of the axes that are kept at zero current because their sign changed too often."""
         return np.array([axis in self._rests for axis in range(len(self._trials))])
@@ -465,8 +471,9 @@ class CoilMonitor:
     @property
     def suspicion(self) -> str:
         """The reason why a coil is suspected; empty while all readings are consistent with healthy coils."""
-        rests = "; ".join(why for _, why in self._rests.values())
-        return self._unknown or rests
+        if not self._rests:
+            return self._unknown
+        return self._unknown or "; ".join(why for _, why in self._rests.values())
 
     @property
     def doubts_currents(self) -> bool:
@@ -692,10 +699,6 @@ class CoilMonitor:
     def monitor_doubted(self) -> str:
         """The reason why the current monitor is considered wrong; empty while it is trusted."""
         return self._witness.doubt
-
-    @property
-    def _responses(self) -> list[CoilResponse]:
-        return [response for response in (self._response, self._slow) if response is not None]
 
     @property
     def _settle_ns(self) -> int:

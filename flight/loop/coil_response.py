@@ -237,8 +237,20 @@ class CoilResponse:
         spreads = [_GAIN_PRIOR] * coils + [settings.torsion] * count + [settings.damping] * count
         spreads += [1.0] * len(self._modes)
         self._prior: FloatArray = 1.0 / np.array(spreads) ** 2
+        self._prior_matrix: FloatArray = np.diag(self._prior)
         # Prior weight (inverse variance) of a healthy coil's gain, whose error is uniform within a bound.
-        self._healthy = 3.0 / max(settings.errors.coil_gain, _LEAST_GAIN_ERROR) ** 2
+        healthy = np.full(coils, 3.0 / max(settings.errors.coil_gain, _LEAST_GAIN_ERROR) ** 2)
+        # The hypotheses: all gains are free, one is free, none is free, and one coil is reversed.
+        each = np.eye(coils, dtype=bool)
+        self._prior_weights: FloatArray = np.concatenate(
+            [
+                self._prior[None, :coils],
+                np.where(each, self._prior[:coils], healthy),
+                np.tile(healthy, (coils + 1, 1)),
+            ]
+        )
+        self._expected: FloatArray = np.ones((2 * coils + 2, coils))
+        self._expected[coils + 2 :][each] = -1.0
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0,) * coils)])
         self._known_ns = 0
         self._last_ns = 0
@@ -415,12 +427,13 @@ class CoilResponse:
 
         Bins from before a fault would hide the fault from a fit over all bins.
         """
-        whole = self._solved(list(self._rows), span)
+        rows = np.array(self._rows)
+        whole = self._solved(rows, span)
         self.fastest = max(self._speeds)
         self.gain, self.sigma, self._weights = whole.gain, whole.sigma, whole.weights
-        fits, count = [whole], len(self._rows) // 2
+        fits, count = [whole], len(rows) // 2
         while count >= self._settings.least_bins:
-            fits.append(self._solved(list(self._rows)[-count:], span))
+            fits.append(self._solved(rows[-count:], span))
             count //= 2
         # The gain of a coil that has just failed differs between the whole window and its newest half.
         newest = fits[min(1, len(fits) - 1)]
@@ -433,31 +446,24 @@ class CoilResponse:
             alone, is_steady = bool(whole.alone[axis]), bool(steady[axis])
             self._count(axis, whole.possible, alone=alone, is_reversed=bool(shown), is_steady=is_steady)
 
-    def _solved(self, rows: Sequence[FloatArray], span: float) -> MotionFit:
+    def _solved(self, rows: FloatArray, span: float) -> MotionFit:
         """Fit all gains freely, and fit each gain with the other coils assumed healthy.
 
         `rows` (m, f, n + 3 + k) are those of m neighbouring bins, and `span` is the time (s) from bin to bin.
         """
         count, coils = len(self._free), self._count_of_coils
         matrix, outputs = self._inputs_and_outputs(rows, span)
-        normal, right = matrix.T @ matrix + np.diag(self._prior), matrix.T @ outputs
+        normal, right = matrix.T @ matrix + self._prior_matrix, matrix.T @ outputs
         # Eliminate the nuisance parameters, which leaves one equation for each gain.
-        prior, rest = self._prior[:coils], right[coils:]
+        rest = right[coils:]
         others = np.linalg.inv(normal[coils:, coils:])
         coupling = others @ normal[coils:, :coils]
         gains = GainEquations(
-            normal[:coils, :coils] - np.diag(prior) - normal[:coils, coils:] @ coupling,
+            normal[:coils, :coils] - self._prior_matrix[:coils, :coils] - normal[:coils, coils:] @ coupling,
             right[:coils] - rest @ coupling,
             float(outputs @ outputs - rest @ others @ rest),
         )
-        # The hypotheses: all gains are free, one is free, none is free, and one coil is reversed.
-        healthy, each = np.full(coils, self._healthy), np.eye(coils, dtype=bool)
-        weights = np.concatenate(
-            [prior[None], np.where(each, prior, healthy), np.tile(healthy, (coils + 1, 1))]
-        )
-        expected = np.ones((len(weights), coils))
-        expected[coils + 2 :][each] = -1.0
-        fits = gains.solve(weights, expected)
+        fits = gains.solve(self._prior_weights, self._expected)
         free_cost = float(fits.costs[0])
         spread = max(1.0, free_cost / max(len(outputs) - count - coils, 1))
         # If a gain is impossible even within its uncertainty, the model is wrong.
@@ -482,7 +488,7 @@ class CoilResponse:
             tuple(is_reversed),
         )
 
-    def _inputs_and_outputs(self, rows: Sequence[FloatArray], span: float) -> tuple[FloatArray, FloatArray]:
+    def _inputs_and_outputs(self, rows: FloatArray, span: float) -> tuple[FloatArray, FloatArray]:
         """Return the inputs (m f, p) of p fit parameters and the whitened accelerations (m f,) of m bins."""
         count, coils = len(self._free), self._count_of_coils
         white = self._whitened(rows, span)
@@ -524,15 +530,16 @@ class CoilResponse:
             counts = self._in_a_row[finding]
             counts[axis] = counts[axis] + 1 if holds else 0
 
-    def _whitened(self, bins: Sequence[FloatArray], span: float) -> FloatArray:
+    def _whitened(self, rows: FloatArray, span: float) -> FloatArray:
         """Return the rows (m, f, n + 3 + k) of m bins, with noise of variance 1 and without a constant part.
 
         The noise of the mean rate of a bin enters two differences of neighbouring bins with opposite signs.
         """
-        settings, rows = self._settings, np.array(bins)
+        settings = self._settings
         # The span is rounded to ns, so that equal spans use the stored matrix.
         variance = (settings.rate_noise / round(span, 9)) ** 2 / settings.bin_samples
-        return np.tensordot(_whitening(len(rows), settings.model_error**2, variance), rows, 1)
+        whitening = _whitening(len(rows), settings.model_error**2, variance)
+        return np.asarray((whitening @ rows.reshape(len(rows), -1)).reshape(rows.shape))
 
 
 @functools.lru_cache(maxsize=64)
@@ -630,11 +637,13 @@ class CoilCorrection:
             healthy coil, -1 for a reversed coil.
         deviations: relative standard deviations (n,) of the estimated gains; zero for coils without an
             estimated gain.
+        sizes: absolute values of the factors, n floats.
     """
 
     def __init__(self, coils: int = 3) -> None:
         """Start with `coils` healthy coils."""
         self.factors: FloatArray = np.ones(coils)
+        self.sizes: tuple[float, ...] = (1.0,) * coils
         self.deviations: FloatArray = np.zeros(coils)
         self._changes: list[list[int]] = [[] for _ in range(coils)]  # times (ns) of the changes of sign
         self._unreviewed: set[int] = set()
@@ -692,6 +701,7 @@ class CoilCorrection:
             number = f"not {len(self.factors)} factors"
             return f"{factors.tolist()}: {number} from {LEAST_GAIN:g} to 1 or with the opposite sign"
         self.factors, self.deviations = factors.copy(), deviations.copy()
+        self.sizes = tuple(sizes.tolist())
         return ""
 
     def confirm(self, axis: int) -> None:
@@ -705,6 +715,7 @@ class CoilCorrection:
     def _multiply(self, axis: int, factor: float) -> None:
         self.factors = self.factors.copy()
         self.factors[axis] *= factor
+        self.sizes = tuple(np.abs(self.factors).tolist())
 
 
 _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}

@@ -181,16 +181,15 @@ class CoilDrive:
         currents.
         """
         watch, settings = self._watch, self._settings
-        usable = self.available & ~watch.resting
-        factors = np.abs(watch.correction.factors)
-        limits = self._limits * factors
+        sizes = watch.correction.sizes
         # A weak coil reaches its limit at a smaller effective current.
-        limited = self._share < 1.0 or bool((factors < 1.0).any())
-        beyond = limited and bool((np.abs(currents) > limits).any())
-        if (beyond or not all(usable.tolist())) and currents.any():
+        limited = self._share < 1.0 or min(sizes) < 1.0
+        beyond = limited and bool((np.abs(currents) > self._limits * sizes).any())
+        whole = not watch.has_resting and self.available.all()
+        if (beyond or not whole) and currents.any():
             # The usable axes share the torque that was commanded for all axes.
             # While the field is unknown, each usable axis keeps its own current.
-            known = field()
+            known, usable, limits = field(), self.available & ~watch.resting, self._limits * sizes
             if known is None:
                 currents = np.clip(np.where(usable, currents, 0.0), -limits, limits)
             else:

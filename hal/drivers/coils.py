@@ -450,8 +450,9 @@ class PwmTorqueCoils:
             largest_counts(step, min(settings.current_limit, coil.current_limit))
             for coil, step in zip(settings.coils, self._steps, strict=True)
         )
+        self._signs = tuple(coil.sign for coil in settings.coils)
         # mean current (A) of one count, with the sign of the coil
-        self._signed = tuple(coil.sign * step for coil, step in zip(settings.coils, self._steps, strict=True))
+        self._signed = tuple(sign * step for sign, step in zip(self._signs, self._steps, strict=True))
         self._mailbox = CommandMailbox(clock, round(settings.stale_after * 1e9), len(settings.coils))
         self._outputs = CoilOutputs(pca, clock, settings, self._mailbox.lock)
         self._running = False
@@ -497,11 +498,18 @@ class PwmTorqueCoils:
                 ticker.kick()
             raise problem
         command: tuple[float, ...] = tuple(values.tolist())
-        counts = [self._counts(axis, current) for axis, current in enumerate(command)]
+        counts: list[int] = []
+        saturated = False
+        for current, step, largest, sign in zip(
+            command, self._steps, self._largest, self._signs, strict=True
+        ):
+            count, limited = counts_for(current, step, largest)
+            counts.append(count * sign)
+            saturated = saturated or limited
         with self._mailbox.lock:
             if ticker is None or not self._running:
                 raise Refused(DEVICE, "a command before start() or after close()")
-            self._mailbox.put(command, tuple(count for count, _ in counts), any(cut for _, cut in counts))
+            self._mailbox.put(command, tuple(counts), saturated)
         ticker.kick()
 
     def brake(self, axes: Axes) -> None:
@@ -575,10 +583,6 @@ class PwmTorqueCoils:
                 bound = mean_current(self._largest[axis], self._steps[axis])
                 return OutOfRange(DEVICE, f"current of coil {COIL_NAMES[axis]}", value, -bound, bound, "A")
         return None
-
-    def _counts(self, axis: int, current: float) -> tuple[int, bool]:
-        counts, limited = counts_for(current, self._steps[axis], self._largest[axis])
-        return counts * self._settings.coils[axis].sign, limited
 
     def _try_zero(self) -> bool:
         return self._outputs.zero(self._mailbox.braked)

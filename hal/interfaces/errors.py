@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from types import TracebackType
 
 
 class DeviceError(Exception):
@@ -19,13 +19,28 @@ class NotResponding(DeviceError):
     """Raised if a device does not answer, for example because a port is closed or a bus hangs."""
 
 
-@contextmanager
-def answering(device: str) -> Iterator[None]:
+class _Answering:
+    """The context manager of `answering`, a class because a generator would be several times as slow."""
+
+    __slots__ = ("_device",)
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, OSError):
+            text = f"{error.strerror}; check its power, wiring and address"
+            raise NotResponding(self._device, text) from error
+
+
+def answering(device: str) -> _Answering:
     """Return a context manager that converts an OSError of the bus into NotResponding of the device."""
-    try:
-        yield
-    except OSError as error:
-        raise NotResponding(device, f"{error.strerror}; check its power, wiring and address") from error
+    return _Answering(device)
 
 
 class CorruptData(DeviceError):

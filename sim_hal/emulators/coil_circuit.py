@@ -83,7 +83,9 @@ class Chopping(NamedTuple):
         (whole_0, part_0), (whole_1, part_1) = periods
         total = 0.0
         for bridge, current in self.drawn:
-            for begin, end in bridge.driven() if current else ():
+            if not current or bridge.a == bridge.b:
+                continue
+            for begin, end in bridge.driven():
                 at_0, at_1 = (min(max(part * COUNTS - begin, 0.0), end - begin) for part in (part_0, part_1))
                 total += current * ((whole_1 - whole_0) * (end - begin) + at_1 - at_0)
         return total * self.period_ns / COUNTS
@@ -134,6 +136,7 @@ class CoilCondition(Enum):
     B_LOW = "b-low"
 
 
+_SOUND = CoilCondition.SOUND
 _FREE: tuple[Pulse | None, Pulse | None] = (None, None)
 _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
     CoilCondition.A_HIGH: (_HIGH, None),
@@ -169,7 +172,7 @@ class CoilCircuit:
         self.chip = chip
         self._coils = tuple(
             (
-                coil,
+                (coil.channel_a, coil.channel_b),
                 sum(1 << channel for channel in coil.channels),
                 coil.sign * truth.supply_voltage / coil.resistance / COUNTS,
                 min(truth.current_limit, coil.current_limit, truth.supply_voltage / coil.resistance),
@@ -206,12 +209,11 @@ class CoilCircuit:
 
     def update(self, written: int) -> None:
         """Update the currents after a STOP. The bit mask `written` contains the written PWM channels."""
-        count = len(self._coils)
+        count, high = len(self._coils), self.chip.high
         draws = self._generator.random(count).tolist() if written else [0.5] * count
-        for axis, (coil, channels, step, limit) in enumerate(self._coils):
+        for axis, ((channel_a, channel_b), channels, step, limit) in enumerate(self._coils):
             stuck_a, stuck_b = self._stuck[axis]
-            pulse_a = stuck_a or self.chip.high(coil.channel_a)
-            bridge = Bridge(pulse_a, stuck_b or self.chip.high(coil.channel_b))
+            bridge = Bridge(stuck_a or high(channel_a), stuck_b or high(channel_b))
             if bridge == self._bridges[axis] and not written & channels:
                 continue
             self._bridges[axis] = bridge
@@ -221,13 +223,15 @@ class CoilCircuit:
                 current = counts * step + self._uncertainty * (2.0 * draws[axis] - 1.0)
                 current = min(limit, max(-limit, current))
                 drawn = abs(current) * COUNTS / abs(counts)
-            match self._conditions[axis]:
-                case CoilCondition.OPEN:
-                    current, drawn = 0.0, 0.0
-                case CoilCondition.SHORTED:
-                    current, drawn = 0.0, self._supply_voltage / self._short_ohm[axis]
-                case CoilCondition.REVERSED:
-                    current = -current
+            condition = self._conditions[axis]
+            if condition is _SOUND:
+                pass
+            elif condition is CoilCondition.OPEN:
+                current, drawn = 0.0, 0.0
+            elif condition is CoilCondition.SHORTED:
+                current, drawn = 0.0, self._supply_voltage / self._short_ohm[axis]
+            elif condition is CoilCondition.REVERSED:
+                current = -current
             self._drawn[axis] = drawn
             self._values[axis] = current
         self._currents = np.array(self._values)

@@ -142,12 +142,12 @@ class EmulatedI2cBus:
         At most one fault acts on a chip in a transaction. A bit flip changes the data that are read. In a
         transaction without reads, a bit flip changes the data that are written after the register byte.
         """
-        reads = any(message.count is not None for message in messages)
         given: list[bytes] = []
         parts: list[I2cPart] = []
         fault: _Fault | None = None
         address = -1
         with self._lock:
+            reads = bool(self._faults) and any(message.count is not None for message in messages)
             for message in messages:
                 if message.address != address:
                     address = message.address
@@ -156,8 +156,10 @@ class EmulatedI2cBus:
                         self._deliver(parts, address, b"" if reads else message.data[: fault.after])
                         self._fail(fault, address)
                 if message.count is None:
-                    written = message.data if reads else _flipped(message.data, fault, 1)
+                    written = message.data if reads or fault is None else _flipped(message.data, fault, 1)
                     self._deliver(parts, address, written)
+                elif fault is None and len(parts) == 1:
+                    given.append(parts[0].read(message.count))
                 else:
                     # The bus is open drain, so zero bits dominate if several chips answer.
                     answers = zip(*(part.read(message.count) for part in parts), strict=True)

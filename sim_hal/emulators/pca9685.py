@@ -46,6 +46,8 @@ _WRITABLE[MODE2] = 0x1F
 _WRITABLE[0x02:0x06] = b"\xfe" * 4
 _WRITABLE[LED0_ON_L:_LED_END] = b"\xff\x1f\xff\x1f" * CHANNELS
 _WRITABLE[PRE_SCALE] = 0xFF
+_WITHOUT_PULSES = SLEEP | EXTERNAL_CLOCK
+"""Bits of MODE1 of which each stops the outputs."""
 
 _POWER_ON = bytearray(256)
 """Content of each register after power-on."""
@@ -101,7 +103,7 @@ class EmulatedPca9685:
     def frequency(self) -> float:
         """PWM frequency (Hz), 0 while the oscillator is off."""
         # No external clock is wired to the EXTCLK pin.
-        if self._registers[MODE1] & (SLEEP | EXTERNAL_CLOCK):
+        if self._registers[MODE1] & _WITHOUT_PULSES:
             return 0.0
         return OSCILLATOR_HZ / (COUNTS * (self._registers[PRE_SCALE] + 1))
 
@@ -171,7 +173,7 @@ class EmulatedPca9685:
         registers = self._registers
         base = LED0_ON_L + 4 * channel
         off_high = registers[base + 3]
-        if off_high & FULL or registers[MODE1] & (SLEEP | EXTERNAL_CLOCK) or self._halted >> channel & 1:
+        if off_high & FULL or registers[MODE1] & _WITHOUT_PULSES or self._halted >> channel & 1:
             return 0, 0
         on_high = registers[base + 1]
         if on_high & FULL:
@@ -184,7 +186,10 @@ class EmulatedPca9685:
 
     def _store_run(self, pointer: int, values: bytes) -> int:
         end = pointer + len(values)
-        self._registers[pointer:end] = bytes(map(int.__and__, values, _WRITABLE[pointer:end]))
+        # One long number instead of a loop over the bytes.
+        writable = int.from_bytes(_WRITABLE[pointer:end], "big")
+        kept = int.from_bytes(values, "big") & writable
+        self._registers[pointer:end] = kept.to_bytes(len(values), "big")
         self._pointer = end if end < _LED_END else 0
         first, last = (pointer - LED0_ON_L) >> 2, (end - 1 - LED0_ON_L) >> 2
         return (1 << last + 1) - (1 << first)

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -204,7 +204,19 @@ class BinaryOutput:
 
     def pack(self, now: MessageData) -> bytes:
         """Return the packet that contains the data of one time."""
-        return self.layout.pack(now.values(" ".join(BINARY_FIELDS[key] for key in self.layout.fields)))
+        return self.layout.pack(now.values(_quantities(self.layout.fields)))
+
+
+@lru_cache(maxsize=64)
+def _quantities(fields: tuple[tuple[int, int], ...]) -> str:
+    """Return the names of the quantities in binary fields, which are given as group bit and field bit."""
+    return " ".join(BINARY_FIELDS[key] for key in fields)
+
+
+@lru_cache(maxsize=64)
+def _windows(register: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the filter lengths of magnetometer, accelerometer and gyro in the fields of register 85."""
+    return tuple(int(text) for text in register[:3])
 
 
 def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
@@ -744,7 +756,7 @@ class Vn100Emulator:
     # Output.
 
     def _sample(self, now_ns: int) -> Vn100Sample:
-        windows = tuple(self.registers.integer(85, index) for index in range(3))
+        windows = _windows(self.registers.values[85])
         sample = self._attitude.turned(self._sensors.measure(self._sense(now_ns), windows))
         return sample if self.alter is None else self.alter(sample)
 

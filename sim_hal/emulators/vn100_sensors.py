@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -195,7 +196,7 @@ class MessageData:
 
     def values(self, names: str) -> Values:
         """Return the values of quantities whose names are separated by spaces."""
-        return tuple(value for name in names.split() for value in _QUANTITIES[name][0](self))
+        return tuple(value for read in _readers(names) for value in read(self))
 
     def text(self, names: str) -> list[str]:
         """Return the values of named quantities as text in the unit's format."""
@@ -236,6 +237,13 @@ _QUANTITIES: Mapping[str, tuple[Callable[[MessageData], Values], str]] = {
     "delta_velocity": (_vector(lambda now: now.sample.accel * now.interval), "%+08.3f"),
 }
 """Function and ASCII format of each quantity; delta angles are in degrees and delta velocities in m/s."""
+
+
+@lru_cache(maxsize=64)
+def _readers(names: str) -> tuple[Callable[[MessageData], Values], ...]:
+    """Return the functions that read the quantities whose names are separated by spaces."""
+    return tuple(_QUANTITIES[name][0] for name in names.split())
+
 
 BINARY_FIELDS: Mapping[tuple[int, int], str] = {
     (0, 0): "time",

@@ -389,7 +389,7 @@ class Recovery:
 
 TESLA_PER_GAUSS = 1e-4
 _UNIT_NORM_TOLERANCE = 1e-2
-_NO_RATE = (math.nan, math.nan, math.nan)
+_ZERO_RATE = (0.0, 0.0, 0.0)
 _CERTAIN = 4  # unexpected samples or messages after which the unit counts as misconfigured
 _ODD_TIME_NS = 5_000_000_000  # time without an unexpected message after which their count begins again
 _ANSWERS = frozenset(
@@ -434,7 +434,12 @@ class ReadingConverter:
         self._settings = settings
         matrices = (settings.gyro_matrix, settings.field_matrix)
         gyro, magnetometer = (np.asarray(np.linalg.inv(matrix), dtype=float) for matrix in matrices)
-        self._rate_map, self._field_map = gyro @ settings.mounting, magnetometer @ settings.mounting
+        # One product maps a whole sample: quaternion, rate, magnetic field and acceleration.
+        self._map: FloatArray = np.zeros((13, 13))
+        self._map[:4, :4] = settings.attitude_map
+        self._map[4:7, 4:7] = gyro @ settings.mounting
+        self._map[7:10, 7:10] = magnetometer @ settings.mounting * TESLA_PER_GAUSS
+        self._map[10:, 10:] = settings.mounting
         self._field_offset = magnetometer @ settings.field_bias
         self._byte_ns = byte_ns
         self._on_reset = on_reset
@@ -481,10 +486,11 @@ class ReadingConverter:
             finite = math.isfinite(sum(rate))
             self.out_of_range += finite
             self.not_finite += not finite
-            rate = _NO_RATE
-        # One common array is faster than an array for each quantity.
-        values = np.array((*q, *rate, *mag, *accel))
-        quaternion = settings.attitude_map @ values[:4]
+            rate = _ZERO_RATE
+        values = self._map @ np.array((*q, *rate, *mag, *accel))
+        if not has_rate:
+            values[4:7] = math.nan
+        quaternion = values[:4]
         # Of the two equivalent signs of the quaternion, the sign with a positive scalar part is returned.
         quaternion /= math.copysign(norm, quaternion[3])
         length = item.layout.length if isinstance(item, BinaryPacket) else item.length
@@ -493,9 +499,9 @@ class ReadingConverter:
             arrival_ns=item.arrival_ns,
             device_time_ns=device_ns,
             quaternion=quaternion,
-            rate=self._rate_map @ values[4:7],
-            field=self._field_map @ values[7:10] * TESLA_PER_GAUSS - self._field_offset,
-            acceleration=settings.mounting @ values[10:],
+            rate=values[4:7],
+            field=values[7:10] - self._field_offset,
+            acceleration=values[10:],
         )
 
     def _fault(self, *sample: tuple[float, ...]) -> str:
