@@ -185,11 +185,11 @@ class CoilDrive:
         # A weak coil reaches its limit at a smaller effective current.
         limited = self._share < 1.0 or min(sizes) < 1.0
         beyond = limited and bool((np.abs(currents) > self._limits * sizes).any())
-        whole = not watch.has_resting and self.available.all()
-        if (beyond or not whole) and currents.any():
+        usable = self.available & ~watch.resting
+        if (beyond or not usable.all()) and currents.any():
             # The usable axes share the torque that was commanded for all axes.
             # While the field is unknown, each usable axis keeps its own current.
-            known, usable, limits = field(), self.available & ~watch.resting, self._limits * sizes
+            known, limits = field(), self._limits * sizes
             if known is None:
                 currents = np.clip(np.where(usable, currents, 0.0), -limits, limits)
             else:

@@ -35,6 +35,9 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Sequence
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -314,18 +317,49 @@ def give_back() -> None:
         trim(0)
 
 
-def lean_numpy() -> None:
-    """Prevent scipy from importing unused parts of numpy, which saves 11 MiB and 0.2 s in each process.
+_ARRAY_API = "scipy._lib._array_api"
 
-    In scipy/_lib/array_api_compat, scipy copies every name that numpy lists, and so imports numpy's masked
-    arrays, test support and Fortran reader. This function must be called before scipy is imported. The
-    function removes these modules from numpy's list of names; they can still be imported explicitly. With a
-    different version of numpy, the function may have no effect.
+
+class _WithoutTables(MetaPathFinder):
+    """Import hook by which scipy adds no table of array libraries to the docstrings of its functions.
+
+    Parsing and writing 170 docstrings takes two thirds of the time in which `scipy.special` is imported.
+    """
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return a spec of scipy's module `_array_api` whose decorator changes no docstring."""
+        if name != _ARRAY_API:
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def without_tables(module: ModuleType) -> None:
+                execute(module)
+                if hasattr(module, "xp_capabilities"):
+                    vars(module)["xp_capabilities"] = lambda **_: lambda function: function
+
+            vars(spec.loader)["exec_module"] = without_tables
+        return spec
+
+
+def lean_imports() -> None:
+    """Make the import of scipy light, which saves 11 MiB and 0.3 s of processor time in each process.
+
+    This function must be called before scipy is imported. In scipy/_lib/array_api_compat, scipy copies every
+    name that numpy lists, and so imports numpy's masked arrays, test support and Fortran reader. The function
+    removes these modules from numpy's list of names; they can still be imported explicitly. The function also
+    keeps scipy from extending its docstrings. With different versions of numpy and scipy, the function may
+    have no effect.
     """
     np.__all__ = [name for name in np.__all__ if name not in _SELDOM]
     lazy = getattr(np, "__numpy_submodules__", None)
     if isinstance(lazy, set):
         lazy -= _SELDOM
+    if _ARRAY_API not in sys.modules and not any(isinstance(one, _WithoutTables) for one in sys.meta_path):
+        sys.meta_path.insert(0, _WithoutTables())
 
 
 def main(arguments: list[str]) -> None:
@@ -336,7 +370,7 @@ def main(arguments: list[str]) -> None:
     os.nice(5)  # the control loop has priority
     if cores:
         os.sched_setaffinity(0, map(int, cores.split(",")))
-    lean_numpy()
+    lean_imports()
     home = importlib.import_module(module)
     if (prepare := getattr(home, "prepare", None)) is not None:
         prepare()

@@ -133,9 +133,9 @@ def _obey(words: Sequence[str]) -> int:
         _complete(parser)
         options = parser.parse_args(words)
         if "numpy" in sys.modules:
-            from flight.loop.worker import lean_numpy  # noqa: PLC0415 - a command without numpy needs none of it
+            from flight.loop.worker import lean_imports  # noqa: PLC0415 - a command without numpy needs none of it
 
-            lean_numpy()
+            lean_imports()
         status: int = options.command(options)
     finally:
         sys.stdout.flush()

@@ -87,6 +87,7 @@ class PathGuidance:
         self._rules = rules
         self._arrives = arrives
         self._path: PolynomialPath | None = None
+        self._sampled: tuple[PolynomialPath, int, PathSample] | None = None
         self._planned_ns: int | None = None
         self._target_q2: float | None = None
         self._target_rate = 0.0
@@ -158,7 +159,13 @@ class PathGuidance:
 
     def sample(self, now_ns: int) -> PathSample | None:
         """Return the commanded motion at `now_ns`; None without a path."""
-        return None if self._path is None else self._path.sample(now_ns)
+        path = self._path
+        if path is None:
+            return None
+        # A control cycle asks several times for the same instant.
+        if self._sampled is None or self._sampled[0] is not path or self._sampled[1] != now_ns:
+            self._sampled = path, now_ns, path.sample(now_ns)
+        return self._sampled[2]
 
     def state(self, now_ns: int) -> GuidanceState:
         """Return whether a path is being followed or the end of a path is held now."""
