@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
@@ -328,9 +329,7 @@ class StarRenderer:
 
     def __init__(self, camera: Camera, sky: SkySection, seed: int) -> None:
         self._model = camera_model(camera, sky)
-        catalogue = load().brighter_than(sky.magnitude_limit)
-        self._directions = catalogue.directions_at(sky.year)
-        self._magnitudes = catalogue.magnitude
+        self._directions, self._magnitudes = _stars(sky.magnitude_limit, sky.year)
         self._seed = seed
 
     def render(
@@ -341,6 +340,15 @@ class StarRenderer:
 
         generator = np.random.default_rng([self._seed, sequence])
         return render(self._model, self._directions, self._magnitudes, times, attitudes, generator, tracks)
+
+
+@lru_cache(maxsize=2)
+def _stars(magnitude_limit: float, year: float) -> tuple[FloatArray, FloatArray]:
+    """Return ICRS directions (n, 3) and Johnson V magnitudes (n,) of the stars up to a limit, read-only."""
+    catalogue = load().brighter_than(magnitude_limit)
+    directions = catalogue.directions_at(year)
+    directions.setflags(write=False)
+    return directions, catalogue.magnitude
 
 
 def inline_exposure(renderer: StarRenderer) -> Expose:
