@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+import numpy.typing as npt
 from scipy.special import erfcx, ndtri
 
 from hal.interfaces.errors import OutOfRange, check_limits
@@ -201,34 +201,62 @@ _SOFT = 0.1
 """Width of the transition at a coast or a cloud edge, in standard deviations of the noise."""
 
 
-def albedo(directions: FloatArray, seed: int) -> Float32Array:
+def albedo(directions: FloatArray | Float32Array, seed: int) -> Float32Array:
     """Return the ground's albedo (n,) below Earth-fixed unit directions (n, 3)."""
     places = np.ascontiguousarray(directions.T, dtype=np.float32)
-    places *= _RADIUS
-    places += 0.5 * _CELLS
-    land, cloud = (
-        _covered(volume, places, share)
-        for volume, share in zip(_volumes(seed), (LAND_SHARE, CLOUD_SHARE), strict=True)
-    )
+    places *= np.float32(_RADIUS)
+    places += np.float32(0.5 * _CELLS)
+    heights = _read(_noise(seed), places * np.float32(_MAGNIFICATION))
+    heights *= np.float32(_FINE)
+    heights += _read(_noise(seed), places)
+    heights /= np.float32(math.hypot(1.0, _FINE))
+    land, cloud = _covered(heights.real, LAND_SHARE), _covered(heights.imag, CLOUD_SHARE)
     ground = OCEAN + (LAND - OCEAN) * land
     return np.asarray(ground + (CLOUD - ground) * cloud)
 
 
-def _covered(volume: Float32Array, places: Float32Array, share: float) -> Float32Array:
-    """Return the cover by land or cloud (n,), from 0 to 1, at `places` (3, n); its mean is `share`."""
-    coarse = _read(volume, places)
-    fine = _read(volume, places * np.float32(_MAGNIFICATION))
-    height = (coarse + _FINE * fine) / np.hypot(1.0, _FINE)
-    return np.asarray(np.clip((height - ndtri(1.0 - share)) / _SOFT + 0.5, 0.0, 1.0), dtype=np.float32)
+def _covered(heights: Float32Array, share: float) -> Float32Array:
+    """Return the cover by land or cloud (n,), from 0 to 1, where a noise is (n,); its mean is `share`."""
+    above = (heights - np.float32(ndtri(1.0 - share))) / np.float32(_SOFT) + np.float32(0.5)
+    return np.asarray(np.clip(above, 0.0, 1.0))
 
 
-def _read(volume: Float32Array, places: Float32Array) -> Float32Array:
-    return np.asarray(map_coordinates(volume, places, order=1, mode="grid-wrap"))
+def _read(noise: npt.NDArray[np.complex64], places: Float32Array) -> npt.NDArray[np.complex64]:
+    """Return the periodic noise (n,), interpolated linearly between the cells, at `places` (3, n) in cells.
+
+    The land's noise is the real part and the cloud's the imaginary part, so that both are read at once.
+    """
+    low = np.floor(places)
+    along, across, up = places - low
+    i, j, k = low.astype(np.int32) % _CELLS
+    rows = [column % _CELLS * _CELLS for column in (j, j + 1)]
+    layers = [layer % _CELLS * _CELLS**2 for layer in (i, i + 1)]
+    after = (k + 1) % _CELLS
+
+    def line(layer: IntArray, row: IntArray) -> npt.NDArray[np.complex64]:
+        base = layer + row
+        return _between(noise.take(base + k), noise.take(base + after), up)
+
+    faces = [_between(line(layer, rows[0]), line(layer, rows[1]), across) for layer in layers]
+    return _between(faces[0], faces[1], along)
+
+
+def _between(
+    before: npt.NDArray[np.complex64], after: npt.NDArray[np.complex64], share: Float32Array
+) -> npt.NDArray[np.complex64]:
+    """Return the linear interpolation (n,) between two values (n,), which overwrites `after`."""
+    after -= before
+    after *= share
+    after += before
+    return after
 
 
 @lru_cache(maxsize=4)
-def _volumes(seed: int) -> tuple[Float32Array, Float32Array]:
-    """Return two periodic volumes of independent noise, of unit variance, for land and for cloud."""
+def _noise(seed: int) -> npt.NDArray[np.complex64]:
+    """Return two periodic volumes of independent noise of unit variance, as one flat array.
+
+    The real part is the noise of the land, and the imaginary part the noise of the clouds.
+    """
     across = np.fft.fftfreq(_CELLS, 1.0 / _CELLS).astype(np.float32)
     wave = np.sqrt(across[:, None, None] ** 2 + across[None, :, None] ** 2 + across**2)
     amplitude = np.where(wave >= 1.5, np.maximum(wave, 1.5) ** _SLOPE, 0.0)
@@ -238,7 +266,8 @@ def _volumes(seed: int) -> tuple[Float32Array, Float32Array]:
     # The transform of white noise is white noise, with independent real and imaginary parts.
     noise = np.fft.ifftn(white * amplitude)
     land, cloud = noise.real, noise.imag
-    return (land / land.std()).astype(np.float32), (cloud / cloud.std()).astype(np.float32)
+    whole = land / land.std() + 1j * (cloud / cloud.std())
+    return np.asarray(whole.astype(np.complex64).reshape(-1))
 
 
 TOP = 120e3
@@ -310,35 +339,44 @@ def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> F
     `sight` holds the intersections of the rays with the Earth.
     """
     result = np.zeros(len(rays), dtype=np.float32)
+    axes = semi_axes().astype(np.float32)[:, None]
     seen = np.flatnonzero(sight.heights < TOP)
-    places = sight.places.T
-    normals = _unit((places[:, seen] / semi_axes()[:, None]).T)
-    to_earth = scene.earth_matrix @ scene.camera_matrix.T
+    places = _chosen(sight.places.T, seen)
+    normals = _unit(places / axes)
+    to_camera = scene.camera_matrix @ scene.earth_matrix.T
     distance = float(np.linalg.norm(scene.sun))
     sun = scene.in_earth(scene.sun / distance)
-    sunward = normals @ sun
-    lit = np.flatnonzero(sunward > _DARKEST)
-    seen, normals = seen[lit], normals.T[:, lit].T
-    solar = sunward[lit].astype(np.float32)
-    directions = rays.T[:, seen].T
-    upward = np.maximum(-np.sum(directions.T * (to_earth.T @ normals.T), axis=0), 0.0).astype(np.float32)
+    solar = sun.astype(np.float32) @ normals
+    lit = np.flatnonzero(solar > _DARKEST)
+    if len(lit) < len(seen):
+        seen, solar, places, normals = seen[lit], solar[lit], places[:, lit], normals[:, lit]
+    directions = _chosen(rays.T, seen)
+    upward = np.maximum(-np.sum(directions * (to_camera.astype(np.float32) @ normals), axis=0), 0.0)
     # The cosine of the scattering angle is 1 (forward scattering) for a line of sight towards the Sun.
-    turned = (directions @ (to_earth.T @ sun)).astype(np.float32)
+    turned = (to_camera @ sun).astype(np.float32) @ directions
     air, hits = scene.atmosphere, sight.hits[seen]
     bottom = np.exp(-sight.heights[seen] / air.scale_height)
     depth = np.where(hits, air.slant_depth(upward), air.limb_depth * bottom)
     towards = air.slant_depth(solar)
     light = air.phase(turned) * air.scattered(depth, bottom, towards)
     ground = np.flatnonzero(hits & (solar > 0.0))
-    beneath = _unit((places[:, seen[ground]] * semi_axes()[:, None]).T)
-    matt = albedo(beneath, scene.texture) * solar[ground]
+    beneath = _unit(places[:, ground] * axes)
+    matt = albedo(beneath.T, scene.texture) * solar[ground]
     light[ground] += matt * np.exp(-depth[ground] - towards[ground])
     result[seen] = light * np.float32((ASTRONOMICAL_UNIT / distance) ** 2)
     return result
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+def _chosen(vectors: FloatArray, at: IntArray) -> Float32Array:
+    """Return the columns `at` of vectors (3, n) as 32-bit numbers."""
+    coarse = vectors.astype(np.float32)
+    return coarse if len(at) == vectors.shape[1] else coarse[:, at]
+
+
+def _unit(vectors: Float32Array) -> Float32Array:
+    """Return vectors (3, n) with unit length."""
+    x, y, z = vectors
+    return np.asarray(vectors / np.sqrt(x * x + y * y + z * z))
 
 
 RIM_DARKENING = 0.6

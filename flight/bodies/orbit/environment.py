@@ -194,6 +194,8 @@ class EstimatedEnvironment:
         self._fixed_ns = 0
         self._near: Ephemeris | None = None
         self._near_sigma = 0.0
+        # Field, pressures of air and light, and visible fraction of the Sun at the times of the prediction.
+        self._near_table: FloatArray = np.zeros((0, 10))
         self.refused = 0
 
     @property
@@ -250,16 +252,20 @@ class EstimatedEnvironment:
         return self._state(self.julian_date(now_ns))
 
     def at(self, now_ns: int) -> FilterEnvironment | None:
-        """Return field, position, pressures and sunlight, or None while the orbit is unknown."""
+        """Return field, position, pressures and sunlight, or None while the orbit is unknown.
+
+        The pressures are interpolated linearly over `STEP`, in which their directions rotate by 0.01 rad. The
+        interpolated pressures are at most 2e-5 too small.
+        """
         near, times = self._prediction(now_ns)
         if near is None:
             return None
-        shape = pressures(near, times)
+        values = near.interpolated(self._near_table, times)
         return FilterEnvironment(
-            near.field_at(times)[0],
+            values[0, 0:3],
             near.position_at(times)[0],
-            Pressures(shape.air, shape.light),
-            float(near.sunlit_at(times)[0]),
+            Pressures(values[:, 3:6], values[:, 6:9]),
+            float(values[0, 9]),
             math.hypot(self.field_sigma(now_ns), self._displaced_field(near)),
         )
 
@@ -335,6 +341,9 @@ class EstimatedEnvironment:
             state = self._state(date)
             near = None if state is None else predict(state, BEHIND + AHEAD)
             self._near = near
+            if near is not None:
+                shape = pressures(near, near.times)
+                self._near_table = np.column_stack([near.field, shape.air, shape.light, near.sunlit])
             self._near_sigma = 0.0 if state is None or self._recent(date) is not None else state.sigma
             seconds = BEHIND if near is None else self._seconds_into(near, now_ns)
         return near, np.array([seconds])

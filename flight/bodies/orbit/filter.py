@@ -19,16 +19,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flight.bodies.orbit.environment import StuckFieldCheck
+from flight.bodies.orbit.propagation import EstimatePropagation
 from flight.bodies.orbit.steps import DipoleHistory, FilterStep, OpenStep, RateByField
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_matrix, cross_product
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_product
 from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
 from knightcube.gnc.control.coil_map import CoilMap
-from knightcube.gnc.estimation import estimate as form
 from knightcube.gnc.estimation import free_filter as states
 from knightcube.gnc.estimation.error_state import PriorCheck
-from knightcube.gnc.estimation.estimate import FIELD_BIAS, Estimate, Knowledge, Parameters
+from knightcube.gnc.estimation.estimate import Estimate, Knowledge
 from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
 from knightcube.gnc.estimation.free_filter import (
     FilterEnvironment,
@@ -44,7 +44,6 @@ from knightcube.gnc.estimation.measurements import (
     MeanRateMeasurement,
     Measurement,
 )
-from knightcube.gnc.estimation.rigid_body import by_matrix
 
 FORGOTTEN_NS = 10_000_000_000
 """Time (ns) without a contradicting gyro after which the commanded dipoles are trusted again."""
@@ -370,117 +369,6 @@ class StepReplay:
         if isinstance(measurement, FieldMeasurement):
             return free.field(measurement.field, measurement.reference, measurement.covariance)
         return free.gyro(measurement.rate, measurement.covariance)
-
-
-_FROM = np.r_[states.ATTITUDE, states.RATE, states.GYRO, states.MAGNET]
-_TO = np.r_[form.ATTITUDE, form.RATE, form.BIAS, form.FIELD_BIAS]
-_PICKED, _PLACED = np.ix_(_FROM, _FROM), np.ix_(_TO, _TO)
-_MOVING = np.r_[states.ATTITUDE, states.RATE, states.COILS, states.CAMERA]
-_MOVED, _CAMERA = np.ix_(_MOVING, _MOVING), slice(15, 18)
-_MOTION = np.ix_(*2 * [np.r_[form.ATTITUDE, form.RATE]])
-_SIZE = FIELD_BIAS.stop
-_PARAMETERS, _NONE = Parameters(), np.zeros(3)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Beginning:
-    """An estimate at the end of a step, with terms that are computed once for all its propagations.
-
-    Attributes:
-        spread: covariance (19, 19) of the estimate, with the states in the order of the loop's estimates.
-        moving: covariance (18, 18) of attitude, rate, coils and misalignment of the star camera.
-        field, residual: magnetic field (3,), T, and satellite's residual dipole (3,), A m^2, in body axes.
-    """
-
-    around: FilterEnvironment
-    memory: FreeMemory
-    spread: FloatArray
-    moving: FloatArray
-    field: FloatArray
-    residual: FloatArray
-
-
-class EstimatePropagation:
-    """Propagates a filter's estimates to times within a filter step, in about 0.1 ms for each estimate."""
-
-    def __init__(self, free: FreeFilter) -> None:
-        self._free = free
-        self._newest: _Beginning | None = None
-        self._changes = -1
-
-    def now(
-        self, time_ns: int, seconds: float, dipole: FloatArray, around: FilterEnvironment, measured_ns: int
-    ) -> Estimate:
-        """Return the newest estimate, propagated by `seconds` under a dipole (3,), A m^2."""
-        free, newest = self._free, self._newest
-        if newest is None or self._changes != free.changes or newest.around is not around:
-            newest = self._beginning(free.memory(), around)
-            self._newest, self._changes = newest, free.changes
-        return self._carry(newest, time_ns, seconds, dipole, measured_ns)
-
-    def then(
-        self, memory: FreeMemory, time_ns: int, seconds: float, dipole: FloatArray, around: FilterEnvironment
-    ) -> Estimate:
-        """Return an earlier estimate, propagated by `seconds` under a dipole (3,), A m^2."""
-        return self._carry(self._beginning(memory, around), time_ns, seconds, dipole, time_ns)
-
-    def _beginning(self, memory: FreeMemory, around: FilterEnvironment) -> _Beginning:
-        constants, spread = memory.constants, np.zeros((_SIZE, _SIZE))
-        spread[_PLACED] = memory.covariance[_PICKED]
-        field = attitude_matrix(memory.quaternion) @ around.field
-        residual = constants[states.DIPOLE] + around.sunlit * constants[states.SUNLIT]
-        return _Beginning(around, memory, spread, memory.covariance[_MOVED], field, residual)
-
-    def camera_covariance(self, seconds: float, dipole: FloatArray, around: FilterEnvironment) -> FloatArray:
-        """Return the attitude covariance (3, 3), rad^2, of the star camera, propagated by `seconds`."""
-        begun = self._beginning(self._free.memory(), around)
-        moved, grown = self._motion(begun, seconds, dipole)[2:]
-        rows = moved[0:3].copy()
-        rows[:, _CAMERA] += _EYE
-        return np.asarray(rows @ begun.moving @ rows.T + seconds**2 / 3.0 * grown)
-
-    def _motion(
-        self, begun: _Beginning, seconds: float, dipole: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return rotation (4,), rate (3,), transition matrix (6, 18) of the errors, and rate noise (3, 3).
-
-        The midpoint rule is used, because rate and torque change their directions during a step.
-        """
-        motion, half, rate = self._free.motion, 0.5 * seconds, begun.memory.rate
-        whole = dipole + begun.memory.constants[states.COILS].reshape(3, 3) @ dipole + begun.residual
-        first = motion.acceleration(rate, cross_product(whole, begun.field))
-        field = attitude_matrix(from_rotation_vector(half * (rate + 0.5 * half * first))) @ begun.field
-        middle = rate + half * first
-        acceleration = motion.acceleration(middle, cross_product(whole, field))
-        after = rate + seconds * acceleration
-        turn = rate + seconds / 6.0 * (first + 2.0 * acceleration + 0.5 * cross_product(rate, after))
-        rotation = from_rotation_vector(seconds * turn)
-        moved = np.zeros((6, len(_MOVING)))
-        moved[0:3, 0:3], moved[0:3, 3:6] = attitude_matrix(rotation), seconds * _EYE
-        moved[3:6, 3:6] = _EYE + seconds * motion.stiffness(middle)
-        by_coils = -seconds * (motion.inverse @ cross_matrix(field)) @ by_matrix(dipole)
-        moved[0:3, 6:15], moved[3:6, 6:15] = half * by_coils, by_coils
-        return rotation, after, moved, seconds * self._free.rate_noise(dipole, begun.around)
-
-    def _carry(
-        self, begun: _Beginning, time_ns: int, seconds: float, dipole: FloatArray, measured_ns: int
-    ) -> Estimate:
-        rotation, after, moved, grown = self._motion(begun, seconds, dipole)
-        spread, among = begun.spread.copy(), moved @ begun.moving @ moved.T
-        among[0:3, 0:3] += seconds**2 / 3.0 * grown
-        among[3:6, 3:6] += grown
-        spread[_MOTION] = among
-        return Estimate(
-            time_ns=time_ns,
-            quaternion=multiply(rotation, begun.memory.quaternion),
-            rate=after,
-            bias=begun.memory.constants[states.GYRO],
-            disturbance=_NONE,
-            parameters=_PARAMETERS,
-            covariance=spread,
-            measured_ns=measured_ns,
-            field_bias=begun.memory.constants[states.MAGNET],
-        )
 
 
 FIELD_STRENGTH = 5e-5

@@ -71,18 +71,19 @@ class Ephemeris:
 
     def field_at(self, times: FloatArray) -> FloatArray:
         """Return the geomagnetic field (m, 3), T, at times (m,), s."""
-        return self._linear(self.field, times)
+        return self.interpolated(self.field, times)
 
     def sun_at(self, times: FloatArray) -> FloatArray:
         """Return the unit vectors (m, 3) from the satellite to the Sun at times (m,), s."""
-        towards = self._linear(self.sun, times) - self.position_at(times)
+        towards = self.interpolated(self.sun, times) - self.position_at(times)
         return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
 
     def sunlit_at(self, times: FloatArray) -> FloatArray:
         """Return the visible fraction (m,) of the Sun's disc at times (m,), s."""
-        return self._linear(self.sunlit[:, None], times)[:, 0]
+        return self.interpolated(self.sunlit[:, None], times)[:, 0]
 
-    def _linear(self, values: FloatArray, times: FloatArray) -> FloatArray:
+    def interpolated(self, values: FloatArray, times: FloatArray) -> FloatArray:
+        """Return values (m, k) at times (m,), s, interpolated linearly between values (n, k) at `times`."""
         before, share, _ = self._interval(times)
         s = share[:, None]
         return np.asarray((1.0 - s) * values[before] + s * values[before + 1])

@@ -115,10 +115,14 @@ class FieldRate:
         self._prior = inertia_covariance(self._assumed, settings.errors)
         self._gate = (settings.gate_sigma + 1.0) ** 2
         self.restarts = 0
+        self._is_reset = False  # whether nothing has changed since the last reset
         self.restart()
 
     def restart(self) -> None:
         """Reset the filter, but keep the count of restarts."""
+        if self._is_reset:
+            return
+        self._is_reset = True
         self._waiting: list[tuple[float, FloatArray]] = []
         self._since = 0.0
         self._refused = self._gyro_refused = 0
@@ -177,6 +181,7 @@ class FieldRate:
 
     def advance(self, dipole: FloatArray, seconds: float) -> None:
         """Propagate the state by `seconds` under a dipole moment (3,) A m^2 of the coils, body axes."""
+        self._is_reset = False
         self._since += seconds
         if self._rate is None:
             return
@@ -199,6 +204,7 @@ class FieldRate:
         """
         if not np.all(np.isfinite(field)):
             return False
+        self._is_reset = False
         if self._rate is None:
             self._start(field)
             return True
@@ -226,6 +232,7 @@ class FieldRate:
         an estimate that used the gyro, the filter restarts.
         """
         settings = self._settings
+        self._is_reset = False
         self._propagate_covariance()
         covariance = self._covariance
         if self._rate is None or self._gyro_refused >= settings.refusals or not np.all(np.isfinite(rate)):
@@ -245,6 +252,7 @@ class FieldRate:
     def _restart_counted(self, exclude_gyro: bool) -> None:
         """Restart and count it."""
         self.restart()
+        self._is_reset = False
         self._gyro_refused = self._settings.refusals if exclude_gyro else 0
         self.restarts += 1
 

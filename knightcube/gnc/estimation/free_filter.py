@@ -41,13 +41,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import (
-    FloatArray,
-    IntArray,
-    cross_matrix,
-    cross_product,
-    tangent_basis,
-)
+from knightcube.astro.arrays import FloatArray, IntArray, cross_matrix, cross_product, tangent_basis
 from knightcube.astro.earth.disturbance import AIR, SIZES, Pressures, box_areas, shapes
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.quaternion import (
@@ -829,26 +823,35 @@ class FreeFilter:
         relative = spread.diagonal()[:3] * (self.motion.trace / self.motion.inertia.diagonal()) ** 2
         return np.asarray(2.0 * CURVATURE * float(relative.max()) * (by_inertia @ spread @ by_inertia.T))
 
-    def rate_noise(self, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0) -> FloatArray:
+    def rate_noise(
+        self,
+        dipole: FloatArray,
+        around: FilterEnvironment,
+        doubt: float = 0.0,
+        then: FreeMemory | None = None,
+        motion: FreeMotion | None = None,
+    ) -> FloatArray:
         """Return the noise density (3, 3) of the angular acceleration, rad^2/s^3.
 
         The noise density depends on the coils' dipole (3,) A m^2, on the error of the field model, and on the
         standard deviation `doubt` (A m^2) of an uncertain dipole. Errors of a dipole cause no torque along
-        the field, but the error of the field model does.
+        the field, but the error of the field model does. The estimate is `then`, and the equation of motion
+        is `motion`; by default both are the present ones.
         """
-        settings, motion, square = self._settings, self.motion, float(dipole @ dipole)
+        settings, motion, square = self._settings, motion or self.motion, float(dipole @ dipole)
+        at = then or self
         coils = LASTING * (settings.coil_error**2 * square / 3.0 + doubt**2)
         coils += settings.coil_noise**2 if square else 0.0
         density = settings.torque_noise**2 * motion.by_torque
         if coils:
-            field = attitude_matrix(self.quaternion) @ around.field
+            field = attitude_matrix(at.quaternion) @ around.field
             across = motion.inverse @ cross_matrix(field)
             density = density + coils * (across @ across.T)
         if square:
             across = motion.inverse @ cross_matrix(dipole)
             # In a rotating body, the two components of the field's error across the rate average out.
-            rotated = 1.0 + 0.25 * LASTING**2 * float(self.rate @ self.rate)
-            error = max(self.field_error, around.field_sigma)
+            rotated = 1.0 + 0.25 * LASTING**2 * float(at.rate @ at.rate)
+            error = max(at.field_error, around.field_sigma)
             density = density + LASTING * (1.0 + 2.0 / rotated) / 3.0 * error**2 * (across @ across.T)
         return np.asarray(density)
 

@@ -1,0 +1,242 @@
+"""Propagation of the satellite's estimate within a filter step, from the end of the last step."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import (
+    Matrix,
+    Quaternion,
+    Vector,
+    added,
+    attitude_matrix,
+    compose,
+    cross,
+    exponential,
+    matrix,
+    rows_of,
+    skew,
+    times,
+)
+from knightcube.gnc.estimation import estimate as form
+from knightcube.gnc.estimation import free_filter as states
+from knightcube.gnc.estimation.estimate import FIELD_BIAS, Estimate, Parameters
+from knightcube.gnc.estimation.free_filter import FilterEnvironment, FreeFilter, FreeMemory, FreeMotion
+from knightcube.gnc.estimation.rigid_body import by_matrix
+
+_EYE: FloatArray = np.eye(3)
+_FROM = np.r_[states.ATTITUDE, states.RATE, states.GYRO, states.MAGNET]
+_TO = np.r_[form.ATTITUDE, form.RATE, form.BIAS, form.FIELD_BIAS]
+_PICKED, _PLACED = np.ix_(_FROM, _FROM), np.ix_(_TO, _TO)
+_MOVING = np.r_[states.ATTITUDE, states.RATE, states.COILS, states.CAMERA]
+_MOVED, _CAMERA = np.ix_(_MOVING, _MOVING), slice(15, 18)
+_MOTION = np.ix_(*2 * [np.r_[form.ATTITUDE, form.RATE]])
+_SIZE = FIELD_BIAS.stop
+_PARAMETERS, _NONE = Parameters(), np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Beginning:
+    """An estimate at the end of a step, with terms that are computed once for all its propagations.
+
+    Attributes:
+        motion: equation of motion with the estimated inertia.
+        inertia, inverse: rows of the inertia tensor, kg m^2, and of its inverse.
+        coils: rows of the matrix from the commanded to the estimated dipole of the coils.
+        quaternion, rate: attitude, and body rate, rad/s.
+        field, residual: magnetic field, T, and satellite's residual dipole, A m^2, in body axes.
+    """
+
+    around: FilterEnvironment
+    memory: FreeMemory
+    motion: FreeMotion
+    inertia: Matrix
+    inverse: Matrix
+    coils: Matrix
+    quaternion: Quaternion
+    rate: Vector
+    field: Vector
+    residual: Vector
+
+    def acceleration(self, rate: Vector, dipole: Vector, field: Vector) -> Vector:
+        """Return the angular acceleration, rad/s^2, at a rate, rad/s, with a dipole, A m^2, in a field, T."""
+        momentum, torque = times(self.inertia, rate), cross(dipole, field)
+        gyroscopic = cross(momentum, rate)
+        return times(self.inverse, added(torque, gyroscopic))
+
+
+class _Motion(NamedTuple):
+    """The motion from the beginning of a propagation to its end.
+
+    Attributes:
+        seconds: duration, s.
+        dipole: mean commanded dipole, A m^2, body axes.
+        rotation: quaternion from the body axes at the beginning into those at the end.
+        rate: body rate at the end, rad/s.
+        middle, field: body rate, rad/s, and magnetic field, T, in body axes, halfway.
+    """
+
+    seconds: float
+    dipole: Vector
+    rotation: Quaternion
+    rate: Vector
+    middle: Vector
+    field: Vector
+
+
+class PropagatedEstimate(Estimate):
+    """An estimate whose covariance (19, 19) is computed when it is first read."""
+
+    __slots__ = ("_compute", "_known")
+    _compute: Callable[[], FloatArray]
+    _known: FloatArray | None
+
+    def __init__(self, covariance: Callable[[], FloatArray], **values: Any) -> None:
+        """`values` holds the other attributes of `Estimate` by name."""
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "_compute", covariance)
+        object.__setattr__(self, "_known", None)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (19, 19) of the error state, whose attitude error is a rotation vector in body axes."""
+        known = self._known
+        if known is None:
+            known = self._compute()
+            object.__setattr__(self, "_known", known)
+        return known
+
+
+class EstimatePropagation:
+    """Propagates a filter's estimates to times within a filter step.
+
+    The covariance of a propagated estimate takes several times as long as the attitude and the rate, and is
+    computed only if it is read.
+    """
+
+    def __init__(self, free: FreeFilter) -> None:
+        self._free = free
+        self._newest: _Beginning | None = None
+        self._changes = -1
+
+    def now(
+        self, time_ns: int, seconds: float, dipole: FloatArray, around: FilterEnvironment, measured_ns: int
+    ) -> Estimate:
+        """Return the newest estimate, propagated by `seconds` under a dipole (3,), A m^2."""
+        free, newest = self._free, self._newest
+        if newest is None or self._changes != free.changes or newest.around is not around:
+            newest = self._beginning(free.memory(), around)
+            self._newest, self._changes = newest, free.changes
+        return self._propagated(newest, time_ns, seconds, dipole, measured_ns)
+
+    def then(
+        self, memory: FreeMemory, time_ns: int, seconds: float, dipole: FloatArray, around: FilterEnvironment
+    ) -> Estimate:
+        """Return an earlier estimate, propagated by `seconds` under a dipole (3,), A m^2."""
+        return self._propagated(self._beginning(memory, around), time_ns, seconds, dipole, time_ns)
+
+    def _beginning(self, memory: FreeMemory, around: FilterEnvironment) -> _Beginning:
+        constants = memory.constants
+        motion = copy.copy(self._free.motion)  # which later corrections of the inertia do not change
+        x, y, z = (constants[states.DIPOLE] + around.sunlit * constants[states.SUNLIT]).tolist()
+        a, b, c, d = memory.quaternion.tolist()
+        u, v, w = memory.rate.tolist()
+        e, f, g = (attitude_matrix(memory.quaternion) @ around.field).tolist()
+        return _Beginning(
+            around,
+            memory,
+            motion,
+            rows_of(motion.inertia),
+            rows_of(motion.inverse),
+            rows_of(_EYE + constants[states.COILS].reshape(3, 3)),
+            (a, b, c, d),
+            (u, v, w),
+            (e, f, g),
+            (x, y, z),
+        )
+
+    def camera_covariance(self, seconds: float, dipole: FloatArray, around: FilterEnvironment) -> FloatArray:
+        """Return the attitude covariance (3, 3), rad^2, of the star camera, propagated by `seconds`."""
+        begun = self._beginning(self._free.memory(), around)
+        transition, grown = self._transition(begun, _moved(begun, seconds, dipole))
+        rows = transition[0:3].copy()
+        rows[:, _CAMERA] += _EYE
+        moving = begun.memory.covariance[_MOVED]
+        return np.asarray(rows @ moving @ rows.T + seconds**2 / 3.0 * grown)
+
+    def _transition(self, begun: _Beginning, moved: _Motion) -> tuple[FloatArray, FloatArray]:
+        """Return the transition matrix (6, 18) of the errors, and the covariance (3, 3) of the rate noise."""
+        motion, seconds, dipole = begun.motion, moved.seconds, np.array(moved.dipole)
+        found = np.zeros((6, len(_MOVING)))
+        found[0:3, 0:3], found[0:3, 3:6] = matrix(moved.rotation), seconds * _EYE
+        found[3:6, 3:6] = _EYE + seconds * motion.stiffness(np.array(moved.middle))
+        by_coils = -seconds * (motion.inverse @ np.array(skew(moved.field))) @ by_matrix(dipole)
+        found[0:3, 6:15], found[3:6, 6:15] = 0.5 * seconds * by_coils, by_coils
+        noise = self._free.rate_noise(dipole, begun.around, then=begun.memory, motion=motion)
+        return found, seconds * noise
+
+    def _covariance(self, begun: _Beginning, moved: _Motion) -> FloatArray:
+        """Return the covariance (19, 19) at the end, with the states in the order of the loop's estimates."""
+        seconds, before = moved.seconds, begun.memory.covariance
+        transition, grown = self._transition(begun, moved)
+        spread = np.zeros((_SIZE, _SIZE))
+        spread[_PLACED] = before[_PICKED]
+        among = transition @ before[_MOVED] @ transition.T
+        among[0:3, 0:3] += seconds**2 / 3.0 * grown
+        among[3:6, 3:6] += grown
+        spread[_MOTION] = among
+        return spread
+
+    def _propagated(
+        self, begun: _Beginning, time_ns: int, seconds: float, dipole: FloatArray, measured_ns: int
+    ) -> Estimate:
+        moved = _moved(begun, seconds, dipole)
+        return PropagatedEstimate(
+            lambda: self._covariance(begun, moved),
+            time_ns=time_ns,
+            quaternion=np.array(compose(moved.rotation, begun.quaternion)),
+            rate=np.array(moved.rate),
+            bias=begun.memory.constants[states.GYRO],
+            disturbance=_NONE,
+            parameters=_PARAMETERS,
+            measured_ns=measured_ns,
+            latency=0.0,
+            field_bias=begun.memory.constants[states.MAGNET],
+        )
+
+
+def _moved(begun: _Beginning, seconds: float, dipole: FloatArray) -> _Motion:
+    """Return the motion during `seconds` under a commanded dipole (3,), A m^2.
+
+    The midpoint rule is used, because rate and torque change their directions during a step. The code uses
+    plain floats, because for three components numpy takes ten times as long.
+    """
+    x, y, z = dipole.tolist()
+    half, rate = 0.5 * seconds, begun.rate
+    whole = added(times(begun.coils, (x, y, z)), begun.residual)
+    first = begun.acceleration(rate, whole, begun.field)
+    middle = _ahead(rate, half, first)
+    field = times(matrix(exponential(*_scaled(half, _ahead(rate, 0.5 * half, first)))), begun.field)
+    second = begun.acceleration(middle, whole, field)
+    after = _ahead(rate, seconds, second)
+    a, b, c = cross(rate, after)
+    u, v, w = first[0] + 2.0 * second[0], first[1] + 2.0 * second[1], first[2] + 2.0 * second[2]
+    mean = _ahead(rate, seconds / 6.0, (u + 0.5 * a, v + 0.5 * b, w + 0.5 * c))
+    return _Motion(seconds, (x, y, z), exponential(*_scaled(seconds, mean)), after, middle, field)
+
+
+def _ahead(vector: Vector, seconds: float, slope: Vector) -> Vector:
+    """Return `vector` + `seconds` * `slope`."""
+    return vector[0] + seconds * slope[0], vector[1] + seconds * slope[1], vector[2] + seconds * slope[2]
+
+
+def _scaled(factor: float, vector: Vector) -> Vector:
+    """Return `factor` * `vector`."""
+    return factor * vector[0], factor * vector[1], factor * vector[2]
