@@ -15,7 +15,8 @@ from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.settings import FaultEntry
 from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
 
-BEGIN, END, DURATION = 6.0, 9.0, 20.0
+BEGIN, END, DURATION, LONG = 6.0, 9.0, 15.0, 20.0
+"""Begin and end (s) of a fault; duration (s) of a flight, and of one that reaches its target late."""
 WITHIN = 0.1
 """s from the loss of control until the coils are at zero."""
 
@@ -28,12 +29,12 @@ def true_current(run: Run, since: float, until: float) -> FloatArray:
     return largest[(time >= since) & (time < until)]
 
 
-def assert_whole(run: Run) -> None:
+def assert_whole(run: Run, duration: float = DURATION) -> None:
     """Every packet that was written is there, in order, to the end of the flight."""
     for log in run.logs.values():
         assert log.intact
-    assert len(run["control"]) == round(DURATION / 0.025)
-    assert run["control"]["time_ns"][-1] == pytest.approx((DURATION - 0.025) * 1e9)
+    assert len(run["control"]) == round(duration / 0.025)
+    assert run["control"]["time_ns"][-1] == pytest.approx((duration - 0.025) * 1e9)
 
 
 def line(faults: LineFaults) -> Callable[[Rigged], None]:
@@ -69,12 +70,12 @@ def test_a_sound_flight_raises_no_alarm(sound: Run) -> None:
 def test_a_line_without_packets_loses_control_and_the_coils_are_off_until_they_come_again(
     tmp_path: Path, faults: LineFaults, events: list[str]
 ) -> None:
-    run = fly(demo_config(DURATION, camera=False), tmp_path, line(faults))
+    run = fly(demo_config(LONG, camera=False), tmp_path, line(faults))
     names = event_names(run)
     assert [name for name in dict.fromkeys(names) if name in events] == events
     assert true_current(run, BEGIN + WITHIN, END).max() == 0.0
-    assert true_current(run, END + 0.3, DURATION).max() > 0.0
-    assert_whole(run)
+    assert true_current(run, END + 0.3, LONG).max() > 0.0
+    assert_whole(run, LONG)
     final = 2 * np.arcsin(run["truth"]["quaternion"][-1, 1]) - 2 * np.arcsin(-0.3)
     assert abs(final) < np.radians(4.5)
 
@@ -86,7 +87,7 @@ def test_after_a_silence_of_a_second_the_estimate_goes_on_as_the_model_carried_i
             rigged.at(begin, lambda: setattr(wire, "faults", LineFaults(silent=True)))
             rigged.at(begin + 1.0, lambda: setattr(wire, "faults", SOUND))
 
-    run = fly(demo_config(DURATION, camera=False), tmp_path, prepare)
+    run = fly(demo_config(LONG, camera=False), tmp_path, prepare)
     names = event_names(run)
     assert [names.count(name) for name in ("imu-silent", "control-lost", "control-regained")] == [2, 2, 2]
     assert "imu-refused" not in names, "the first readings agree with what was carried on"
