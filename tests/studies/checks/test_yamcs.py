@@ -25,7 +25,6 @@ from tests.studies.interop.yamcs import PLANS, fly
 from tests.support.linked_board import free_ports, write_linked_config
 from tests.support.linked_flight import free_port, service
 from tests.support.orbit_elements import POLAR_ORBIT
-from tests.support.yamcs_operator import Operator
 from tests.support.yamcs_server import basic, missing, serving
 
 
@@ -107,6 +106,8 @@ def test_mission_control_refuses_what_it_cannot_show(
 @pytest.mark.timeout(300)
 def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path: Path) -> None:
     """An alarm is raised and acknowledged, stacks run, files go both ways, and a pass is on the timeline."""
+    from tests.support.yamcs_operator import Operator  # noqa: PLC0415 - imports the client for a second
+
     (udp,), http = free_ports([socket.SOCK_DGRAM]), free_port()
     config = write_linked_config(tmp_path, udp=f"127.0.0.1:{udp}", rate=1_000_000)
     out = tmp_path / "out"
