@@ -13,7 +13,7 @@ from typing import Any
 
 from flight.link.commands import LAYOUTS as COMMAND_LAYOUTS
 from flight.link.process.directives import LAYOUTS as DIRECTIVE_LAYOUTS
-from flight.link.telemetry.definitions import Field, Range
+from flight.link.telemetry.fields import Field, Range
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout, wraps_at
 
 _FOREWORD = """\

@@ -49,7 +49,7 @@ from flight.link.commands import Channel, open_udp, open_unix
 from flight.link.telemetry.log import FlightLog, Recorder
 from flight.loop import horizon_cameras as horizon_task
 from flight.loop import imaging as imaging_task
-from flight.loop.body import PLANNER, BodyKind, FlightBody
+from flight.loop.body import PLANNER, BodyKind, FlightBody, Planner
 from flight.loop.commanding import CommandTask, OnboardParameters
 from flight.loop.control_cycle import LoopTasks
 from flight.loop.executive import JobResult, JobRunner, LockStepRunner, Worker
@@ -66,6 +66,7 @@ from flight.loop.horizon_cameras import HorizonCameraSettings, HorizonCameraTask
 from flight.loop.imaging import Imaging, ImagingSettings, ObjectTracks
 from flight.loop.modes import ModeControl, ModeSettings
 from flight.loop.navigation import Navigation, NavigationSettings, Positioning, SunSensing
+from flight.loop.shedding import BusyPeriods, OverloadSign, Shedding, ShedLevel
 from flight.loop.state import Learned, StateKeeper, open_state, service_folder, state_folder
 from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
 from flight.loop.worker_processes import ProcessRunner
@@ -383,6 +384,8 @@ def imaging_settings(
         calm=body.control.exposure_start,
         kept=kept,
         lens=lens,
+        # The frames that are taken under overload keep the attitude measured.
+        most_every=int(camera.max_age // max(camera.period, camera.fine_period or 0.0)),
     )
 
 
@@ -536,6 +539,7 @@ def _tasks(
     if opened.channels or config.commands.timeline:
         table = OnboardParameters(config, (modes.adopt, drive.adopt), health.adopt, keeper, services)
         commanding = CommandTask(modes, drive, table, config.commands.timeline, opened.channels, services)
+    observer = PerformanceObserver(devices.coils, services)
     return LoopTasks(
         navigation=navigation,
         imaging=imaging,
@@ -545,12 +549,37 @@ def _tasks(
         modes=modes,
         steering=steering,
         drive=drive,
-        observer=PerformanceObserver(devices.coils, services),
+        observer=observer,
         health=health,
         housekeeping=housekeeping,
         commanding=commanding,
         power=_power(config, devices, drive, imaging, services),
+        shedding=_shedding(config, planner, imaging, observer, services),
     )
+
+
+def _shedding(
+    config: Config,
+    planner: Planner,
+    imaging: Imaging | None,
+    observer: PerformanceObserver,
+    services: Services,
+) -> Shedding:
+    """Return the task that reduces the workers' jobs under overload."""
+    limit = min(max(config.replan_period() or 0.0, 1.0), 0.5 * config.executive.planner_timeout)
+    plans = BusyPeriods(planner.busy_since_ns, round(limit * SECOND_NS))
+    signs = [
+        OverloadSign("control cycles are lost", lambda: observer.lost, 3),
+        OverloadSign(f"plans take longer than {limit:g} s", lambda: plans.count, 1),
+    ]
+    if imaging is None:
+        return Shedding(signs, plans, lambda _: None, lambda: (0, 0), services)
+
+    def apply(level: ShedLevel) -> None:
+        imaging.reduce(level.search, level.frame_every)
+
+    signs.append(OverloadSign("frames wait or take too long", lambda: imaging.workload()[1], 2))
+    return Shedding(signs, plans, apply, imaging.workload, services)
 
 
 def _power(

@@ -257,6 +257,9 @@ POWER_SENSOR_RECOVERED = _info(
     166, "power-sensor-recovered", "the monitors of battery and bus are used again"
 )
 
+WORK_SHED = _warning(170, "work-shed", "the processor is overloaded, so less important work is reduced")
+WORK_RESTORED = _info(171, "work-restored", "reduced work is done again, because the processor has room")
+
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)
 )

@@ -22,6 +22,7 @@ from flight.loop.horizon_cameras import HorizonCameraTask
 from flight.loop.imaging import Imaging
 from flight.loop.modes import ModeControl
 from flight.loop.navigation import CoilKnowledge, CurrentValidity, Navigation, Positioning, SunSensing
+from flight.loop.shedding import Shedding
 from flight.loop.steering import CoilDrive, Steering
 
 if TYPE_CHECKING:  # only flights with a section `power` load this module
@@ -57,6 +58,7 @@ class LoopTasks:
     housekeeping: Housekeeping
     commanding: CommandTask | None
     power: PowerTask | None
+    shedding: Shedding
 
 
 @dataclass(slots=True, eq=False)

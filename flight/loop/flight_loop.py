@@ -271,8 +271,7 @@ class FlightLoop:
         control_ns = round(SECOND_NS / CONTROL_RATE_HZ)
         groups = [RateGroup(CONTROL, control_ns, self._run_control)]
         if replan_period is not None:
-            planner = self._body.control.planner
-            groups.append(RateGroup("planning", round(replan_period * SECOND_NS), planner.replan))
+            groups.append(RateGroup("planning", round(replan_period * SECOND_NS), self._replan))
         if camera is not None and tasks.imaging is not None:
             groups.append(RateGroup("camera", round(camera.period * SECOND_NS), tasks.imaging.trigger))
         if tasks.commanding is not None:
@@ -286,6 +285,10 @@ class FlightLoop:
     def _has_fast_cameras(self) -> bool:
         """Return whether the horizon cameras take frames more often than once in two seconds."""
         return any(camera.period < 2.0 for camera in self._config.wide_cameras)
+
+    def _replan(self, cycle: Cycle) -> None:
+        if self._tasks.shedding.makes_plan(cycle.slot):
+            self._body.control.planner.replan(cycle)
 
     def _run_horizon_cameras(self, cycle: Cycle) -> None:
         if self._tasks.horizon_cameras is not None:
@@ -303,6 +306,7 @@ class FlightLoop:
                 sensing.run(now_ns)
         if not self._has_fast_cameras():
             self._run_horizon_cameras(cycle)
+        tasks.shedding.run(self._groups[0].slips, now_ns)
         tasks.housekeeping.run(cycle, state)
         self._correct_label(now_ns)
         self._keep_state(now_ns)

@@ -286,13 +286,17 @@ CONTROL = "control"
 
 
 class PerformanceObserver:
-    """Records the cycles that the executive reports, and reports skipped slots and failures as events."""
+    """Records the cycles that the executive reports, and reports skipped slots and failures as events.
+
+    The attribute `lost` is the number of skipped control cycles.
+    """
 
     def __init__(self, coils: TorqueCoils, services: Services) -> None:
         self._coils = coils
         self._clock = services.clock
         self._recorder = services.recorder
         self._events = services.events
+        self.lost = 0
 
     def ran(self, group: RateGroup, cycle: Cycle, execution_ns: int) -> None:
         """Record a control cycle's lateness and execution time."""
@@ -312,6 +316,7 @@ class PerformanceObserver:
         """
         if group.name != CONTROL:
             return
+        self.lost += slots
         text = f"{group.name}: {slots} slots skipped, {group.slips} since start"
         self._events.report(events.CYCLE_SLIP, self._clock.now_ns(), text)
 

@@ -89,6 +89,7 @@ class ImagingSettings:
         late_ns: time (ns) after the end of an exposure from which its frame counts as late.
         max_rate: body rate (rad/s) above which no exposure is made.
         slow_ns: processing time (ns) of a frame above which vision is reported as slow.
+        most_every: largest number of due exposures of which one must be made under overload.
         mounting: quaternion (4,) from body axes to camera axes.
         angular_acceleration_psd: function of a time that returns the power spectral density (3, 3),
             rad^2/s^3, of the body's white angular acceleration.
@@ -119,6 +120,7 @@ class ImagingSettings:
     kept: KeptFrames | None = None
     detection: DetectionSettings = field(default_factory=DetectionSettings)
     lens: LensKnowledge | None = None
+    most_every: int = 8
 
 
 class CameraAttitude(NamedTuple):
@@ -620,6 +622,8 @@ class Imaging:
         self._objects = objects
         self._lens, self._lens_ns = settings.lens, 0
         self._spare = True  # whether there was time to search the last frame for objects
+        self._searches, self._frame_every, self._turn = True, 1, 0
+        self._shed = self._late = 0
 
     def counts(self) -> tuple[int, int]:
         """Return the number of frames, and the number of rates from streaks that the filter accepted."""
@@ -639,6 +643,21 @@ class Imaging:
         """Leave at least `seconds` s between two exposures, because the battery is low."""
         # Half a second is subtracted, so that the trigger after a late trigger is not skipped.
         self._rest_ns = round((seconds - 0.5) * 1e9)
+
+    def reduce(self, search: bool, frame_every: int) -> None:
+        """Search frames for objects only if `search` is true, and make one of `frame_every` exposures.
+
+        No more exposures are left out than the largest age of the newest frame permits.
+        """
+        self._searches = search
+        self._frame_every = max(min(frame_every, self._settings.most_every), 1)
+
+    def workload(self) -> tuple[int, int]:
+        """Return the numbers of exposures that were left out by `reduce`, and of late frames.
+
+        A frame is late if it arrives while the worker is busy, or if its processing takes too long.
+        """
+        return self._shed, self._late
 
     def begin(self, time_ns: int) -> None:
         """Measure the age of the newest frame from `time_ns` on."""
@@ -660,6 +679,12 @@ class Imaging:
         if rested_ns < self._settings.fine_rest_ns and fine and speed <= FAST:
             return
         self._triggered_ns = now_ns = cycle.start_ns
+        self._turn = (self._turn + 1) % self._frame_every
+        if self._turn:
+            self._shed += 1
+            self._last_frame_ns = now_ns
+            self._streams.note("camera", now_ns)
+            return
         exposure_ns = self._measurer.exposure_ns(now_ns)
         self._ordered = self._settings.calm(now_ns, exposure_ns), exposure_ns
         self._expose(now_ns)
@@ -723,11 +748,12 @@ class Imaging:
             self._frame = frame
             self._busy_since_ns = now_ns
         else:
+            self._late += self._frame is not None
             self._events.report(events.VISION_FAILED, now_ns, "the worker is busy or not running")
 
     def _job(self, frame: Frame) -> FrameJob:
         """Return the worker's job for a frame, with the learned lens."""
-        job = self._measurer.job(frame, self._last_checksum, self._spare)
+        job = self._measurer.job(frame, self._last_checksum, self._spare and self._searches)
         if self._lens is None:
             return job
         elapsed = max(frame.exposure_start_ns - self._lens_ns, 0) * 1e-9 if self._lens_ns else 0.0
@@ -746,6 +772,7 @@ class Imaging:
         frame, self._frame = self._frame, None
         if frame is None:
             return
+        self._late += now_ns - self._busy_since_ns > self._settings.slow_ns
         self._judge_speed(now_ns)
         if result.outcome != "done":
             self._events.report(events.VISION_FAILED, now_ns, f"{result.outcome}: {result.error}")

@@ -66,9 +66,8 @@ from flight.link.telemetry.definitions import (
     PARAMETER_KEYS,
     PARAMETERS,
     VERIFICATION,
-    Field,
-    Packet,
 )
+from flight.link.telemetry.fields import Field, Packet
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY_LAYOUTS
 from flight.link.telemetry.packets import TelemetryError
 from flight.schema.document import read_document, read_text, to_yaml

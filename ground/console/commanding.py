@@ -37,7 +37,8 @@ from flight.link.process.commanding import Report, Stage, utc_of
 from flight.link.process.directives import LIST, SCHEDULE
 from flight.link.process.downlink import LIVE
 from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
-from flight.link.telemetry.definitions import VERIFICATION, Field
+from flight.link.telemetry.definitions import VERIFICATION
+from flight.link.telemetry.fields import Field
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import Layout, Packer, PacketArray, TelemetryError
 from flight.schema.document import merged_text, read_text

@@ -11,7 +11,7 @@ from flight.link.commands import DUMP_PARAMETERS, LOAD_PARAMETERS, POINT, SLEW
 from flight.link.events import EVENTS
 from flight.link.modes import ORBITAL, TESTBED, Mode
 from flight.link.process.directives import SCHEDULE
-from flight.link.telemetry.definitions import Field, Packet
+from flight.link.telemetry.fields import Field, Packet
 from flight.link.telemetry.packets import LAYOUTS, Layout
 from flight.loop.facts import FACTS
 from ground.documentation import command_table

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.definitions import Packet
+from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.packets import LAYOUTS, to_text
 from flight.schema import reader as configuration
 from flight.schema.document import config_path

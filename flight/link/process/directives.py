@@ -10,7 +10,7 @@ from flight.link.commands import CommandError, telecommand
 from flight.link.files.store import LONGEST_NAME
 from flight.link.files.transfer import FOREIGN, GROUND
 from flight.link.security import KEY_BYTES
-from flight.link.telemetry.definitions import Field, Packet
+from flight.link.telemetry.fields import Field, Packet
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
     Layout,

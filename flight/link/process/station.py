@@ -75,7 +75,8 @@ from flight.link.security import (
     Vault,
     may_change,
 )
-from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION, Packet
+from flight.link.telemetry.definitions import LINK, RUN, TRANSFER, VERIFICATION
+from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS, Clock, SerialPort

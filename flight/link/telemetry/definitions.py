@@ -10,82 +10,13 @@ configuration schema.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import replace
 
 from flight.link.events import Severity
 from flight.link.modes import Mode
+from flight.link.telemetry.fields import Alarms, Field, Level, Limits, Packet, States, counter, flag
 from hal.interfaces.devices import COIL_NAMES, MOST_COILS
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
-
-Range = tuple[float, float]
-States = tuple[tuple[int, str], ...]
-NO_YES: States = ((0, "no"), (1, "yes"))
-Level = Literal["warning", "fault"]
-Alarms = tuple[tuple[int, Level], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Nominal ranges (low, high) of a value. A value outside its range causes a warning or a fault."""
-
-    warning: Range | None = None
-    fault: Range | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Field:
-    """Definition of one field of a packet. Numbers are big-endian in the packet.
-
-    Attributes:
-        kind: numpy type code (f8, f4, u1, u2, u4, u8, i8), or S<n> for n bytes of UTF-8 text.
-        count: number of values; a field with more than one value is an array.
-        states: numbers and names of the states of an enumerated field.
-        bits: numbers and names of the bits of a bit field, of which several can be set.
-        alarms: states or set bits that are reported as a warning or a fault.
-        limits: nominal ranges of a numeric field without states.
-        valid: allowed range (low, high) of a command argument.
-        wraps: whether the field is a counter that continues at 0 after its largest number.
-    """
-
-    name: str
-    kind: str
-    unit: str
-    meaning: str
-    count: int = 1
-    states: States = ()
-    alarms: Alarms = ()
-    limits: Limits | None = None
-    valid: Range | None = None
-    wraps: bool = False
-    bits: States = ()
-
-
-def counter(name: str, meaning: str) -> Field:
-    """Return the definition of a counter field, which wraps at the end of its range."""
-    return Field(name, "u4", "-", meaning, wraps=True)
-
-
-def flag(name: str, meaning: str) -> Field:
-    """Return the definition of a Boolean field with the states no and yes."""
-    return Field(name, "u1", "-", meaning, states=NO_YES)
-
-
-@dataclass(frozen=True, slots=True)
-class Packet:
-    """Definition of a packet: name, application process identifier (APID), rate and fields.
-
-    The text `hazard` states the harm that a telecommand can cause. The text is empty for a harmless packet.
-    """
-
-    name: str
-    apid: int
-    rate: str
-    meaning: str
-    fields: tuple[Field, ...]
-    version: int = field(default=1)
-    telecommand: bool = False
-    hazard: str = ""
 
 
 def _parameter(key: str, unit: str, low: float, high: float, meaning: str) -> Field:
@@ -252,6 +183,23 @@ HEALTH = Packet(
         Field("memory_slope", "f8", "B/s", "growth of the proportional memory; NaN if unknown"),
         Field("disk_free", "f8", "B", "free disk space for the flight log; NaN if unknown"),
         Field("temperature", "f8", "deg C", "highest temperature of the board; NaN if unknown"),
+    ),
+)
+
+_LEVEL = Limits((0.0, 0.0), (0.0, 5.0))
+
+WORKLOAD = Packet(
+    "workload",
+    0x136,
+    "after each change, 1 Hz at most",
+    "Work that is reduced because the processor is overloaded",
+    (
+        Field("level", "u1", "-", "level of the reduction; 0 if all work is done", limits=_LEVEL),
+        counter("frames_shed", "frames of the star camera that were not taken since start"),
+        counter("plans_shed", "periodic plans that were not made since start"),
+        counter("frames_late", "frames since start that found the worker busy or took it too long"),
+        counter("plans_late", "plans since start that took too long"),
+        counter("cycles_lost", "control cycles skipped since start"),
     ),
 )
 
@@ -894,6 +842,7 @@ JOB_TIMING = Packet(
 PACKETS: tuple[Packet, ...] = (
     RUN, IMU, CONTROL, ATTITUDE, COIL_CURRENTS, SPIN, NAVIGATION, DESCRIPTION, FIX, GPS_LINK, DIRECTIONS,
     SEPARATE_ATTITUDES, TARGET, MODE, PLAN, STREAK, STARS, LENS, SIGHTINGS, TRACK, EVENT, HOUSEKEEPING,
-    HEALTH, POWER, COMMAND, PARAMETERS, LINK, VERIFICATION, TRANSFER, TRUTH, TRUE_COIL_CURRENTS, ORBIT_TRUTH,
+    HEALTH, WORKLOAD, POWER, COMMAND, PARAMETERS, LINK, VERIFICATION, TRANSFER, TRUTH, TRUE_COIL_CURRENTS,
+    ORBIT_TRUTH,
     TRUE_DESCRIPTION, TRUE_POWER, CYCLE_TIMING, RATE_GROUP, JOB_TIMING,
 )  # fmt: skip

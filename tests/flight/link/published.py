@@ -16,7 +16,7 @@ _PLAIN = {
         102 gps-recovered  105 strings-recovered  107 sun-clear  108 slew-begun  109 slew-ended
         120 object-found  121 object-lost  122 object-followed  132 field-trusted  134 wide-recovered
         136 wide-trusted  140 sun-found  144 coil-tested  156 gyro-recovered
-        163 battery-recovered  166 power-sensor-recovered
+        163 battery-recovered  166 power-sensor-recovered  171 work-restored
         """,
     "warning": """
         3 cycle-slip  6 crashed-often  7 boot-waits  11 imu-corrupt  12 imu-implausible  15 imu-refused
@@ -31,6 +31,7 @@ _PLAIN = {
         123 object-escapes  130 clock-off  131 field-refused  133 wide-lost  135 wide-false  141 sun-missed
         142 astray  143 coil-corrected  150 returned  151 gps-link  152 field-extrapolated  153 gps-set-up
         154 camera-saturated  157 lens-changed  160 battery-low  161 battery-very-low  165 power-sensor-lost
+        170 work-shed
         """,
     "fault": """
         4 task-failed  9 no-progress  10 imu-silent  13 imu-line-lost  16 imu-unusable  49 worker-rests

@@ -8,7 +8,8 @@ from flight.link import commands, events, modes
 from flight.link.events import EVENTS, EventKind, Reaction, Severity
 from flight.link.modes import Mode
 from flight.link.process import directives
-from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, Packet
+from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS
+from flight.link.telemetry.fields import Packet
 from tests.flight.link.published import COMMANDS, DIRECTIVES, PARAMETERS, published_events
 
 

@@ -39,8 +39,8 @@ from flight.link.telemetry.definitions import (
     PARAMETER_KEYS,
     PARAMETERS,
     VERIFICATION,
-    Packet,
 )
+from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.packets import Packer
 from ground.commands import satellite
 from knightcube.errors import FlightError, UsageError

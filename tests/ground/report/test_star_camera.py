@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flight.link.telemetry import definitions as table
-from flight.link.telemetry.definitions import Packet
+from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.packets import Layout, PacketArray
 from flight.schema import reader
 from flight.schema.orbit import OrbitConfig, as_orbit

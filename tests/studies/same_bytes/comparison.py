@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.definitions import Field, Packet
+from flight.link.telemetry.fields import Field, Packet
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, Layout, compile_layouts, to_text
 from tests.studies.same_bytes.answers import ANSWERS_FILE

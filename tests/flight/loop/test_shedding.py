@@ -1,0 +1,130 @@
+"""Load shedding on stand-ins: signs of overload, order of the levels, return, and telemetry."""
+
+from __future__ import annotations
+
+import itertools
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from flight.link import events
+from flight.loop.shedding import LEVELS, BusyPeriods, OverloadSign, Shedding, ShedLevel
+
+S = 1_000_000_000
+
+
+class Bench:
+    """A task whose signs are counters that a test raises."""
+
+    def __init__(self) -> None:
+        self.frames = self.cycles = 0
+        self.busy_since_ns: int | None = None
+        self.applied: list[ShedLevel] = []
+        self.reports: list[tuple[Any, int, str]] = []
+        self.records: list[dict[str, Any]] = []
+        self.second = 0
+        services = SimpleNamespace(
+            events=SimpleNamespace(report=lambda *row: self.reports.append(row)),
+            recorder=SimpleNamespace(record=lambda _, now_ns, **values: self.records.append(values)),
+        )
+        plans = BusyPeriods(lambda: self.busy_since_ns, 5 * S)
+        self.task = Shedding(
+            [
+                OverloadSign("cycles", lambda: self.cycles, 3),
+                OverloadSign("plans", lambda: plans.count, 1),
+                OverloadSign("frames", lambda: self.frames, 2),
+            ],
+            plans,
+            self.applied.append,
+            lambda: (7, self.frames),
+            cast(Any, services),
+        )
+
+    def run(self, seconds: int, *, frames: bool = False, cycles: bool = False) -> int:
+        """Run the task once a second, with signs of overload in each; return the level."""
+        for _ in range(seconds):
+            self.second += 1
+            self.frames += frames
+            self.cycles += cycles
+            self.task.run(self.cycles, self.second * S)
+        return LEVELS.index(self.applied[-1]) if self.applied else 0
+
+
+def test_levels_reduce_the_search_first_then_frames_then_plans_and_never_restore_work() -> None:
+    first = {
+        name: next(i for i, level in enumerate(LEVELS) if reduced(level))
+        for name, reduced in {
+            "search": lambda level: not level.search,
+            "frames": lambda level: level.frame_every > 1,
+            "plans": lambda level: level.plan_every > 1,
+        }.items()
+    }
+    assert first["search"] < first["frames"] < first["plans"]
+    for before, after in itertools.pairwise(LEVELS):
+        assert after.search <= before.search
+        assert after.frame_every >= before.frame_every
+        assert after.plan_every >= before.plan_every
+
+
+def test_without_signs_nothing_is_reduced_or_recorded() -> None:
+    bench = Bench()
+    bench.task._frames = lambda: (0, 0)
+    assert bench.run(600) == 0
+    assert not bench.reports
+    assert not bench.records
+
+
+@pytest.mark.parametrize("sign", ["frames", "cycles"])
+def test_an_overload_raises_the_level_step_by_step_to_the_last(sign: str) -> None:
+    bench = Bench()
+    levels = [bench.run(1, **{sign: True}) for _ in range(120)]
+    assert levels[-1] == len(LEVELS) - 1
+    assert sorted(levels) == levels
+    raises = [i for i in range(1, 120) if levels[i] > levels[i - 1]]
+    assert min(b - a for a, b in itertools.pairwise(raises)) >= 10
+    assert [kind for kind, *_ in bench.reports] == [events.WORK_SHED] * (len(LEVELS) - 1)
+    assert bench.reports[0][2].endswith(f": {sign}")
+
+
+def test_single_late_frames_and_stalls_of_the_machine_reduce_nothing() -> None:
+    bench = Bench()
+    for _ in range(5):
+        bench.run(1, frames=True)
+        bench.run(2, cycles=True)
+        assert bench.run(70) == 0
+
+
+def test_work_returns_when_there_is_room_and_later_after_a_relapse() -> None:
+    bench = Bench()
+    assert bench.run(11, frames=True) == 1
+    assert bench.run(58) == 1
+    assert bench.run(5) == 0
+    assert bench.reports[-1][0] is events.WORK_RESTORED
+    assert bench.run(11, frames=True) == 1
+    assert bench.run(100) == 1, "the next return is later"
+    assert bench.run(25) == 0
+
+
+def test_a_long_plan_counts_once() -> None:
+    bench = Bench()
+    bench.busy_since_ns = 1 * S
+    assert bench.run(30) == 1
+    assert bench.records[-1]["plans_late"] == 1
+
+
+def test_periodic_plans_become_rarer_and_are_counted() -> None:
+    bench = Bench()
+    assert all(bench.task.makes_plan(slot) for slot in range(8))
+    bench.run(120, frames=True)
+    made = [bench.task.makes_plan(slot) for slot in range(80)]
+    assert sum(made) == 80 // LEVELS[-1].plan_every
+    bench.run(1)
+    assert bench.records[-1]["plans_shed"] == 80 - sum(made)
+
+
+def test_level_and_counters_are_recorded_when_they_change() -> None:
+    bench = Bench()
+    bench.run(3, frames=True)
+    bench.run(30)
+    assert [(row["level"], row["frames_late"]) for row in bench.records] == [(0, 1), (1, 2), (1, 3)]
