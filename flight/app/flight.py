@@ -554,30 +554,33 @@ def _tasks(
         housekeeping=housekeeping,
         commanding=commanding,
         power=_power(config, devices, drive, imaging, services),
-        shedding=_shedding(config, planner, imaging, observer, services),
+        shedding=_shedding(config, planner, navigation, imaging, observer, services),
     )
 
 
 def _shedding(
     config: Config,
     planner: Planner,
+    navigation: Navigation,
     imaging: Imaging | None,
     observer: PerformanceObserver,
     services: Services,
 ) -> Shedding:
-    """Return the task that reduces the workers' jobs under overload."""
+    """Return the task that reduces less important work under overload."""
     limit = min(max(config.replan_period() or 0.0, 1.0), 0.5 * config.executive.planner_timeout)
     plans = BusyPeriods(planner.busy_since_ns, round(limit * SECOND_NS))
     signs = [
         OverloadSign("control cycles are lost", lambda: observer.lost, 3),
         OverloadSign(f"plans take longer than {limit:g} s", lambda: plans.count, 1),
     ]
-    if imaging is None:
-        return Shedding(signs, plans, lambda _: None, lambda: (0, 0), services)
 
     def apply(level: ShedLevel) -> None:
-        imaging.reduce(level.search, level.frame_every)
+        navigation.thin(not level.every_reading)
+        if imaging is not None:
+            imaging.reduce(level.search, level.frame_every)
 
+    if imaging is None:
+        return Shedding(signs, plans, apply, lambda: (0, 0), services)
     signs.append(OverloadSign("frames wait or take too long", lambda: imaging.workload()[1], 2))
     return Shedding(signs, plans, apply, imaging.workload, services)
 

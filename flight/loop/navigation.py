@@ -133,6 +133,7 @@ class Navigation:
         """Read the inertial unit or, while it gives no readings, the `magnetometer`."""
         self._unit = unit
         self._magnetometer = magnetometer
+        self._thinned = False  # whether only the newest reading of a cycle is used
         self._replaced = False  # whether the magnetometer replaces the inertial unit
         self._unit_ns = 0  # time (ns) of the unit's newest reading
         self._estimation = estimation
@@ -186,6 +187,10 @@ class Navigation:
             self._filter.mark_unknown(known.uncertain_since_ns)
         self._filter.command(max(in_force.written_ns, known.since_ns), currents, known=known.now)
 
+    def thin(self, thinned: bool) -> None:
+        """Use only the newest reading of each control cycle if `thinned` is true, because of an overload."""
+        self._thinned = thinned
+
     def update(self, now_ns: int) -> tuple[ImuReading, ...]:
         """Apply new and late measurements, and return the readings of this cycle, oldest first."""
         self._filter.catch_up(_AT_A_TIME)
@@ -201,8 +206,10 @@ class Navigation:
         if self._magnetometer is not None:
             polled = self._or_magnetometer(polled, self._magnetometer, now_ns)
         readings = tuple(reading for reading in polled if self._is_usable(reading, now_ns))
-        for reading in readings:
+        used = readings[-1:] if self._thinned else readings
+        for reading in used:
             self._ingest(reading)
+        for reading in readings:
             self._streams.note("imu", reading.time_ns)
             self._streams.note("field", reading.time_ns, math.hypot(*reading.field.tolist()))
             self._received_ns = reading.time_ns
@@ -216,7 +223,7 @@ class Navigation:
         self._doubted = doubted
         text = "the body rate contradicts the commands" if doubted else "the rate follows the commands"
         self._facts.update(facts.COMMANDS_DOUBTED, doubted, now_ns, text)
-        return readings
+        return used
 
     def _or_magnetometer(
         self, polled: list[ImuReading], magnetometer: InertialUnit, now_ns: int

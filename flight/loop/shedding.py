@@ -1,9 +1,10 @@
 """Load shedding: when the work of a flight exceeds its processor, the least important work is reduced first.
 
-Control, safety, telemetry and commands are never reduced. The workers' jobs are reduced step by step, in the
-order of `LEVELS`: the search for objects, then frames of the star camera, then periodic plans. A plan that is
-not renewed stays in force, and its final attitude is held after its end. Plans for a new target, or after a
-loss of control, are always made.
+Control cycles, safety, telemetry and commands are never reduced. All other work is reduced step by step, in
+the order of `LEVELS`: readings of the inertial unit that arrive more often than control cycles, then the
+search for objects, then frames of the star camera, then periodic plans. A plan that is not renewed stays in
+force, and its final attitude is held after its end. Plans for a new target, or after a loss of control, are
+always made.
 
 Overload is recognised by its signs: lost control cycles, frames that arrive while the worker is busy or whose
 processing takes too long, and plans that take too long. Each raise of the level reduces more work. The level
@@ -28,25 +29,29 @@ class ShedLevel:
     """Reduced work of a level.
 
     Attributes:
+        every_reading: whether all readings of the inertial unit are used, not the newest of each cycle alone.
         search: whether frames are searched for objects.
         frame_every: number of due exposures of the star camera of which one is made.
         plan_every: number of due periodic plans of which one is made.
         text: description of the reduced work for events.
     """
 
+    every_reading: bool
     search: bool
     frame_every: int
     plan_every: int
     text: str
 
 
+_NEWEST = "1 reading of the inertial unit per control cycle"
 LEVELS: tuple[ShedLevel, ...] = (
-    ShedLevel(True, 1, 1, "all work is done"),
-    ShedLevel(False, 1, 1, "no search for objects"),
-    ShedLevel(False, 2, 1, "no search for objects, 1 of 2 frames"),
-    ShedLevel(False, 2, 2, "no search for objects, 1 of 2 frames, 1 of 2 periodic plans"),
-    ShedLevel(False, 4, 4, "no search for objects, 1 of 4 frames, 1 of 4 periodic plans"),
-    ShedLevel(False, 8, 8, "no search for objects, 1 of 8 frames, 1 of 8 periodic plans"),
+    ShedLevel(True, True, 1, 1, "all work is done"),
+    ShedLevel(False, True, 1, 1, _NEWEST),
+    ShedLevel(False, False, 1, 1, f"{_NEWEST}, no search for objects"),
+    ShedLevel(False, False, 2, 1, f"{_NEWEST}, no search for objects, 1 of 2 frames"),
+    ShedLevel(False, False, 2, 2, f"{_NEWEST}, no search for objects, 1 of 2 frames and periodic plans"),
+    ShedLevel(False, False, 4, 4, f"{_NEWEST}, no search for objects, 1 of 4 frames and periodic plans"),
+    ShedLevel(False, False, 8, 8, f"{_NEWEST}, no search for objects, 1 of 8 frames and periodic plans"),
 )
 """Levels in the order in which work is reduced."""
 
@@ -132,7 +137,7 @@ class Shedding:
         Args:
             signs: signs of overload.
             plans: counter of late plans.
-            apply: function that makes the imaging task follow a level.
+            apply: function that makes navigation and imaging follow a level.
             frames: function that returns the numbers of frames that were not taken, and of late frames.
             services: services of the loop.
         """

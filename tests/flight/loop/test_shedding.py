@@ -6,9 +6,11 @@ import itertools
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from flight.link import events
+from flight.loop.navigation import Navigation
 from flight.loop.shedding import LEVELS, BusyPeriods, OverloadSign, Shedding, ShedLevel
 
 S = 1_000_000_000
@@ -51,17 +53,19 @@ class Bench:
         return LEVELS.index(self.applied[-1]) if self.applied else 0
 
 
-def test_levels_reduce_the_search_first_then_frames_then_plans_and_never_restore_work() -> None:
+def test_levels_reduce_readings_first_then_the_search_then_frames_then_plans_and_never_restore_work() -> None:
     first = {
         name: next(i for i, level in enumerate(LEVELS) if reduced(level))
         for name, reduced in {
+            "readings": lambda level: not level.every_reading,
             "search": lambda level: not level.search,
             "frames": lambda level: level.frame_every > 1,
             "plans": lambda level: level.plan_every > 1,
         }.items()
     }
-    assert first["search"] < first["frames"] < first["plans"]
+    assert first["readings"] < first["search"] < first["frames"] < first["plans"]
     for before, after in itertools.pairwise(LEVELS):
+        assert after.every_reading <= before.every_reading
         assert after.search <= before.search
         assert after.frame_every >= before.frame_every
         assert after.plan_every >= before.plan_every
@@ -128,3 +132,32 @@ def test_level_and_counters_are_recorded_when_they_change() -> None:
     bench.run(3, frames=True)
     bench.run(30)
     assert [(row["level"], row["frames_late"]) for row in bench.records] == [(0, 1), (1, 2), (1, 3)]
+
+
+def test_thinned_navigation_uses_the_newest_reading_of_a_cycle_and_watches_all() -> None:
+    ingested, noted = [], []
+    navigation = object.__new__(Navigation)
+    readings = [
+        SimpleNamespace(time_ns=time_ns, field=np.ones(3), rate=np.ones(3), has_rate=True)
+        for time_ns in (1, 2, 3)
+    ]
+    fakes: dict[str, Any] = {
+        "_filter": SimpleNamespace(catch_up=lambda _: None, doubts_commands=False),
+        "_unit": SimpleNamespace(poll=lambda: readings),
+        "_facts": SimpleNamespace(update=lambda *_: None),
+        "_streams": SimpleNamespace(note=lambda *row: noted.append(row[:2])),
+        "_magnetometer": None,
+        "_doubted": False,
+        "_is_usable": lambda *_: True,
+        "_ingest": ingested.append,
+        "_watch_line": lambda _: None,
+    }
+    for name, value in fakes.items():
+        setattr(navigation, name, value)
+    for thinned in (False, True):
+        ingested.clear()
+        noted.clear()
+        navigation.thin(thinned)
+        used = navigation.update(10)
+        assert list(used) == ingested == (readings[-1:] if thinned else readings)
+        assert [time for name, time in noted if name == "imu"] == [1, 2, 3]

@@ -1,0 +1,235 @@
+"""A board of the 800 MHz class: `python -m tests.studies.bench slow_board [--orbit] [--share S]`.
+
+The flight flies in real time on emulated devices, with vision and planner, in a share of one core and in
+512 MB of memory. The share makes this core as fast as an ARM Cortex-A53 at 800 MHz: the yardstick (heap sort
+and Linpack's elimination) is measured here and compared with the published figures of that processor
+(`tests.support.processor_share`). The inertial unit sends 200 readings a second. The emulated devices are
+outside the limit. `--camera-period` and `--replan-period` ask for more work than fits, so that work is shed.
+Needs root, and a cgroup hierarchy with the controllers `cpu` and `memory`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import socket
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ground.telemetry import Run, read_run
+from tests.hal.guardian.live_flight import LiveFlight
+from tests.studies.bench import executive
+from tests.support import process_watch
+from tests.support.executive_figures import PERIOD_NS, Began, Figures, evaluate
+from tests.support.process_watch import MIB, answering
+from tests.support.processor_share import CORTEX_A53, Limits, limited, measure
+
+MEMORY = 512 * 1024 * 1024
+"""Bytes of memory of the board."""
+IMU_HZ, IMU_BAUD = 200, 230_400
+SLOW_AFTER_S, FRAME_AGE_S, TIMEOUT_S = 5.0, 60.0, 60.0
+"""Times (s) that a slow board needs: of a frame, between frames, and of a job until it is given up."""
+_WORKERS = ("planner", "vision", "wide")
+_PATIENCE_S = 240.0
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is flown: duration (s), craft, periods (s) of frames and plans, and share of a core or None."""
+
+    duration: float
+    orbit: bool
+    camera_period: float
+    replan_period: float
+    share: float | None
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Measure the yardstick, fly, and print what fitted and what was shed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=3.0, metavar="M", help="default %(default)s")
+    parser.add_argument("--orbit", action="store_true", help="fly the satellite, not the step demonstration")
+    parser.add_argument("--camera-period", type=float, default=5.0, metavar="S", help="default %(default)s")
+    parser.add_argument(
+        "--replan-period", type=float, metavar="S", help="default 5, in orbit 10, the shortest permitted"
+    )
+    limit = parser.add_mutually_exclusive_group()
+    limit.add_argument("--share", type=float, metavar="S", help="of a core (default: by the yardstick)")
+    limit.add_argument("--no-limit", action="store_true", help="fly with the whole machine, to compare")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args(arguments)
+    if not 0.5 <= options.minutes < 1e4:
+        parser.error(f"--minutes {options.minutes:g}: a flight takes half a minute at least")
+    share, printed = options.share, ""
+    if share is None and not options.no_limit:
+        here = measure()
+        share = here.share(CORTEX_A53)
+        printed = (
+            f"yardstick: {here.sorts:.0f} sorts/s, {here.mflops:.0f} MFLOPS here; {CORTEX_A53.sorts:.0f}, "
+            f"{CORTEX_A53.mflops:.0f} of {CORTEX_A53.name} ({CORTEX_A53.source})\n"
+        )
+    if share is not None and not 0.001 <= share <= 1.0:
+        parser.error(f"--share {share:g}: must lie between 0.001 and 1")
+    least = executive.SHORTEST_REPLAN if options.orbit else 5.0
+    replan = options.replan_period or least
+    wish = Wish(60.0 * options.minutes, options.orbit, options.camera_period, replan, share)
+    with executive._compiled(), tempfile.TemporaryDirectory() as folder:
+        figures = fly(Path(folder), wish)
+    if options.json:
+        sys.stdout.write(json.dumps({"wish": asdict(wish), "yardstick": printed, **figures}) + "\n")
+    else:
+        sys.stdout.write(printed + table(wish, figures))
+    return int(figures["lost_beyond_machine"] > 0 or figures["memory_refusals"] > 0)
+
+
+def configuration(wish: Wish) -> str:
+    """Return the configuration, whose inertial unit sends 200 readings a second."""
+    load = executive.Load(wish.duration, wish.camera_period, wish.replan_period, orbit=wish.orbit)
+    tree = yaml.safe_load(executive.full_load(load))
+    if wish.orbit:
+        tree["pointing"]["replan_period"] = wish.replan_period
+    else:
+        tree["guidance"]["strategy"] = "receding"
+    tree["inertial_unit"] |= {"rate_hz": IMU_HZ, "baud_rate": IMU_BAUD}
+    tree["camera"] |= {"vision_slow_after": SLOW_AFTER_S, "max_age": FRAME_AGE_S}
+    tree["executive"] = {"planner_timeout": TIMEOUT_S, "vision_timeout": TIMEOUT_S}
+    return yaml.safe_dump(tree, sort_keys=False)
+
+
+def fly(folder: Path, wish: Wish) -> Figures:
+    """Fly once in `folder`, and return the figures. Raises OSError where the limit is refused."""
+    config, devices, wakes = folder / "flight.yaml", folder / "devices", folder / "wakes"
+    facts = devices / "facts.json"
+    config.write_text(configuration(wish), encoding="utf-8")
+    devices.mkdir()
+    with ExitStack() as stack:
+        limits = stack.enter_context(limited(wish.share, MEMORY)) if wish.share is not None else None
+        bare = "tests.studies.bench.bare_loop", str(PERIOD_NS), "0", str(wakes)
+        stack.enter_context(answering(*bare))
+        stack.enter_context(
+            answering("sim_hal", "serve", str(config), "--folder", str(devices), "--facts", str(facts))
+        )
+        if limits is not None:
+            for process in process_watch.below(_own_process()):
+                limits.release(process)
+        notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        notifications.bind(str(folder / "notify"))
+        words = folder, config, notifications, wish.duration, "--devices", str(facts)
+        flight = LiveFlight(*words, before="" if limits is None else limits.line())
+        stack.callback(flight.end)
+        stop = threading.Event()
+        if limits is not None:
+            demoting = threading.Thread(target=_demote, args=(flight, limits, stop), daemon=True)
+            demoting.start()
+            stack.callback(demoting.join)
+        stack.callback(stop.set)
+        ready_ns = flight.wait_for("READY=1", _PATIENCE_S)
+        busy = process_watch.look({"control": flight.process.pid}).processor["control"]
+        offset_ns = time.time_ns() - time.monotonic_ns()
+        load = executive.Load(wish.duration, warm_up=min(30.0, 0.2 * wish.duration), look_period=2.0)
+        watched = executive._watch(flight, notifications, load)
+        error = flight.end()
+        used = None if limits is None else limits.used()
+    if flight.process.returncode != 0:
+        raise RuntimeError(f"the flight ended with status {flight.process.returncode}: {error.strip()}")
+    began = Began(flight.begun_ns, ready_ns, busy, offset_ns)
+    found = evaluate(flight.folder, devices, wakes, began, watched, load.warm_up).figures
+    found |= _shed(read_run(flight.folder), wish.duration)
+    found |= {"memory_refusals": 0 if used is None else used.refusals}
+    if used is not None:
+        found |= {"throttled": used.throttled / max(used.periods, 1), "memory_group_mib": used.memory / MIB}
+    return found
+
+
+def _own_process() -> int:
+    import os  # noqa: PLC0415
+
+    return os.getpid()
+
+
+def _demote(flight: LiveFlight, limits: Limits, stop: threading.Event) -> None:
+    """Put each worker behind the control process as soon as it exists."""
+    done: set[int] = set()
+    while not stop.wait(0.1):
+        for role, process in executive.members(flight).items():
+            if role in _WORKERS and process not in done:
+                limits.demote(process)
+                done.add(process)
+
+
+def _shed(run: Run, seconds: float) -> Figures:
+    """Return what the flight says it did and shed."""
+    house, load = run["housekeeping"], run["workload"]
+    last = house[-1]
+    span = (int(last["time_ns"]) - int(house[0]["time_ns"])) * 1e-9
+    events = [bytes(event["name"]).rstrip(b"\0").decode() for event in run["event"]]
+    counters = ("frames_shed", "plans_shed", "frames_late", "plans_late")
+    return {
+        "imu_hz": (int(last["imu_packets"]) - int(house[0]["imu_packets"])) / span,
+        "frames": int(last["frames"]),
+        "streak_rates": int(last["streak_rates"]),
+        "plans_accepted": int(last["plans_accepted"]),
+        "plans_refused": int(last["plans_refused"]),
+        "level": int(load["level"].max()) if len(load) else 0,
+        "level_at_end": int(load["level"][-1]) if len(load) else 0,
+        **{name: int(load[name][-1]) if len(load) else 0 for name in counters},
+        "seconds": seconds,
+        "events": {name: events.count(name) for name in sorted(set(events))},
+    }
+
+
+def table(wish: Wish, figures: Figures) -> str:
+    """Return the figures as text."""
+    late, spent = figures["lateness_s"], figures["execution_s"]
+    group = f"; the group's {figures['memory_group_mib']:.0f} MiB" if "throttled" in figures else ""
+    throttled = f", throttled in {figures['throttled']:.0%} of the periods" if "throttled" in figures else ""
+    limit = "no limit" if wish.share is None else f"{wish.share:.1%} of a core, 512 MB{throttled}"
+    rows: list[tuple[str, Any]] = [
+        ("craft; limit", f"{'satellite' if wish.orbit else 'testbed'}; {limit}"),
+        (
+            "control cycles; lost; lost while the machine was there; by the bare loop",
+            "; ".join(
+                str(figures[name]) for name in ("slots", "lost", "lost_beyond_machine", "lost_by_bare_loop")
+            ),
+        ),
+        ("lateness, ms", ", ".join(f"{name} {1e3 * value:.2f}" for name, value in late.items())),
+        ("duration of a cycle, ms", ", ".join(f"{name} {1e3 * value:.2f}" for name, value in spent.items())),
+        ("processor of control, % of a core", f"{100.0 * figures['processor_control']:.1f}"),
+        ("memory (PSS), largest, MiB", f"{figures['memory_alone_max_mib']:.0f}{group}"),
+        (
+            "exec to READY; to the first current, s",
+            f"{figures['ready_s']:.1f}; {figures['first_command_s']:.1f}",
+        ),
+        ("readings of the inertial unit, Hz", f"{figures['imu_hz']:.1f}"),
+        (
+            "frames taken; late; shed",
+            f"{figures['frames']}; {figures['frames_late']}; {figures['frames_shed']}",
+        ),
+        (
+            "plans flown; refused; late; shed",
+            "; ".join(
+                str(figures[name]) for name in ("plans_accepted", "plans_refused", "plans_late", "plans_shed")
+            ),
+        ),
+        ("level of shedding: highest; at the end", f"{figures['level']}; {figures['level_at_end']}"),
+        (
+            "jobs",
+            "; ".join(
+                f"{name} {jobs['done']} done, {jobs['not_done']} not, at work {jobs['busy']:.0%}"
+                for name, jobs in figures["jobs"].items()
+            ),
+        ),
+        ("events", ", ".join(f"{name} {count}" for name, count in figures["events"].items())),
+    ]
+    return "".join(f"{name}: {value}\n" for name, value in rows)

@@ -1,0 +1,180 @@
+"""A share of a core for processes under test: how large it is for a slower processor, and how to enforce it.
+
+The kernel enforces the share (CFS bandwidth of the controller `cpu`, cgroup v1 or v2), on one core, with a
+period of 5 ms. The kernel grants 1 ms at least, so that the period is longer for shares below 20 %. Within
+the share, the control process comes before its workers, as the kernel of a board schedules them: control is
+in a group of its own with a far greater weight. A limiter by SIGSTOP and SIGCONT is not offered, because the
+flight takes a stopped worker for a failed one and replaces it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+PERIOD_US = 5_000
+"""Period (us) of the limit: the unit's `CPUQuotaPeriodSec`."""
+_LEAST_QUOTA_US = 1_000
+"""Shortest run time (us) in a period that the kernel accepts."""
+_ROOT = Path("/sys/fs/cgroup")
+_SOURCE = Path(__file__).with_name("yardstick.c")
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """Speed of a processor on the two kernels of the yardstick, as published.
+
+    Attributes:
+        sorts: arrays of 8,111 integers sorted by heap sort per second (NBench's numeric sort).
+        mflops: million floating-point operations per second of Linpack in double precision.
+        source: where the figures are published.
+    """
+
+    name: str
+    sorts: float
+    mflops: float
+    source: str
+
+
+CORTEX_A53 = Published(
+    "ARM Cortex-A53 at 800 MHz (TI AM65x)",
+    355.67,
+    325.3,
+    "Texas Instruments, Processor SDK Linux for AM65x, RT-linux 11.02 Performance Guide",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Yardstick:
+    """Speed of this core on the two kernels, in the units of `Published`."""
+
+    sorts: float
+    mflops: float
+
+    def share(self, slow: Published) -> float:
+        """Return the share of this core that is as fast: the geometric mean of both kernels' ratios."""
+        return math.sqrt(slow.sorts / self.sorts * slow.mflops / self.mflops)
+
+
+def measure() -> Yardstick:
+    """Compile the yardstick and run it. Raises RuntimeError without a C compiler."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        raise RuntimeError("no C compiler for the yardstick: install one, or give the share by --share")
+    with tempfile.TemporaryDirectory() as folder:
+        program = Path(folder, "yardstick")
+        subprocess.run([compiler, "-O2", str(_SOURCE), "-o", str(program), "-lm"], check=True)
+        printed = subprocess.run([str(program)], capture_output=True, text=True, check=True).stdout
+    sorts, mflops, _ = map(float, printed.split())
+    return Yardstick(sorts, mflops)
+
+
+@dataclass(frozen=True, slots=True)
+class Used:
+    """What a limited group used: throttled periods of all periods, largest memory (bytes), refusals."""
+
+    periods: int
+    throttled: int
+    memory: int
+    refusals: int
+
+
+class Limits:
+    """The groups of one run: `control` and `workers` inside the limit, `devices` outside of it."""
+
+    def __init__(self, share: float, memory: int) -> None:
+        """Make the groups. Raises OSError where the kernel or the rights refuse them."""
+        name = f"knightcube-board-{os.getpid()}"
+        self._is_v2 = (_ROOT / "cgroup.controllers").exists()
+        if self._is_v2:
+            (_ROOT / "cgroup.subtree_control").write_text("+cpu +memory", encoding="ascii")
+        self._cpu = (_ROOT if self._is_v2 else _ROOT / "cpu") / name
+        self._memory = self._cpu if self._is_v2 else _ROOT / "memory" / name
+        self._devices = self._cpu.with_name(f"{name}-devices")
+        self.period_us = max(PERIOD_US, math.ceil(_LEAST_QUOTA_US / share))
+        self.quota_us = round(share * self.period_us)
+        try:
+            self._make(memory)
+        except OSError:
+            self.close()
+            raise
+
+    def _make(self, memory: int) -> None:
+        for folder in {self._cpu, self._memory, self._devices}:
+            folder.mkdir()
+        if self._is_v2:
+            (self._cpu / "cgroup.subtree_control").write_text("+cpu", encoding="ascii")
+            (self._cpu / "cpu.max").write_text(f"{self.quota_us} {self.period_us}", encoding="ascii")
+            (self._cpu / "memory.max").write_text(str(memory), encoding="ascii")
+        else:
+            (self._cpu / "cpu.cfs_period_us").write_text(str(self.period_us), encoding="ascii")
+            (self._cpu / "cpu.cfs_quota_us").write_text(str(self.quota_us), encoding="ascii")
+            (self._memory / "memory.limit_in_bytes").write_text(str(memory), encoding="ascii")
+        for part in ("control", "workers"):
+            (self._cpu / part).mkdir()
+        weight, most, least = ("cpu.weight", 10000, 1) if self._is_v2 else ("cpu.shares", 262144, 2)
+        # Other work of this machine must not take the share: the groups come before it.
+        for folder in (self._cpu, self._devices, self._cpu / "control"):
+            (folder / weight).write_text(str(most), encoding="ascii")
+        (self._cpu / "workers" / weight).write_text(str(least), encoding="ascii")
+
+    def line(self) -> str:
+        """Return a line of Python by which a process enters the group of the control process."""
+        places = {self._cpu / "control", self._memory if not self._is_v2 else self._cpu / "control"}
+        files = [str(place / "cgroup.procs") for place in sorted(places)]
+        return (
+            f"for name in {files!r}: open(name, 'w').write(str(os.getpid()))\nos.sched_setaffinity(0, {{0}})"
+        )
+
+    def demote(self, process: int) -> None:
+        """Move a worker behind the control process."""
+        self._enter(self._cpu / "workers", process)
+
+    def release(self, process: int) -> None:
+        """Move a process out of the limit, to the devices."""
+        self._enter(self._devices, process)
+
+    @staticmethod
+    def _enter(folder: Path, process: int) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            (folder / "cgroup.procs").write_text(str(process), encoding="ascii")
+
+    def used(self) -> Used:
+        """Return what the group used until now."""
+        rows = dict(line.split() for line in (self._cpu / "cpu.stat").read_text().splitlines())
+        peak, events = ("memory.peak", "memory.events") if self._is_v2 else ("memory.max_usage_in_bytes", "")
+        refused = "memory.failcnt" if not self._is_v2 else events
+        words = (self._memory / refused).read_text().split()
+        refusals = int(words[words.index("max") + 1] if self._is_v2 else words[0])
+        memory = int((self._memory / peak).read_text())
+        return Used(int(rows["nr_periods"]), int(rows["nr_throttled"]), memory, refusals)
+
+    def close(self) -> None:
+        """Remove the groups, whose processes have ended."""
+        for folder in (self._cpu / "control", self._cpu / "workers", self._cpu, self._memory, self._devices):
+            for _ in range(100):
+                if not folder.exists():
+                    break
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
+                    break
+                time.sleep(0.05)
+
+
+@contextmanager
+def limited(share: float, memory: int) -> Iterator[Limits]:
+    """Make the groups, and remove them at the end."""
+    limits = Limits(share, memory)
+    try:
+        yield limits
+    finally:
+        limits.close()
