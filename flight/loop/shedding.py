@@ -136,9 +136,9 @@ class Shedding:
 
         Args:
             signs: signs of overload.
-            plans: counter of late plans.
+            plans: counter of plans that are late.
             apply: function that makes navigation and imaging follow a level.
-            frames: function that returns the numbers of frames that were not taken, and of late frames.
+            frames: function that returns the numbers of frames not taken, and of frames that are late.
             services: services of the loop.
         """
         self._signs, self._plans, self._apply, self._frames = tuple(signs), plans, apply, frames

@@ -131,9 +131,7 @@ class Limits:
         """Return a line of Python by which a process enters the group of the control process."""
         places = {self._cpu / "control", self._memory if not self._is_v2 else self._cpu / "control"}
         files = [str(place / "cgroup.procs") for place in sorted(places)]
-        return (
-            f"for name in {files!r}: open(name, 'w').write(str(os.getpid()))\nos.sched_setaffinity(0, {{0}})"
-        )
+        return f"for name in {files!r}: open(name, 'w').write(str(os.getpid()))\nos.sched_setaffinity(0, {{{core}}})"
 
     def demote(self, process: int) -> None:
         """Move a worker behind the control process."""

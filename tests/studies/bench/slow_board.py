@@ -3,7 +3,7 @@
 The flight flies in real time on emulated devices, with vision and planner, in a share of one core and in
 512 MB of memory. The share makes this core as fast as an ARM Cortex-A53 at 800 MHz: the yardstick (heap sort
 and Linpack's elimination) is measured here and compared with the published figures of that processor
-(`tests.support.processor_share`). The inertial unit sends 200 readings a second. The emulated devices are
+(`tests.support.processor_share`). The inertial unit sends 200 readings a second (`--imu-rate`). The emulated devices are
 outside the limit. `--camera-period` and `--replan-period` ask for more work than fits, so that work is shed.
 Needs root, and a cgroup hierarchy with the controllers `cpu` and `memory`.
 """
@@ -35,7 +35,7 @@ from tests.support.processor_share import CORTEX_A53, Limits, limited, measure
 
 MEMORY = 512 * 1024 * 1024
 """Bytes of memory of the board."""
-IMU_HZ, IMU_BAUD = 200, 230_400
+IMU_BAUD = 230_400
 SLOW_AFTER_S, FRAME_AGE_S, TIMEOUT_S = 5.0, 60.0, 60.0
 """Times (s) that a slow board needs: of a frame, between frames, and of a job until it is given up."""
 _WORKERS = ("planner", "vision", "wide")
@@ -44,13 +44,17 @@ _PATIENCE_S = 240.0
 
 @dataclass(frozen=True)
 class Wish:
-    """What is flown: duration (s), craft, periods (s) of frames and plans, and share of a core or None."""
+    """What is flown.
+
+    Duration (s), craft, periods (s) of frames and plans, share of a core or None, and readings per second.
+    """
 
     duration: float
     orbit: bool
     camera_period: float
     replan_period: float
     share: float | None
+    imu_rate: int
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -67,6 +71,9 @@ def main(arguments: Sequence[str]) -> int:
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--share", type=float, metavar="S", help="of a core (default: by the yardstick)")
     limit.add_argument("--no-limit", action="store_true", help="fly with the whole machine, to compare")
+    parser.add_argument(
+        "--imu-rate", type=int, choices=(40, 50, 100, 200), default=200, help="Hz, default %(default)s"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
     if not 0.5 <= options.minutes < 1e4:
@@ -83,7 +90,7 @@ def main(arguments: Sequence[str]) -> int:
         parser.error(f"--share {share:g}: must lie between 0.001 and 1")
     least = executive.SHORTEST_REPLAN if options.orbit else 5.0
     replan = options.replan_period or least
-    wish = Wish(60.0 * options.minutes, options.orbit, options.camera_period, replan, share)
+    wish = Wish(60.0 * options.minutes, options.orbit, options.camera_period, replan, share, options.imu_rate)
     with executive._compiled(), tempfile.TemporaryDirectory() as folder:
         figures = fly(Path(folder), wish)
     if options.json:
@@ -94,14 +101,14 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def configuration(wish: Wish) -> str:
-    """Return the configuration, whose inertial unit sends 200 readings a second."""
+    """Return the configuration, with the times that a slow board needs."""
     load = executive.Load(wish.duration, wish.camera_period, wish.replan_period, orbit=wish.orbit)
     tree = yaml.safe_load(executive.full_load(load))
     if wish.orbit:
         tree["pointing"]["replan_period"] = wish.replan_period
     else:
         tree["guidance"]["strategy"] = "receding"
-    tree["inertial_unit"] |= {"rate_hz": IMU_HZ, "baud_rate": IMU_BAUD}
+    tree["inertial_unit"] |= {"rate_hz": wish.imu_rate, "baud_rate": IMU_BAUD}
     tree["camera"] |= {"vision_slow_after": SLOW_AFTER_S, "max_age": FRAME_AGE_S}
     tree["executive"] = {"planner_timeout": TIMEOUT_S, "vision_timeout": TIMEOUT_S}
     return yaml.safe_dump(tree, sort_keys=False)
