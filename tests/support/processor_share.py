@@ -131,7 +131,9 @@ class Limits:
         """Return a line of Python by which a process enters the group of the control process."""
         places = {self._cpu / "control", self._memory if not self._is_v2 else self._cpu / "control"}
         files = [str(place / "cgroup.procs") for place in sorted(places)]
-        return f"for name in {files!r}: open(name, 'w').write(str(os.getpid()))\nos.sched_setaffinity(0, {{{core}}})"
+        core = sorted(os.sched_getaffinity(0))[-1]
+        enter = f"for name in {files!r}: open(name, 'w').write(str(os.getpid()))"
+        return f"{enter}\nos.sched_setaffinity(0, {{{core}}})"
 
     def demote(self, process: int) -> None:
         """Move a worker behind the control process."""

@@ -3,8 +3,9 @@
 The flight flies in real time on emulated devices, with vision and planner, in a share of one core and in
 512 MB of memory. The share makes this core as fast as an ARM Cortex-A53 at 800 MHz: the yardstick (heap sort
 and Linpack's elimination) is measured here and compared with the published figures of that processor
-(`tests.support.processor_share`). The inertial unit sends 200 readings a second (`--imu-rate`). The emulated devices are
-outside the limit. `--camera-period` and `--replan-period` ask for more work than fits, so that work is shed.
+(`tests.support.processor_share`). The inertial unit sends 200 readings a second (`--imu-rate`). The emulated
+devices are outside the limit. `--camera-period` and `--replan-period` ask for more work than fits, so that
+work is shed.
 Needs root, and a cgroup hierarchy with the controllers `cpu` and `memory`.
 """
 
