@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from flight.app.cli import main
 from flight.schema import reader
 from flight.schema.orbit import OrbitConfig
 from ground.telemetry import read_run
@@ -64,6 +66,48 @@ def test_the_installer_refuses_what_check_refuses(
     said = capsys.readouterr()
     assert (said.out, said.err.count("\n")) == ("", 1)
     assert complaint in said.err
+
+
+_WRONG: list[tuple[Path, tuple[str | int, ...], object]] = [
+    (TESTBED, ("plant", "colour"), 3),
+    (TESTBED, ("plant", "inertia"), math.nan),
+    (TESTBED, ("coils", "current_limit"), math.inf),
+    (TESTBED, ("coils", "windings", 1, "channels"), [0, 1]),
+    (TESTBED, ("power_monitor", "address"), 0x40),
+    (TESTBED, ("camera", "mounting"), [0.0, 0.0, 0.0, 0.0]),
+    (TESTBED, ("camera", "device", "pixel_format"), "JPEG"),
+    (TESTBED, ("camera",), [1, 2]),
+    (TESTBED, ("body",), "os:system"),
+    (TESTBED, ("inertial_unit", "max_age"), 0.01),
+    (TESTBED, ("steps", 1, "q2"), 1.5),
+    (ORBIT, ("craft", "inertia"), [1e-3, 1e-3, 9e-3]),
+    (ORBIT, ("solar_strings", "strings", 1, "channel"), 0),
+    (ORBIT, ("solar_strings", "strings", 3, "address"), 0x40),
+    (ORBIT, ("pointing", "across"), [0.0, 0.0, 1.0]),
+    (ORBIT, ("targets", 0, "point"), "mars"),
+    (ORBIT, ("commands", "udp"), "0.0.0.0:70000"),
+]
+
+
+@pytest.mark.parametrize(("path", "key", "value"), _WRONG, ids=[str(key[-1]) for _, key, _ in _WRONG])
+def test_the_drop_in_and_check_refuse_a_wrong_value_with_the_same_words(
+    path: Path,
+    key: tuple[str | int, ...],
+    value: object,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    part = tree
+    for word in key[:-1]:
+        part = part[word]
+    part[key[-1]] = value
+    changed = tmp_path / "flight.yaml"
+    changed.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    assert board_dropin.main([str(changed)]) == 2
+    refused = capsys.readouterr().err.partition(": ")[2]
+    assert main(["check", str(changed)]) == 2
+    assert capsys.readouterr().err.partition(": ")[2] == refused != ""
 
 
 def test_the_unit_knows_the_writes_that_stop_other_bridges(tmp_path: Path) -> None:
