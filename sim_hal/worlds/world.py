@@ -127,10 +127,13 @@ class WorldInputs:
 
 
 def make_world(inputs: WorldInputs) -> World:
-    """Return the world that a configuration names. Raises ConfigError for an unknown world."""
+    """Return the world that a configuration names. Raises ConfigError for any other object."""
     named = inputs.section.world
     factory = imported("simulation.world", named, WORLDS, os.environ)
-    world = factory(inputs) if callable(factory) else None
+    try:
+        world = factory(inputs) if callable(factory) else None
+    except TypeError as error:
+        raise ConfigError("simulation.world", f"is {named!r}: its factory fails: {error}") from error
     if not isinstance(world, World):
         raise ConfigError(
             "simulation.world", f"is {named!r}: its factory returns no World (sim_hal.worlds.world)"
