@@ -114,10 +114,6 @@ class StarMatch:
     mirrored: bool = False
 
 
-# For a vector v, the product v @ _CROSS, reshaped to (3, 3), is the cross-product matrix [v x].
-_CROSS = np.array(
-    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0.0]]
-)
 # Rotation step (rad) below which the iteration ends; a step d leaves an error of about d^2, or 0.002 arcsec.
 _SETTLED = 1e-4
 _MOST_STEPS = 6
@@ -163,10 +159,13 @@ def stretched(direction: FloatArray, scale: float | FloatArray) -> FloatArray:
     """Return unit vectors (n, 3) with their tangents x/z, y/z multiplied by `scale`, a number or (n,)."""
     if isinstance(scale, float) and scale == 1.0:
         return direction
-    x, y, z = direction.T
+    z = direction[:, 2]
+    # The length of a unit vector whose tangents are multiplied by s is the root of s^2 + (1 - s^2) z^2.
+    squared = scale * scale
+    shrink = 1.0 / np.sqrt(squared + (1.0 - squared) * (z * z))
     longer = np.empty_like(direction)
-    longer[:, 0], longer[:, 1], longer[:, 2] = scale * x, scale * y, z
-    longer /= np.sqrt(np.einsum("ij,ij->i", longer, longer))[:, None]
+    np.multiply(direction[:, :2], (scale * shrink)[:, None], out=longer[:, :2])
+    np.multiply(z, shrink, out=longer[:, 2])
     return longer
 
 
@@ -214,22 +213,32 @@ def refine(
     """
     parameters = 4 if free_scale else 3
     weight = (1.0 / (sigma * scale))[:, None]
+    # Weighted predictions, residuals and scale slopes; their 9 x 9 Gram matrix holds all normal equations.
+    rows = np.zeros((len(observed), 9))
+    normal = np.zeros((parameters, parameters))
     for _ in range(_MOST_STEPS):
         b = stretched(observed, scale)
         predicted = reference @ matrix.T
-        residual = ((b - predicted) * weight).reshape(-1)
-        slope = np.empty((len(b), 3, parameters))
-        slope[:, :, :3] = -(predicted @ _CROSS).reshape(-1, 3, 3)
+        np.multiply(predicted, weight, out=rows[:, :3])
+        np.multiply(b - predicted, weight, out=rows[:, 3:6])
         if free_scale:
-            slope[:, :, 3] = scale_slope(b)
-        slope *= weight[:, :, None]
-        flat = slope.reshape(-1, parameters)
-        normal = flat.T @ flat
+            np.multiply(scale_slope(b), weight, out=rows[:, 6:])
+        # A rotation d changes a residual by d x p, so its gradient is the sum of the products p x r.
+        gram = (rows.T @ rows).tolist()
+        trace = gram[0][0] + gram[1][1] + gram[2][2]
+        gradient = _summed_cross(gram, 3)
+        for i in range(3):
+            for j in range(3):
+                normal[i, j] = (trace if i == j else 0.0) - gram[i][j]
+        if free_scale:
+            normal[3, :3] = normal[:3, 3] = _summed_cross(gram, 6)
+            normal[3, 3] = gram[6][6] + gram[7][7] + gram[8][8]
+            gradient.append(gram[3][6] + gram[4][7] + gram[5][8])
         try:
             covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         except np.linalg.LinAlgError:
             return None
-        step = -(covariance @ (residual @ flat))
+        step = -(covariance @ gradient)
         longest = float(np.abs(step).max())
         # The largest element of a matrix times the largest of its inverse approximates the condition number.
         condition = float(normal.max()) * float(covariance.max()) * _LEAST_INFORMATION
@@ -241,17 +250,34 @@ def refine(
         if longest < _SETTLED:
             break
     # The residuals after the last step follow from the linearised equations.
-    left = (residual + flat @ step).reshape(-1, 3)
+    left = rows[:, 3:6] + rows[:, :3] @ _cross_matrix(step[:3]).T
+    if free_scale:
+        left += step[3] * rows[:, 6:]
     return Refinement(matrix, scale, covariance, np.einsum("ij,ij->i", left, left))
+
+
+def _summed_cross(gram: list[list[float]], at: int) -> list[float]:
+    """Return the sum of p x q over the stars; p begins at column 0 of the Gram matrix, q at column `at`."""
+    return [
+        gram[1][at + 2] - gram[2][at + 1],
+        gram[2][at] - gram[0][at + 2],
+        gram[0][at + 1] - gram[1][at],
+    ]
+
+
+def _cross_matrix(vector: FloatArray) -> FloatArray:
+    """Return the matrix [v x] (3, 3) of a vector v (3,), for which [v x] p is the cross product v x p."""
+    x, y, z = vector.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:
     """Return the attitude matrix (3, 3) after a rotation `turn` (3,), rad, about the camera axes."""
-    x, y, z = (float(component) for component in turn)
+    x, y, z = turn.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     first = math.sin(angle) / angle if angle > 0.0 else 1.0
     second = 2.0 * (math.sin(0.5 * angle) / angle) ** 2 if angle > 0.0 else 0.5
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = _cross_matrix(turn)
     return np.asarray(matrix - (first * cross - second * (cross @ cross)) @ matrix)
 
 

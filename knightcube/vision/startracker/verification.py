@@ -230,7 +230,7 @@ def _bright_matched(
     expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]
 ) -> npt.NDArray[np.bool_]:
     """Return a mask of the matched stars, for the expected stars brighter than the median matched star."""
-    matched = np.isin(expected, star)
+    matched = (expected[:, None] == star).any(axis=1)
     places = np.flatnonzero(matched)
     return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]
 
