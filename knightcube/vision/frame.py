@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 
@@ -75,15 +76,24 @@ def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Back
     sample = pixels[: down * height, : across * width].reshape(down, height, across, width)
     sample = sample[:, stride // 2 :: stride, :, stride // 2 :: stride].transpose(0, 2, 1, 3)
     values = sample.reshape(down, across, -1).astype(np.float64)
-    median = np.median(values, axis=-1, keepdims=True)
-    spread = MAD_TO_SIGMA * np.median(np.abs(values - median), axis=-1, keepdims=True)
+    median = _median_of_blocks(values)
+    apart = np.abs(values - median)
+    spread = MAD_TO_SIGMA * _median_of_blocks(apart)
     # Quantisation can make the median deviation zero. A clipping limit of 1.5 counts keeps adjacent counts.
-    kept = np.abs(values - median) <= _CLIP * np.maximum(spread, 0.5)
+    kept = apart <= _CLIP * np.maximum(spread, 0.5)
     count = kept.sum(axis=-1)
     level = np.where(kept, values, 0.0).sum(axis=-1) / count
     variance = np.where(kept, (values - level[..., None]) ** 2, 0.0).sum(axis=-1) / count
     noise = np.sqrt(np.maximum(variance / _CLIPPED_SIGMA**2, _ROUNDING_VARIANCE))
     return Background(level, ndimage.median_filter(noise, size=3, mode="nearest"), (rows, columns))
+
+
+def _median_of_blocks(values: FloatArray) -> FloatArray:
+    """Return the medians (down, across, 1) of finite values (down, across, k), faster than `numpy.median`."""
+    middle = values.shape[-1] // 2
+    places = [middle] if values.shape[-1] % 2 else [middle - 1, middle]
+    ordered = np.partition(values, places, axis=-1)
+    return np.asarray(ordered[..., places].mean(axis=-1, keepdims=True))
 
 
 def place_among_blocks(pixel: FloatArray, pixels: int, blocks: int) -> tuple[IntArray, FloatArray]:
@@ -96,6 +106,22 @@ def place_among_blocks(pixel: FloatArray, pixels: int, blocks: int) -> tuple[Int
     place = np.clip((pixel - 0.5 * (width - 1)) / width, 0.0, blocks - 1.0)
     first = place.astype(np.int64)
     return first, place - first
+
+
+def among_blocks(
+    values: FloatArray, shape: tuple[int, int], column: npt.ArrayLike, row: npt.ArrayLike
+) -> FloatArray:
+    """Return block values (down, across) interpolated bilinearly at n pixels, (n,).
+
+    The blocks divide a frame of `shape`, and the pixels are at `column` (n,) and `row` (n,).
+    """
+    top, down = place_among_blocks(np.asarray(row, dtype=float), shape[0], values.shape[0])
+    left, across = place_among_blocks(np.asarray(column, dtype=float), shape[1], values.shape[1])
+    bottom = np.minimum(top + 1, values.shape[0] - 1)
+    right = np.minimum(left + 1, values.shape[1] - 1)
+    high = values[top, left] * (1.0 - across) + values[top, right] * across
+    low = values[bottom, left] * (1.0 - across) + values[bottom, right] * across
+    return np.asarray(high * (1.0 - down) + low * down)
 
 
 def interpolation_weights(pixels: int, blocks: int) -> FloatArray:
@@ -282,6 +308,39 @@ def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]
     return row, column
 
 
+def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the hot pixels of a frame (rows, columns), as `find_hot_pixels` does.
+
+    Only the pixels that exceed the lowest limit of the surrounding blocks are tested, so that the background
+    is not computed for every pixel. If at most `most` pixels exceed it, the returned arrays are empty.
+    """
+    from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
+
+    (rows, columns), (down, across) = pixels.shape, background.level.shape
+    # Between block centres, level and noise are interpolated with those of the adjacent blocks.
+    limit = background.level + _HOT_SIGMAS * background.noise
+    lowest = ndimage.minimum_filter(limit, size=3, mode="nearest")
+    if np.issubdtype(pixels.dtype, np.integer):
+        # Integer pixels are compared in their own type, which is four times as fast.
+        lowest = np.clip(np.ceil(lowest), np.iinfo(pixels.dtype).min, np.iinfo(pixels.dtype).max)
+    lowest = lowest.astype(pixels.dtype)
+    height, owner = rows // down, np.minimum(np.arange(columns) // (columns // across), across - 1)
+    found: list[IntArray] = []
+    for block in range(down):
+        first, last = block * height, rows if block == down - 1 else (block + 1) * height
+        found.append(np.flatnonzero(pixels[first:last] >= lowest[block, owner]) + first * columns)
+    row, column = np.divmod(np.concatenate(found), columns)
+    if len(row) <= most:
+        return row[:0], column[:0]
+    level, noise = (
+        among_blocks(grid, background.shape, column, row) for grid in (background.level, background.noise)
+    )
+    bright = pixels[row, column] - level > _HOT_SIGMAS * noise
+    row, column, level, noise = row[bright], column[bright], level[bright], noise[bright]
+    row, column, _ = _hot(pixels, row, column, noise, level)
+    return row, column
+
+
 def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
     """Return whether each of n windows of nine pixels contains only one or two hot pixels and noise.
 
@@ -295,13 +354,17 @@ def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
 
 
 def _hot(
-    signal: Image, row: IntArray, column: IntArray, noise: FloatArray
+    signal: Image, row: IntArray, column: IntArray, noise: FloatArray, level: FloatArray | float = 0.0
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return rows and columns of the hot pixels among m pixels, and the eight neighbours (8, k) of each."""
+    """Return rows and columns of the hot pixels among m pixels, and the eight neighbours (8, k) of each.
+
+    The background `level` (m,) is subtracted from each of the m pixels and from its neighbours.
+    """
     inside = (row > 0) & (row < signal.shape[0] - 1) & (column > 0) & (column < signal.shape[1] - 1)
+    level = np.broadcast_to(level, row.shape)[inside]
     row, column, noise = row[inside], column[inside], noise[inside]
-    around = np.stack([signal[row + dr, column + dc] for dr, dc in _AROUND])
-    own = signal[row, column]
+    around = np.stack([signal[row + dr, column + dc] for dr, dc in _AROUND]) - level
+    own = signal[row, column] - level
     # Of two adjacent hot pixels, both are tested, but a pixel with two brighter neighbours is not hot.
     hot = are_hot(np.concatenate([around, own[None]]), noise) & (np.count_nonzero(around > own, axis=0) <= 1)
     return row[hot], column[hot], around[:, hot]

@@ -15,6 +15,7 @@ from knightcube.vision.frame import (
     estimate_background,
     find_hot_pixels,
     frame_state,
+    hot_pixels_above,
     in_steps,
     interpolation_weights,
     label_pixels,
@@ -218,6 +219,24 @@ def test_hot_pixels_are_found_except_on_the_border() -> None:
     row, column = find_hot_pixels(signal, np.ones_like(signal))
     assert (row.tolist(), column.tolist()) == ([4], [6])
     assert not len(find_hot_pixels(signal, np.full_like(signal, 13.0**2))[0])  # below eight sigmas
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
+def test_the_fast_search_finds_the_same_hot_pixels_as_the_search_with_a_background_of_every_pixel(
+    kind: type[np.generic],
+) -> None:
+    rng = np.random.default_rng(31)
+    frame = rng.normal(40.0, 3.0, (203, 331)) + np.linspace(0.0, 90.0, 331)
+    places = rng.integers(0, frame.size, 400)
+    frame.reshape(-1)[places] += rng.uniform(10.0, 120.0, 400)
+    pixels = np.rint(np.clip(frame, 0.0, 255.0)).astype(kind)
+    background = estimate_background(pixels, 64, 8)
+    noise = background.map(background.noise)
+    expected = find_hot_pixels(pixels - background.map(background.level), noise * noise)
+    found = hot_pixels_above(pixels, background, 10)
+    assert len(expected[0]) > 100
+    assert np.array_equal(found, expected)
+    assert not len(hot_pixels_above(pixels, background, pixels.size)[0])
 
 
 def test_the_saturation_is_a_count_that_several_pixels_share() -> None:

@@ -369,22 +369,28 @@ def fit(
     """
     count = 5 if free_width else 4
     values = np.concatenate([offset, flux[:, None], np.zeros((len(flux), 1)), width[:, None]], axis=1)
+    # All steps share two arrays, because allocating large arrays takes more time than the arithmetic.
+    jacobian = np.empty((len(values), count, (2 * windows.half + 1) ** 2))
+    weighted = np.empty_like(jacobian)
     for step in range(steps + 1):
-        star, jacobian = _jacobian(values, windows, count)
-        residual = windows.light - star - values[:, SKY, None, None]
+        star = _model(values, windows, jacobian)
+        residual = windows.light - star
+        residual -= values[:, SKY, None, None]
         variance = noise.variance(star, windows.noise)
         good = windows.good
         if step >= steps - _CLIP_FROM_END:
             # The limit above which pixels are excluded tolerates PSFs that are not Gaussian.
             good = good & ~(residual * residual > _CLIP**2 * (variance + (_TOLERATED * star) ** 2))
         weight = (good / variance).reshape(len(values), -1)
-        weighted = jacobian * weight[:, None, :]
+        np.multiply(jacobian, weight[:, None, :], out=weighted)
         normal = weighted @ jacobian.transpose(0, 2, 1)
         inverse = _inverse(normal)
         if step < steps:
             gradient = (weighted @ residual.reshape(len(values), -1, 1))[:, :, 0]
             _advance(values, (inverse @ gradient[:, :, None])[:, :, 0], windows.half)
-    leverage = weight * np.sum(jacobian * (inverse @ jacobian), axis=1)
+    np.matmul(inverse, jacobian, out=weighted)
+    weighted *= jacobian
+    leverage = weight * np.sum(weighted, axis=1)
     return PsfFit(
         values[:, :2],
         values[:, FLUX],
@@ -400,25 +406,32 @@ def fit(
     )
 
 
-def _jacobian(values: FloatArray, windows: StarWindows, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the modelled counts of the stars (n, k, k), and their derivatives (n, count, k * k)."""
-    total: FloatArray | None = None
-    flux, size = values[:, FLUX, None], 2 * windows.half + 1
-    for shift, share in path(windows.trail):
+def _model(values: FloatArray, windows: StarWindows, jacobian: FloatArray) -> FloatArray:
+    """Return the modelled counts of the stars (n, k, k), and write their derivatives to `jacobian`.
+
+    The array `jacobian` (n, p, k * k) receives the derivatives by the first p of the parameters `values`
+    (n, 5), where p is 4 or 5.
+    """
+    flux, size, count = values[:, FLUX, None], 2 * windows.half + 1, jacobian.shape[1]
+    nodes = path(windows.trail)
+    total = jacobian.reshape(len(values), count, size, size)
+    out = total if len(nodes) == 1 else np.empty_like(total)
+    if len(nodes) > 1:
+        total[:] = 0.0
+    for shift, share in nodes:
         across, across_x, across_w = profile(values[:, X] + shift[:, 0], values[:, WIDTH], windows.half)
         down, down_y, down_w = profile(values[:, Y] + shift[:, 1], values[:, WIDTH], windows.half)
-        out = np.empty((len(values), count, size, size))
         np.multiply(down[:, :, None], (flux * across_x)[:, None, :], out=out[:, X])
         np.multiply((flux * down_y)[:, :, None], across[:, None, :], out=out[:, Y])
         np.multiply(down[:, :, None], across[:, None, :], out=out[:, FLUX])
         out[:, SKY] = 1.0
         if count > WIDTH:
-            out[:, WIDTH] = (flux * down)[:, :, None] * across_w[:, None, :]
+            np.multiply((flux * down)[:, :, None], across_w[:, None, :], out=out[:, WIDTH])
             out[:, WIDTH] += (flux * down_w)[:, :, None] * across[:, None, :]
-        total = share * out if total is None else total + share * out
-    assert total is not None  # A star's path has at least one quadrature node.
-    star = values[:, FLUX, None, None] * total[:, FLUX]
-    return star, total.reshape(len(values), count, -1)
+        if out is not total:
+            out *= share
+            total += out
+    return np.asarray(values[:, FLUX, None, None] * total[:, FLUX])
 
 
 def _advance(values: FloatArray, step: FloatArray, half: int) -> None:

@@ -21,12 +21,13 @@ import numpy.typing as npt
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
 from knightcube.vision.frame import (
     MAD_TO_SIGMA,
+    Background,
+    among_blocks,
     estimate_background,
-    find_hot_pixels,
+    hot_pixels_above,
     interpolation_weights,
     label_pixels,
     moments,
-    place_among_blocks,
     saturation_of_bright,
 )
 
@@ -62,15 +63,7 @@ class Surface:
 
     def at(self, column: npt.ArrayLike, row: npt.ArrayLike) -> FloatArray:
         """Return the values of the surface (n,) at the pixels `column` (n,), `row` (n,)."""
-        top, down = place_among_blocks(np.asarray(row, dtype=float), self.shape[0], self.values.shape[0])
-        left, across = place_among_blocks(
-            np.asarray(column, dtype=float), self.shape[1], self.values.shape[1]
-        )
-        bottom = np.minimum(top + 1, self.values.shape[0] - 1)
-        right = np.minimum(left + 1, self.values.shape[1] - 1)
-        high = self.values[top, left] * (1.0 - across) + self.values[top, right] * across
-        low = self.values[bottom, left] * (1.0 - across) + self.values[bottom, right] * across
-        return np.asarray(high * (1.0 - down) + low * down)
+        return among_blocks(self.values, self.shape, column, row)
 
     def factors(self) -> tuple[Float32Array, Float32Array]:
         """Return two matrices (rows, down), (down, columns) whose product is the surface at every pixel."""
@@ -137,10 +130,13 @@ def in_counts(pixels: Image) -> tuple[Image, float]:
     return (pixels / unit).astype(np.float32), unit
 
 
-def measure_sky(pixels: Image) -> SkyBackground:
-    """Return the sky background and noise of a frame (rows, columns), before and after smoothing."""
+def measure_sky(pixels: Image, single: Background | None = None) -> SkyBackground:
+    """Return the sky background and noise of a frame (rows, columns), before and after smoothing.
+
+    The background `single` of single pixels is measured unless it is given.
+    """
     shape = (pixels.shape[0], pixels.shape[1])
-    single = estimate_background(pixels, _SKY_BLOCK, _SINGLE_STRIDE)
+    single = estimate_background(pixels, _SKY_BLOCK, _SINGLE_STRIDE) if single is None else single
     level = Surface(single.level, shape)
     row, column = np.arange(2, shape[0] - 1, _STRIDE), np.arange(2, shape[1] - 1, _STRIDE)
     sample = _smoothed_at(pixels, row, column)
@@ -181,23 +177,21 @@ def one_sided(reach: FloatArray, noise: FloatArray) -> BoolArray:
     return np.asarray((reach < 2.0 * _CUT_OFF * noise) | (noise < _HIDDEN))
 
 
-def without_hot_pixels(pixels: Image, most: int) -> Image:
-    """Return a frame (rows, columns) with hot pixels replaced, if the frame has more than `most` hot pixels.
+def without_hot_pixels(pixels: Image, most: int) -> tuple[Image, Background]:
+    """Return a frame with hot pixels replaced if it has more than `most`, and its background.
 
     A few hot pixels are kept, because they are measured as sources and flagged. Thousands of hot pixels of a
     damaged sensor would replace all stars in the list of sources and increase the noise.
     """
-    single = estimate_background(pixels, _SKY_BLOCK, _SINGLE_STRIDE)
-    signal = pixels - single.map(single.level)
-    noise = single.map(single.noise)
-    row, column = find_hot_pixels(signal, noise * noise)
+    background = estimate_background(pixels, _SKY_BLOCK, _SINGLE_STRIDE)
+    row, column = hot_pixels_above(pixels, background, most)
     if len(row) <= most:
-        return pixels
+        return pixels, background
     repaired = pixels.copy()
     around = [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)]
     beside = np.stack([pixels[row + dr, column + dc] for dr, dc in around])
     repaired[row, column] = np.median(beside, axis=0).astype(pixels.dtype)
-    return repaired
+    return repaired, estimate_background(repaired, _SKY_BLOCK, _SINGLE_STRIDE)
 
 
 def find_bright(pixels: Image, sky: SkyBackground, sigmas: float) -> BrightPixels:
@@ -222,7 +216,10 @@ def find_bright(pixels: Image, sky: SkyBackground, sigmas: float) -> BrightPixel
         np.add(once[:-1], once[1:], out=twice)
         np.add(twice[:, :-1], twice[:, 1:], out=wide)
         np.add(wide[:, :-1], wide[:, 1:], out=smooth)
-        np.matmul(down[first : first + count], across, out=bound)
+        # A band of rows is between the centres of a few rows of blocks; all other weights are zero.
+        weight = down[first : first + count]
+        near = np.flatnonzero(weight.any(axis=0))
+        np.matmul(weight[:, near], across[near], out=bound)
         above = np.flatnonzero(smooth > bound)
         row, column = np.divmod(above, columns - 2)
         # The last band of rows may overlap the previous band.
@@ -543,7 +540,7 @@ def survey(pixels: Image, settings: DetectionSettings | None = None) -> Survey:
     """
     pixels, unit = in_counts(pixels)
     settings = (settings or DetectionSettings()).in_units_of(unit)
-    pixels = without_hot_pixels(pixels, settings.most_stars)
-    sky = measure_sky(pixels)
+    pixels, background = without_hot_pixels(pixels, settings.most_stars)
+    sky = measure_sky(pixels, background)
     bright = find_bright(pixels, sky, settings.threshold_sigmas)
     return Survey(pixels, unit, settings, sky, find_areas(pixels, sky, bright, settings.saturation))
