@@ -18,8 +18,11 @@ more likely than that of healthy coils.
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
 that an inertia error of 2 % can make healthy coils look reversed. The fit therefore subtracts the gyroscopic
 acceleration for the assumed inertia, and estimates the remaining error by nuisance parameters
-(`knightcube.gnc.estimation.rigid_body`). If the coils' own field at the magnetometer is comparable with the
-Earth's field, the fit uses the field measured in the last pause of the coils, rotated with the body.
+(`knightcube.gnc.estimation.rigid_body`). The torques by air drag and by the residual dipole change while the
+body rotates, and the commands of pointing counteract them, so that healthy coils can look weak or reversed.
+The fit therefore admits a random walk of the disturbance, whose size follows from the largest expected
+disturbance. If the coils' own field at the magnetometer is comparable with the Earth's field, the fit uses
+the field measured in the last pause of the coils, rotated with the body.
 
 The residual accelerations, computed for healthy coils, are stored for a longer time. If the residual
 accelerations change together with the supply current, a coil is broken; otherwise the current monitor is
@@ -32,7 +35,7 @@ from __future__ import annotations
 import functools
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import NamedTuple
@@ -149,6 +152,8 @@ class ResponseSettings:
         memory_ns: time (ns) for which residual accelerations are stored.
         settle_ns: time (ns) from switching the coils off until their field at the magnetometer has decayed,
             or None if their field is small compared with the Earth's.
+        disturbance: function that returns the largest expected acceleration (rad/s^2) by disturbance torques
+            at a time (ns), or None if the disturbance is constant within a fit.
     """
 
     inertia: FloatArray
@@ -169,6 +174,7 @@ class ResponseSettings:
     highest_reversed: float = -0.5
     memory_ns: int = 20_000_000_000
     settle_ns: int | None = None
+    disturbance: Callable[[int], float] | None = None
 
 
 _STALE_NS = 200_000_000
@@ -181,6 +187,8 @@ _LEAST_CHANGE = 4.0e-3
 """Smallest detectable change of the angular acceleration, rad/s^2."""
 LARGEST_GAIN = 1.5
 """Largest absolute gain of a coil that is physically possible."""
+_SLOWEST_ROTATION = 1.1e-3
+"""Rate (rad/s) at which the direction of the air flow rotates in a body that points to an inertial target."""
 _GAIN_PRIOR = 10.0
 _LEAST_GAIN_ERROR = 0.05
 """Smallest error assumed for the gain of a healthy coil."""
@@ -274,7 +282,7 @@ class CoilResponse:
         # The other columns of a row are mean rate, angle, and the accelerations by the k error modes.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
-        self.fastest = 0.0
+        self.fastest = self._walk = 0.0
         # The newest fit determines the weights of the inertia error modes.
         self._weights: FloatArray = np.zeros(len(self._modes))
         # The tuple of a bin begins with the time (ns) and the commanded acceleration by each coil (3, n).
@@ -427,7 +435,7 @@ class CoilResponse:
 
         Bins from before a fault would hide the fault from a fit over all bins.
         """
-        rows = np.array(self._rows)
+        rows, self._walk = np.array(self._rows), self._disturbance_walk()
         whole = self._solved(rows, span)
         self.fastest = max(self._speeds)
         self.gain, self.sigma, self._weights = whole.gain, whole.sigma, whole.weights
@@ -537,22 +545,38 @@ class CoilResponse:
         """
         settings = self._settings
         # The span is rounded to ns, so that equal spans use the stored matrix.
-        variance = (settings.rate_noise / round(span, 9)) ** 2 / settings.bin_samples
-        whitening = _whitening(len(rows), settings.model_error**2, variance)
+        span = round(span, 9)
+        variance = (settings.rate_noise / span) ** 2 / settings.bin_samples
+        whitening = _whitening(len(rows), settings.model_error**2, variance, self._walk * span)
         return np.asarray((whitening @ rows.reshape(len(rows), -1)).reshape(rows.shape))
 
+    def _disturbance_walk(self) -> float:
+        """Return the variance per second, (rad/s^2)^2/s, of the random walk of the disturbance.
 
-@functools.lru_cache(maxsize=64)
-def _whitening(count: int, independent: float, variance: float) -> FloatArray:
+        Within the time in which the body rotates by 1 rad, the disturbance changes by its own size. The
+        result is rounded to a power of two, so that few whitening matrices are needed.
+        """
+        largest = 0.0 if self._settings.disturbance is None else self._settings.disturbance(self._last_ns)
+        if largest <= 0.0:
+            return 0.0
+        walk = 2.0 * largest**2 * max(self._speeds[-1], _SLOWEST_ROTATION)
+        return float(2.0 ** round(math.log2(walk)))
+
+
+@functools.lru_cache(maxsize=256)
+def _whitening(count: int, independent: float, variance: float, walk: float) -> FloatArray:
     """Return the matrix (m, m) that whitens the differences of bins and removes their constant part.
 
     Args:
         count: number m of differences between bins.
         independent: variance of the independent errors of the differences.
         variance: variance of the rate of a bin, divided by the squared time between bins.
+        walk: increase per bin of the variance of the disturbance, which is a random walk.
     """
     covariance = (independent + 2.0 * variance) * np.eye(count)
     covariance -= variance * (np.eye(count, k=1) + np.eye(count, k=-1))
+    number = np.arange(1, count + 1)
+    covariance += walk * np.minimum(number[:, None], number)
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     constant = whitening.sum(axis=1)
     constant /= math.sqrt(float(constant @ constant))

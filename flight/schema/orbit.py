@@ -39,6 +39,8 @@ _PRESSURE = 5.0e-6
 
 The expected pressure is a tenth of the largest pressure (solar maximum, perpendicular incidence).
 """
+_LARGEST_PRESSURE = 10.0
+"""Ratio of the largest to the expected pressure."""
 _DIPOLE, _MOMENT = 3.0e-4, 1.047e-3
 """Dipole (A m^2) with the cost of an attitude error of 1 deg, tuned for a mean moment (kg m^2) of a 1U."""
 
@@ -291,6 +293,10 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         arm = craft.accuracy.centre_of_mass + math.hypot(*craft.centre_of_mass)
         start = section.torque_start or _two_digits(_PRESSURE * max(x * y, y * z, z * x) * arm)
         return start, section.torque_walk or _two_digits(2.0e-3 * start)
+
+    def largest_torques(self) -> tuple[float, float]:
+        """Return the largest torques (N m) by air at 500 km altitude and by an unknown residual dipole."""
+        return _LARGEST_PRESSURE * self.torque_sizes()[0], sum(self.dipole_errors()) * _FIELD
 
     def dipole_weight(self) -> float:
         """Return the dipole (A m^2) whose cost equals that of an attitude error of `pointing.turn`.

@@ -54,6 +54,7 @@ from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.devices import GpsReading, ImuReading, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.earth.disturbance import mean_density
 from knightcube.astro.earth.orbit_knowledge import OrbitState, TwoLineElements
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
@@ -231,7 +232,7 @@ class SatelliteEstimation(BodyEstimation):
         self.orbit_filter, self.learned_problems = _filter(config, self.environment, learned, _utc(services))
         self.filter = self.orbit_filter
         self.feed: ReadingFeed = OrbitFeed(self.orbit_filter)
-        self.coil_monitor = _coil_monitor(config)
+        self.coil_monitor = _coil_monitor(config, self.environment)
         self._coils, self._errors = config.coils.map(), description_errors(config)
         self._field_bias = config.inertial_unit.accuracy.field_bias
         self._low_rate, self._gyro_bias = config.detumble.low_rate, config.estimation.bias_start
@@ -593,10 +594,18 @@ def _detumbler(
     return FieldDetumbler(WindowSchedule(settle_ns, measure_ns, act_ns), braking, settings, expected)
 
 
-def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
+def _coil_monitor(config: OrbitConfig, environment: EstimatedEnvironment) -> CoilMonitor:
     full = tuple(config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     inertia = config.craft.inertia_matrix()
     settle_ns = round(config.detumble.settle * SECOND_NS)
+    air, dipole = np.array(config.largest_torques()) / float(np.linalg.eigvalsh(inertia)[0])
+
+    def disturbance(time_ns: int) -> float:
+        """Return the largest expected disturbance (rad/s^2), without air drag while the orbit is unknown."""
+        state = environment.state(time_ns)
+        density = 0.0 if state is None else mean_density(float(np.linalg.norm(state.position)))
+        return float(dipole + air * density)
+
     # The field is 16 times weaker than the testbed's, so a coil's torque takes longer to detect.
     response = ResponseSettings(
         inertia,
@@ -610,6 +619,7 @@ def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
         damping=1e-4,
         errors=description_errors(config),
         settle_ns=settle_ns,
+        disturbance=disturbance,
     )
     slow = replace(response, bin_samples=40, least_bins=8, model_error=3.0e-5)
     tumble = config.modes.tumble_rate

@@ -91,6 +91,11 @@ def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
     return Pressures(density[:, None] * motion, ephemeris.sunlit_at(times)[:, None] * sun)
 
 
+def mean_density(distance: float) -> float:
+    """Return the relative air density at a geocentric distance (m), mean of day and night; one at 500 km."""
+    return math.exp((_HEIGHT - distance) / _SCALE_HEIGHT)
+
+
 def box_areas(inertia: FloatArray) -> FloatArray:
     """Return the relative areas (3,) of the faces of a homogeneous box with a given inertia.
 

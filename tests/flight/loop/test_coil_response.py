@@ -477,3 +477,45 @@ def test_for_a_minute_after_a_false_verdict_the_monitor_is_not_believed_alone(
 
 def test_without_the_motion_nothing_is_contradicted() -> None:
     assert not MotionWitness(None, FULL).contradicts(0, CoilFault.OPEN, 0, 0, 0)
+
+
+def _point_in_dense_air(disturbance: float | None, seed: int) -> tuple[dict[Finding, int], FloatArray]:
+    """Hold an attitude for 150 s by healthy coils against a torque that changes its direction.
+
+    Returns how many fits of how many axes made each finding, and the errors of the gains in standard
+    deviations.
+    """
+    settings = ResponseSettings(
+        INERTIAS, 0.65 * np.eye(3), 2.8e-4, bin_samples=40, bins=40, least_bins=8, model_error=3e-5,
+        torsion=1e-6, damping=1e-4, disturbance=None if disturbance is None else lambda _: disturbance,
+    )  # fmt: skip
+    response, generator = CoilResponse(settings), np.random.default_rng(seed)
+    angle, rate, currents = np.zeros(3), np.zeros(3), np.zeros(3)
+    phase, period = generator.uniform(0.0, 6.0, 3), generator.uniform(100.0, 300.0)
+    found = dict.fromkeys(Finding, 0)
+    errors = []
+    for cycle in range(6000):
+        time, now_ns = cycle / 40, cycle * TICK_NS
+        field = 3e-5 * np.array([math.sin(4e-3 * time + phase[0]), math.cos(4e-3 * time + phase[0]), 0.3])
+        if cycle % 80 == 0:
+            wanted = -MOMENTS * (4e-4 * angle + 4e-2 * rate)
+            currents = np.clip(np.cross(field, wanted) / (0.65 * field @ field), -0.148, 0.148)
+        response.commanded(now_ns, tuple(currents.tolist()))
+        air = 3e-4 * np.sin(2.0 * math.pi * time / period + phase)
+        rate = rate + (np.cross(0.65 * currents, field) / MOMENTS + air) / 40
+        angle = angle + rate / 40
+        if response.observe_motion(now_ns + TICK_NS, rate + 2.8e-4 * generator.standard_normal(3), field):
+            for finding in Finding:
+                found[finding] += len(response.axes(finding))
+            errors.append((response.gain - 1.0) / response.sigma)
+    return found, np.abs(errors)
+
+
+def test_no_healthy_coil_looks_reversed_in_dense_air() -> None:
+    misled = 0
+    for seed in range(2):
+        found, errors = _point_in_dense_air(3e-4, seed)
+        assert found[Finding.REVERSED] == found[Finding.FEEBLE] == found[Finding.WEAK] == 0
+        assert np.mean(errors > 3.0) < 0.02
+        misled += _point_in_dense_air(None, seed)[0][Finding.REVERSED]
+    assert misled > 0, "a fit that assumes a constant disturbance is misled"
