@@ -3,33 +3,43 @@
 A campaign makes cases, each with a key and a seed of its own. The function `run` of the campaign turns a case
 into a result that JSON can represent. Each result is appended to the file `results.jsonl` at once, so that
 an interrupted campaign continues with the missing cases. Results do not depend on the order of the cases or
-on the process that runs them.
+on the process that runs them. A lock on this file keeps a second process out of the folder.
 """
 
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import closing
+import traceback
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import connection, get_context
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from ground.campaigns import cluster
+from ground.campaigns import CampaignError, cluster
 from knightcube.errors import UsageError
 
 _PLAIN_S = 10.0
 """Time (s) between two lines of progress if the output is not a terminal."""
 _WIDTH = 30
 """Width of the progress bar in characters."""
+_ATTEMPTS = 3
+"""Number of worker processes that one case may end before the campaign ends."""
+_STOP_S = 5.0
+"""Time (s) in which interrupted worker processes must end before they are killed."""
+_SCRATCH = "knightcube-campaign-"
+"""First characters of the name of the folder that contains the temporary files of the workers."""
 
 
 class Progress:
@@ -41,6 +51,9 @@ class Progress:
         self._done = done
         self._begun = self._written = time.perf_counter()
         self._terminal = sys.stderr.isatty()
+        if done:
+            self.note(f"continuing: {done} of {total} were done before")
+        self._draw("")
 
     def note(self, line: str) -> None:
         """Write a line above the progress bar."""
@@ -51,18 +64,22 @@ class Progress:
         self._done += 1
         now = time.perf_counter()
         left = (now - self._begun) / (self._done - self._before) * (self._total - self._done)
-        if self._terminal:
-            filled = _WIDTH * self._done // self._total
-            bar = "#" * filled + "." * (_WIDTH - filled)
-            self._write(f"\r\x1b[K[{bar}] {self._done}/{self._total}  {left:.0f} s left")
-        elif now - self._written >= _PLAIN_S:
+        self._draw(f"{_duration(left)} left")
+        if not self._terminal and now - self._written >= _PLAIN_S:
             self._written = now
-            self._write(f"{self._done} of {self._total} done, {left:.0f} s left\n")
+            self._write(f"{self._done} of {self._total} done, {_duration(left)} left\n")
 
     def close(self) -> None:
         """Remove the progress bar."""
         if self._terminal:
             self._write("\r\x1b[K")
+
+    def _draw(self, left: str) -> None:
+        """Draw the progress bar, followed by the text `left`, if the output is a terminal."""
+        if self._terminal:
+            filled = _WIDTH * self._done // self._total
+            bar = "#" * filled + "." * (_WIDTH - filled)
+            self._write(f"\r\x1b[K[{bar}] {self._done}/{self._total}  {left}")
 
     @staticmethod
     def _write(text: str) -> None:
@@ -70,7 +87,17 @@ class Progress:
         sys.stderr.flush()
 
 
+def _duration(seconds: float) -> str:
+    """Return a duration as a text such as `40 s`, `12 min` or `3 h 05 min`."""
+    minutes = round(seconds / 60.0)
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
 _PR_SET_PDEATHSIG = 1  # prctl(2)
+_RESULTS = "results.jsonl"
+"""Name of the file of the results in the folder of a campaign."""
 
 Result = dict[str, Any]
 Parameters = dict[str, Any]
@@ -180,28 +207,36 @@ def fly(
         only: text that the key of a case must contain for the case to be run.
     """
     cases = _selected(campaign, runs, seed, only)
-    out.mkdir(parents=True, exist_ok=True)
     label = {"campaign": campaign.name, "runs": runs, "seed": seed} | ({"only": only} if only else {})
-    done = _resume(label, out)
-    missing = [case for case in cases if case.key not in done]
-    if missing:
-        log = out / "results.jsonl"
-        bar = Progress(len(cases), len(cases) - len(missing)) if progress else None
-        results = _on_cluster(dask, campaign, missing, bar) if dask else _here(workers, campaign, missing)
-        with log.open("a", encoding="utf-8") as sink, closing(results):
-            for key, result in results:
-                done[key] = result
-                sink.write(json.dumps({"key": key, "result": result}, allow_nan=True) + "\n")
-                sink.flush()
-                if bar is not None:
-                    bar.advance()
-        if bar is not None:
-            bar.close()
-    summary = campaign.summarise([done[case.key] for case in cases], out)
-    facts = json.dumps(summary.facts, indent=1, allow_nan=False) + "\n"
-    (out / "summary.json").write_text(facts, encoding="utf-8")
-    (out / "summary.txt").write_text(summary.text, encoding="utf-8")
+    with _opened(out) as sink:
+        done = _resume(label, out, sink)
+        missing = [case for case in cases if case.key not in done]
+        if missing:
+            bar = Progress(len(cases), len(cases) - len(missing)) if progress else None
+            results = (
+                _on_cluster(dask, campaign, missing, bar) if dask else _here(workers, campaign, missing, out)
+            )
+            with closing(results):
+                for key, result in results:
+                    done[key] = result
+                    sink.write(json.dumps({"key": key, "result": result}, allow_nan=True) + "\n")
+                    sink.flush()
+                    if bar is not None:
+                        bar.advance()
+            if bar is not None:
+                bar.close()
+        summary = campaign.summarise([done[case.key] for case in cases], out)
+        facts = json.dumps(summary.facts, indent=1, allow_nan=False) + "\n"
+        (out / "summary.json").write_text(facts, encoding="utf-8")
+        (out / "summary.txt").write_text(summary.text, encoding="utf-8")
     return summary
+
+
+def results_in(out: Path) -> list[Result]:
+    """Return the results in the folder of a campaign, ordered by the keys of their cases."""
+    with (out / _RESULTS).open(encoding="utf-8") as lines:
+        done = _read(lines)[0]
+    return [done[key] for key in sorted(done)]
 
 
 def fly_here(campaign: Campaign, runs: int, seed: int) -> list[Result]:
@@ -217,49 +252,179 @@ def _selected(campaign: Campaign, runs: int, seed: int, only: str) -> list[Case]
     return cases
 
 
-def _resume(label: Parameters, out: Path) -> dict[str, Result]:
-    """Return the results in a folder by key, and remove a last line that was cut off by a kill.
+@contextmanager
+def _opened(out: Path) -> Iterator[IO[str]]:
+    """Open and lock the file of the results. Raises UsageError if another process holds the lock."""
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / _RESULTS).open("a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UsageError(f"{out}: another process runs this campaign: wait, or give --out") from error
+        yield file
+
+
+def _resume(label: Parameters, out: Path, file: IO[str]) -> dict[str, Result]:
+    """Return the results in the opened file by key, and remove a last line that was cut off by a kill.
 
     Raises UsageError if the folder contains a campaign with another `label`.
     """
-    label_path, results_path = out / "campaign.json", out / "results.jsonl"
+    label_path = out / "campaign.json"
     if label_path.exists():
         found = json.loads(label_path.read_text(encoding="utf-8"))
         if found != label:
             raise UsageError(f"{out} contains {found}, not {label}: give another folder with --out")
     else:
-        label_path.write_text(json.dumps(label) + "\n", encoding="utf-8")
-    done: dict[str, Result] = {}
-    if results_path.exists():
-        text = results_path.read_text(encoding="utf-8")
-        whole = text[: text.rfind("\n") + 1]
-        if whole != text:
-            results_path.write_text(whole, encoding="utf-8")
-        for line in whole.splitlines():
-            entry = json.loads(line)
-            done[entry["key"]] = entry["result"]
+        beside = label_path.with_suffix(".new")
+        beside.write_text(json.dumps(label) + "\n", encoding="utf-8")
+        beside.replace(label_path)
+    file.seek(0)
+    done, length = _read(file)
+    file.truncate(length)
+    file.seek(0, os.SEEK_END)
     return done
 
 
-def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case]) -> Results:
-    """Run cases on the cores of this machine, and yield each result when its case ends."""
+def _read(lines: IO[str]) -> tuple[dict[str, Result], int]:
+    """Return the results by key, and the length (bytes) of the complete lines.
+
+    The results are ASCII text. A complete line that is not JSON, as a power failure can leave, is skipped, so
+    that its case is run again.
+    """
+    text = lines.read()
+    whole = text[: text.rfind("\n") + 1]
+    done: dict[str, Result] = {}
+    for line in whole.splitlines():
+        with suppress(json.JSONDecodeError):
+            entry = json.loads(line)
+            done[entry["key"]] = entry["result"]
+    return done, len(whole)
+
+
+@dataclass(slots=True)
+class _Worker:
+    """Worker process, the parent's end of its pipe, and the case that the process runs."""
+
+    process: Any
+    pipe: Any
+    case: Case | None = None
+
+
+def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case], out: Path) -> Results:
+    """Run cases on the cores of this machine, and yield each result when its case ends.
+
+    If a worker process dies, another process runs its case. Raises CampaignError if a case ends three
+    processes in a row, and the exception of a case that fails. After an interruption or an error no process
+    is left.
+    """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    count, context = workers or os.cpu_count(), get_context("spawn")
-    with ProcessPoolExecutor(count, context, initializer=_end_with_the_campaign) as pool:
-        keys = {pool.submit(campaign.run, case): case.key for case in cases}
+    count = min(workers or os.cpu_count() or 1, len(cases))
+    waiting, deaths = deque(cases), Counter[str]()
+    crew: list[_Worker] = []
+    with _scratch(out) as scratch:
         try:
-            for future in as_completed(keys):
-                yield keys[future], future.result()
-        except BaseException:
-            # After Ctrl-C, cases that have not begun are cancelled; the other results are already on disk.
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+            while waiting or any(worker.case for worker in crew):
+                crew += [_worker(campaign, scratch) for _ in range(min(count, len(waiting)) - len(crew))]
+                for worker in crew:
+                    if worker.case is None and waiting:
+                        worker.case = waiting.popleft()
+                        with suppress(OSError):  # the process has died, which its end of the pipe shows
+                            worker.pipe.send(worker.case)
+                busy = {worker.pipe: worker for worker in crew if worker.case is not None}
+                for pipe in connection.wait(list(busy)):
+                    worker = busy[pipe]
+                    case = worker.case
+                    try:
+                        result, error = worker.pipe.recv()
+                    except (EOFError, OSError) as lost:
+                        crew.remove(worker)
+                        worker.process.join()
+                        deaths[case.key] += 1
+                        if deaths[case.key] == _ATTEMPTS:
+                            status = worker.process.exitcode
+                            raise CampaignError(
+                                f"case {case.key} ended {_ATTEMPTS} worker processes, status {status}"
+                            ) from lost
+                        waiting.appendleft(case)
+                        continue
+                    if error is not None:
+                        raise error
+                    worker.case = None
+                    yield case.key, result
+        finally:
+            _stop(crew)
 
 
-def _end_with_the_campaign() -> None:
-    """Make the kernel kill this worker process when the process of its campaign ends."""
+def _worker(campaign: Campaign, scratch: str) -> _Worker:
+    """Start a worker process that runs cases of a campaign."""
+    context = get_context("spawn")
+    pipe, end = context.Pipe()
+    process = context.Process(target=_serve, args=(end, campaign.run, os.getpid(), scratch))
+    process.start()
+    end.close()  # so that the pipe ends with the process
+    return _Worker(process, pipe)
+
+
+def _stop(crew: Sequence[_Worker]) -> None:
+    """End worker processes: idle processes by closing their pipes, busy processes by SIGINT, then SIGKILL."""
+    for worker in crew:
+        if worker.case is not None and worker.process.is_alive():
+            os.kill(worker.process.pid, signal.SIGINT)
+        worker.pipe.close()
+    latest = time.monotonic() + _STOP_S
+    for worker in crew:
+        worker.process.join(max(0.0, latest - time.monotonic()))
+        worker.process.kill()
+        worker.process.join()
+
+
+def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) -> None:
+    """Run the cases that arrive through a pipe, and send result or exception of each, in a worker process."""
+    _end_with_the_campaign(parent)
+    tempfile.tempdir = scratch
+    with suppress(EOFError, OSError, KeyboardInterrupt):
+        while True:
+            case = pipe.recv()
+            try:
+                answer = run(case), None
+            except Exception as error:  # noqa: BLE001 - raised in the process of the campaign
+                error.add_note(f"in case {case.key}:\n{traceback.format_exc()}")
+                answer = None, error
+            pipe.send(answer)
+
+
+@contextmanager
+def _scratch(out: Path) -> Iterator[str]:
+    """Yield a folder for temporary files of the workers, and delete the folder at the end.
+
+    A link in the folder of the campaign leads to it, by which the next start deletes the folder of a killed
+    campaign. The folder itself has a short path, because paths of sockets are limited to 107 characters.
+    """
+    link = out / "temporary"
+    _clear(link)
+    folder = tempfile.mkdtemp(prefix=_SCRATCH)
+    link.symlink_to(folder)
+    try:
+        yield folder
+    finally:
+        _clear(link)
+
+
+def _clear(link: Path) -> None:
+    """Delete a link and the folder of temporary files to which the link leads."""
+    if link.is_symlink():
+        folder = link.readlink()
+        if folder.name.startswith(_SCRATCH):
+            shutil.rmtree(folder, ignore_errors=True)
+        link.unlink()
+
+
+def _end_with_the_campaign(parent: int) -> None:
+    """Make the kernel kill this worker process when its parent, the process of the campaign, ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:  # the campaign ended before the call
+        os._exit(1)
 
 
 def _on_cluster(address: str, campaign: Campaign, cases: Sequence[Case], bar: Progress | None) -> Results:

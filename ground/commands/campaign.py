@@ -54,8 +54,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Fly the campaign, and print its summary."""
+    from ground.campaigns import CampaignError  # noqa: PLC0415
     from ground.campaigns.picture import draw_campaign  # noqa: PLC0415
-    from ground.campaigns.runner import fly  # noqa: PLC0415 - no other command needs devices
+    from ground.campaigns.runner import fly, results_in  # noqa: PLC0415 - no other command needs devices
     from ground.campaigns.varied import variation_of, varied_campaign  # noqa: PLC0415
 
     campaign = varied_campaign(
@@ -76,10 +77,11 @@ def run(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         sys.stderr.write(f"\ninterrupted; the same command continues in {out}\n")
         return 130
+    except CampaignError as error:
+        raise CampaignError(f"{error}; the same command continues in {out}") from error
     sys.stdout.write(json.dumps(found.facts) + "\n" if options.json else found.text)
-    lines = (out / "results.jsonl").read_text(encoding="utf-8").splitlines()
     try:
-        drawn = draw_campaign([json.loads(line)["result"] for line in lines], out / "campaign.png")
+        drawn = draw_campaign(results_in(out), out / "campaign.png")
     except UsageError as error:
         sys.stderr.write(f"{PROGRAM}: not drawn: {error}\n")
     else:

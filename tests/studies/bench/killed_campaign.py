@@ -1,0 +1,238 @@
+"""Killed and resumed campaign of a user: `python -m tests.studies.bench killed_campaign [--dask]`.
+
+The command `knightcube campaign` is run three times with the same draws: undisturbed; killed at random
+moments (one SIGINT, otherwise SIGKILL) and started again each time; and, with `--dask`, on a cluster of two
+workers of which one is killed. The bench compares the printed figures and the result of each flight, and
+counts flights that were flown twice, processes that outlive a campaign, and temporary files that remain.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ground.campaigns.runner import show
+
+ROOT = Path(__file__).parents[3]
+VARIED = ("plant.inertia=10%", "plant.thread_stiffness=normal 5%", "guidance.cost=heat|supply")
+_END_S = 60.0
+"""Longest time (s) to wait for the end of processes, and for a cluster."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Comparison of a disturbed campaign with the undisturbed one.
+
+    Attributes:
+        flights: number of flights with a result.
+        repeated: number of results beyond the first of a flight.
+        unequal: number of flights whose result differs from that of the undisturbed campaign.
+        same_figures: whether the printed summaries are equal.
+        interruptions: number of times that the campaign was interrupted before its end.
+        orphans: number of processes that outlived the campaign.
+        remains: number of temporary files and folders that remain.
+    """
+
+    flights: int
+    repeated: int
+    unequal: int
+    same_figures: bool
+    interruptions: int
+    orphans: int
+    remains: int
+
+    def sound(self, runs: int) -> bool:
+        """Return whether the campaign of `runs` flights is complete, equal, and left nothing behind."""
+        wrong = self.repeated + self.unequal + self.orphans + self.remains
+        return self.flights == runs and self.same_figures and not wrong
+
+
+@dataclass(frozen=True, slots=True)
+class UserCampaign:
+    """Command of a user in a folder of its own.
+
+    Attributes:
+        folder: folder in which the command runs, with the results in `campaign` and temporary files in `tmp`.
+        runs: number of flights.
+        duration: duration of each flight, s.
+        dask: address of a Dask scheduler, or an empty text.
+    """
+
+    folder: Path
+    runs: int
+    duration: float
+    dask: str = ""
+
+    def start(self) -> subprocess.Popen[str]:
+        """Start the command."""
+        (self.folder / "tmp").mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, "-m", "flight", "campaign", str(ROOT / "config" / "step_demo.yaml")]
+        for text in VARIED:
+            command += ["--vary", text]
+        command += ["--runs", str(self.runs), "--duration", str(self.duration), "--out", "campaign", "--json"]
+        command += ["--dask", self.dask] if self.dask else ["--workers", "2"]
+        path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {**os.environ, "PYTHONPATH": path, "TMPDIR": str(self.folder / "tmp")}
+        with (self.folder / "log").open("a", encoding="utf-8") as log:
+            return subprocess.Popen(
+                command, cwd=self.folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=log
+            )
+
+    def finish(self) -> dict[str, Any]:
+        """Run the command to its end, and return the summary that it prints."""
+        with self.start() as process:
+            return self.printed(process)
+
+    def printed(self, process: subprocess.Popen[str]) -> dict[str, Any]:
+        """Wait for the end of the command, and return its summary. Raises RuntimeError without a summary."""
+        text, _ = process.communicate()
+        if not text:
+            raise RuntimeError(f"status {process.returncode}: {(self.folder / 'log').read_text()}")
+        found: dict[str, Any] = json.loads(text)
+        return found
+
+    def lines(self) -> list[str]:
+        """Return the complete lines of the file of the results."""
+        path = self.folder / "campaign" / "results.jsonl"
+        return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+
+    def interrupt(self, number: signal.Signals, results: int, delay: float) -> tuple[bool, int]:
+        """Start the command, and send a signal `delay` seconds after it has a number of results.
+
+        Returns whether the signal came before the end of the command, and the number of processes that
+        outlived the command by more than a minute.
+        """
+        with self.start() as process:
+            while process.poll() is None and len(self.lines()) < results:
+                time.sleep(0.02)
+            time.sleep(delay)
+            children = _children(process.pid)
+            interrupted = process.poll() is None
+            process.send_signal(number)
+            process.communicate()
+        return interrupted, _outliving(children)
+
+    def compare(
+        self, found: Any, expected: Any, reference: UserCampaign, interruptions: int, orphans: int
+    ) -> Comparison:
+        """Return the comparison with the undisturbed campaign `reference`, given both printed summaries."""
+        keys = Counter(json.loads(line)["key"] for line in self.lines())
+        own, other = (
+            {entry["key"]: entry["result"] for entry in map(json.loads, one.lines())}
+            for one in (self, reference)
+        )
+        return Comparison(
+            len(keys),
+            keys.total() - len(keys),
+            sum(own.get(key) != result for key, result in other.items()),
+            found == expected,
+            interruptions,
+            orphans,
+            len(list((self.folder / "tmp").iterdir()))
+            + (self.folder / "campaign" / "temporary").is_symlink(),
+        )
+
+
+def killed(
+    folder: Path, runs: int, duration: float, kills: int, seed: int, dask: bool = False
+) -> dict[str, Comparison]:
+    """Return the comparison of the killed campaign, and of the one on a cluster if `dask` is true."""
+    chance = np.random.default_rng(seed)
+    whole = UserCampaign(folder / "whole", runs, duration)
+    expected = whole.finish()
+    part = UserCampaign(folder / "killed", runs, duration)
+    interruptions = orphans = 0
+    for number, results in enumerate(sorted(chance.choice(runs, kills, replace=False))):
+        kind = signal.SIGINT if number == 1 else signal.SIGKILL
+        before, left = part.interrupt(kind, int(results), float(chance.uniform(0.0, 0.5)))
+        interruptions, orphans = interruptions + before, orphans + left
+    found = {"killed": part.compare(part.finish(), expected, whole, interruptions, orphans)}
+    if dask:
+        with ExitStack() as stack:
+            address, worker = _cluster(folder, stack)
+            spread = UserCampaign(folder / "cluster", runs, duration, address)
+            process = stack.enter_context(spread.start())
+            while process.poll() is None and len(spread.lines()) < runs // 3:
+                time.sleep(0.02)
+            lost = process.poll() is None
+            worker.kill()
+            printed = spread.printed(process)
+        found["cluster"] = spread.compare(printed, expected, whole, int(lost), 0)
+    return found
+
+
+def _cluster(folder: Path, stack: ExitStack) -> tuple[str, subprocess.Popen[bytes]]:
+    """Start a Dask scheduler and two workers; return the address and the second worker."""
+    facts = folder / "scheduler.json"
+    local = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
+    worker = ("worker", "--no-nanny", "--nthreads", "1")
+    log = stack.enter_context((folder / "dask.log").open("wb"))
+
+    def started(*words: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "dask", *words, "--scheduler-file", str(facts), *local]
+        process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
+        stack.callback(process.wait)
+        stack.callback(process.kill)
+        return process
+
+    started("scheduler", "--port", "0")
+    latest = time.monotonic() + _END_S
+    while not facts.is_file() and time.monotonic() < latest:
+        time.sleep(0.1)
+    workers = [started(*worker) for _ in range(2)]
+    address: str = json.loads(facts.read_text(encoding="utf-8"))["address"]
+    return address, workers[1]
+
+
+def _children(process: int) -> list[int]:
+    """Return the processes that a process has started and that still run."""
+    try:
+        return list(map(int, Path(f"/proc/{process}/task/{process}/children").read_text().split()))
+    except OSError:
+        return []
+
+
+def _outliving(processes: Sequence[int]) -> int:
+    """Wait for the end of processes, and return the number of those that run after a minute."""
+    latest = time.monotonic() + _END_S
+    while (left := sum(map(_runs, processes))) and time.monotonic() < latest:
+        time.sleep(0.05)
+    return left
+
+
+def _runs(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the comparisons; return 1 if a campaign is incomplete, differs, or left something behind."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=500, metavar="N", help="default %(default)s")
+    parser.add_argument("--duration", type=float, default=0.3, metavar="S", help="default %(default)s")
+    parser.add_argument("--kills", type=int, default=5, metavar="N", help="default %(default)s")
+    parser.add_argument(
+        "--seed", type=int, default=1, metavar="N", help="of the moments, default %(default)s"
+    )
+    parser.add_argument("--dask", action="store_true", help="also on a cluster with a lost worker")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory(prefix="knightcube-") as name:
+        found = killed(Path(name), options.runs, options.duration, options.kills, options.seed, options.dask)
+    show({"campaigns": {kind: asdict(one) for kind, one in found.items()}})
+    return 0 if all(one.sound(options.runs) for one in found.values()) else 1
