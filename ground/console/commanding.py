@@ -156,6 +156,8 @@ class CommandForms:
 def _text_of(data: bytes) -> str:
     """Return a text that describes a command packet. Raises CommandError for invalid values."""
     directive = directives.unpack(data)
+    if isinstance(directive, directives.Scheduled):
+        return f"at {directive.at}: {commands.command_of_words(directive.words).text}"
     return commands.unpack(data).text if directive is None else str(directive)
 
 

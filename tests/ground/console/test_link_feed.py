@@ -66,7 +66,7 @@ def answered(satellite: Satellite, send: Callable[[], dict[str, object]]) -> dic
 def test_the_forms_of_a_link_schedule_a_command_and_list_it(satellite: Satellite) -> None:
     forms = CommandForms(satellite.feed.send, TELECOMMANDS)
     given = {"at": "2099-01-01T00:00:00", "words": "slew 0.2"}
-    assert forms.text("schedule", given) == "at 2099-01-01T00:00:00: slew 0.2"
+    assert forms.text("schedule", given) == "at 2099-01-01T00:00:00: slew to q2 +0.2000"
     assert answered(satellite, lambda: forms.obey("schedule", given))["obeyed"] == 1
     listed = answered(satellite, lambda: forms.obey("list-schedule", {}))
     assert listed["text"] == "1: 2099-01-01T00:00:00Z slew to q2 +0.2000; 1 scheduled"

@@ -339,7 +339,7 @@ def test_the_heat_of_the_coils_and_the_passes_with_their_schedule_are_shown(sate
     cells = satellite.page.locator("#passes tbody tr").first.locator("td").all_inner_texts()
     assert (cells[0], cells[4]) == ("Berlin", "10°")
     assert "satellite" in cells[6]
-    assert re.search(r"T\d\d:\d\d:\d\dZ point ground 52.5000 13.4000 deg", cells[7])
+    assert re.search(r"T\d\d:\d\d:\d\dZ point ground latitude 52.5000, longitude 13.4000 deg", cells[7])
     assert "point nadir" in cells[7]
 
 

@@ -353,7 +353,7 @@ def test_a_satellite_points_by_named_numbers_and_refuses_what_only_a_testbed_obe
     assert counts == {goal: max(NUMBERS.get(goal, (0,))) for goal in Goal}
     assert (
         forms.text("point", {"goal": 4, "numbers": [0.5, 0.25]})
-        == "point ground 28.6479 14.3239 deg, roll free"
+        == "point ground latitude 28.6479, longitude 14.3239 deg, roll free"
     )
     refused: list[tuple[str, dict[str, Any], str]] = [
         ("mode", {"mode": int(Mode.HOLD)}, "no such mode"),

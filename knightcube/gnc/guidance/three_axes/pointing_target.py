@@ -95,7 +95,7 @@ class PointingTarget:
         """Description of the pointing target for event messages."""
         text = self.goal.label
         if self.goal is Goal.GROUND:
-            text += " {:.4f} {:.4f} deg".format(*map(math.degrees, self.numbers))
+            text += " latitude {:.4f}, longitude {:.4f} deg".format(*map(math.degrees, self.numbers))
         elif self.goal is Goal.INERTIAL:
             return text + " {:.4f} {:.4f} {:.4f} {:.4f}".format(*self.numbers)
         elif self.goal is Goal.OBJECT:

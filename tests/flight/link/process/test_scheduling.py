@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -9,7 +10,16 @@ from typing import Any
 
 import pytest
 
-from flight.link.commands import ChangeMode, CommandError, Ping, Point, Slew, command_of_words, unpack
+from flight.link.commands import (
+    ChangeMode,
+    CommandError,
+    Ping,
+    Point,
+    Slew,
+    command_of_words,
+    unpack,
+    words_of,
+)
 from flight.link.modes import Mode
 from flight.link.process import commanding, directives
 from flight.link.process.commanding import (
@@ -48,6 +58,9 @@ def in_seconds(link: BothEnds, seconds: float) -> str:
     return f"{utc:%Y-%m-%dT%H:%M:%S}"
 
 
+GROUND = PointingTarget(Goal.GROUND, (math.radians(52.5), math.radians(-13.4)), math.radians(90.0))
+
+
 def texts(link: BothEnds, counter: int) -> list[str]:
     return [report.text for report in link.reports() if report.counter == counter]
 
@@ -71,6 +84,13 @@ def test_a_number_that_a_file_or_a_packet_does_not_hold_is_refused_when_it_is_sc
     link.restart()
     link.turn(61.0)
     assert link.stages(kept)[-1] == "completed", "the schedule outlives the restart"
+
+
+def test_directions_are_listed_in_degrees_with_their_names(link: BothEnds) -> None:
+    kept = send(link, Scheduled("2099-01-01T00:00:00", words_of(Point(GROUND))))
+    shown = "1: 2099-01-01T00:00:00Z point ground latitude 52.5000, longitude -13.4000 deg, roll 90 deg"
+    assert texts(link, kept)[-1] == shown
+    assert texts(link, send(link, Listing()))[1:] == [shown, "1 scheduled"]
 
 
 def test_an_entry_of_another_release_that_fits_no_packet_is_reported_and_not_executed(link: BothEnds) -> None:

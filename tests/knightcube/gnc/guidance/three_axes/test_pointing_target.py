@@ -28,8 +28,8 @@ def test_goals_keep_their_numbers_in_the_command_packet() -> None:
         (Goal.INERTIAL, (0.0, 0.6, 0.0, 0.8), "inertial 0.0000 0.6000 0.0000 0.8000"),
         (Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0009), "inertial 0.0000 0.0000 0.0000 1.0009"),
         (Goal.INERTIAL, (0.0, 0.0, 0.0, 0.9991), "inertial 0.0000 0.0000 0.0000 0.9991"),
-        (Goal.GROUND, (HALF, 0.1), "ground 90.0000 5.7296 deg, roll free"),
-        (Goal.GROUND, (-HALF, -4.0), "ground -90.0000 -229.1831 deg, roll free"),
+        (Goal.GROUND, (HALF, 0.1), "ground latitude 90.0000, longitude 5.7296 deg, roll free"),
+        (Goal.GROUND, (-HALF, -4.0), "ground latitude -90.0000, longitude -229.1831 deg, roll free"),
         (Goal.OBJECT, (), "object"),
         (Goal.OBJECT, (0.2, -HALF), "object near RA 11.4592, Dec -90.0000 deg"),
     ],
@@ -40,7 +40,10 @@ def test_a_sound_target_has_a_text(goal: Goal, numbers: tuple[float, ...], text:
 
 def test_a_roll_is_shown_in_degrees() -> None:
     assert PointingTarget(Goal.SUN, roll=HALF).text == "sun, roll 90 deg"
-    assert PointingTarget(Goal.GROUND, (0.0, 0.0), 0.0).text == "ground 0.0000 0.0000 deg, roll 0 deg"
+    assert (
+        PointingTarget(Goal.GROUND, (0.0, 0.0), 0.0).text
+        == "ground latitude 0.0000, longitude 0.0000 deg, roll 0 deg"
+    )
 
 
 @pytest.mark.parametrize(
