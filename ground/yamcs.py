@@ -22,6 +22,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flight.link.files.transfer import FOREIGN, SATELLITE
 from flight.link.files.units import DOWN, PACKET_VERSION, SEGMENT_BYTES, UNIT_OVERHEAD_BYTES, UP
@@ -32,6 +33,9 @@ from ground.link.terminal import DEFAULTS, FRAME_OVERHEAD_BYTES
 from ground.xtce import EPOCH, SPACE, document
 from ground.yamcs_operations import DISPLAYS, STACKS, stacks_and_displays
 from knightcube.errors import FlightError, UsageError
+
+if TYPE_CHECKING:
+    from ground.console.description import Body
 
 INSTANCE = SPACE.lower()
 HTTP_PORT = 8090
@@ -206,10 +210,12 @@ def files(
     epoch: str,
     keys: Path = KEYS,
     command_frame_bytes: int = DEFAULTS.command_frame_bytes,
+    body: Body | None = None,
 ) -> Mapping[str, str]:
     """Return the content of each file by its name below `folder`.
 
-    Without a gateway, whose keys are in the folder `keys`, Yamcs reads recorded packets only.
+    Without a gateway, whose keys are in the folder `keys`, Yamcs reads recorded packets only. The command
+    stacks are those that the kind of body can obey.
     """
     host, port = host_port(gateway or ADDRESS)
     server = _SERVER.format(
@@ -247,7 +253,7 @@ def files(
         "etc/processor.yaml": _PROCESSORS,
         LINK_SOURCE: _LINK,
         f"{INSTANCE}.xml": document(epoch=epoch, verified=True),
-        **stacks_and_displays(),
+        **stacks_and_displays(body),
     }
 
 
@@ -258,11 +264,12 @@ def write(
     epoch: str = EPOCH,
     keys: Path = KEYS,
     command_frame_bytes: int = DEFAULTS.command_frame_bytes,
+    body: Body | None = None,
 ) -> None:
     """Write the configuration into a folder. Raises UsageError."""
     folder = folder.absolute()
     try:
-        contents = files(folder, gateway, http_port, epoch, keys, command_frame_bytes)
+        contents = files(folder, gateway, http_port, epoch, keys, command_frame_bytes, body)
     except ValueError as error:
         raise UsageError(f"{gateway}: give HOST:PORT of the gateway") from error
     try:

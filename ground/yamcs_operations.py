@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
 from flight.link.telemetry.packets import LAYOUTS
-from ground.xtce import SPACE, UNUSED, spread
+from ground.console.description import foreign_modes, layouts_for
+from ground.xtce import SPACE, TELECOMMANDS, UNUSED, spread
 
 if TYPE_CHECKING:
+    from ground.console.description import Body
     from ground.passes import OrbitPrediction, Pass, Station
 
 STACKS, DISPLAYS = "stacks", "displays"
@@ -53,16 +55,30 @@ _PROCEDURES: Mapping[str, Sequence[dict[str, Any]]] = {
     "enter-safe": (_command("safe", reason="command stack"), _mode("eq", "safe")),
     "leave-safe-to-hold": (_mode("eq", "safe"), _command("mode", mode="hold"), _mode("eq", "hold")),
     "leave-safe-to-point": (_mode("eq", "safe"), _command("mode", mode="point"), _mode("neq", "safe")),
+    "slew-to-zero": (_mode("neq", "safe"), _command("slew", q2=0.0), _mode("eq", "hold")),
+    "detumble": (_mode("neq", "safe"), _command("mode", mode="detumble"), _mode("neq", "safe")),
     "list-files": (_command("list-files", entity="another-ground-station", under=""),),
 }
 """Steps of each procedure by its name. After the command `point` the mode can be `acquire` first."""
 
 
-def stacks_and_displays() -> Mapping[str, str]:
-    """Return the content of each command stack and display by its name below Yamcs's folder."""
+def procedures_of(body: Body | None) -> Mapping[str, Sequence[dict[str, Any]]]:
+    """Return the steps of each procedure that a kind of body can obey; all if the body is not known."""
+    known = {f"/{SPACE}/{name}" for name in layouts_for(body, TELECOMMANDS)}
+    foreign = {mode.label for mode in foreign_modes(body)}
+
+    def obeyed(step: dict[str, Any]) -> bool:
+        values = {one["value"] for one in (*step.get("arguments", ()), *step.get("condition", ()))}
+        return step.get("name", min(known)) in known and not values & foreign
+
+    return {name: steps for name, steps in _PROCEDURES.items() if all(map(obeyed, steps))}
+
+
+def stacks_and_displays(body: Body | None = None) -> Mapping[str, str]:
+    """Return the content of each command stack and display by its name, for a kind of body."""
     found: dict[str, str] = {}
     advancement = {"acknowledgment": "CommandComplete", "wait": 0}
-    for name, steps in _PROCEDURES.items():
+    for name, steps in procedures_of(body).items():
         stack = {
             "$schema": f"{_SCHEMA}/command-stack.schema.json",
             "steps": steps,

@@ -7,21 +7,26 @@ import contextlib
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from datetime import UTC, datetime, timedelta
+from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from flight.app.service import EndingSignals
+from flight.link.telemetry.definitions import RUN
 from flight.link.telemetry.log import SUFFIX, find_segments
-from flight.link.telemetry.packets import walk
+from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES, walk
 from flight.schema.document import config_path
 from flight.schema.reader import load
-from ground.commands.options import count
+from ground.commands.options import count, positive
 from ground.commands.passes import add_stations, predicted
 from ground.link.commanding import terminal_of
 from ground.link.gateway import Gateway, new_token, token_file, token_path
 from ground.link.terminal import DEFAULTS
+from ground.telemetry import decode
 from ground.xtce import EPOCH
 from ground.yamcs import (
     HTTP_PORT,
@@ -41,6 +46,7 @@ from knightcube.errors import FlightError, UsageError
 
 if TYPE_CHECKING:
     from flight.schema.sections import Link
+    from ground.console.description import Body
     from ground.passes import OrbitPrediction, Station
 
 _ASK_S = 0.2
@@ -68,14 +74,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--recorded", type=Path, metavar="RUN", help=text)
     text = "fly the simulation of CONFIG in real time with its link, which write below --out"
     way.add_argument("--fly", action="store_true", help=text)
+    text = "with --recorded: replay S seconds of the run per second, instead of all packets at once"
+    parser.add_argument("--speed", type=positive, metavar="S", help=text)
     text = "keys of the ground (default %(default)s)"
     parser.add_argument("--keys", type=Path, default=KEYS, metavar="FOLDER", help=text)
     text = "folder of Yamcs's configuration and archive (default %(default)s)"
     parser.add_argument("--out", type=Path, default=Path("mission-control"), metavar="FOLDER", help=text)
     text = "port of Yamcs's page (default %(default)s)"
     parser.add_argument("--port", type=count, default=HTTP_PORT, metavar="PORT", help=text)
-    text = "UTC of mission time zero (default %(default)s)"
-    parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=text)
+    text = f"UTC of mission time zero (default that of the recorded run, otherwise {EPOCH})"
+    parser.add_argument("--epoch", metavar="UTC", help=text)
     text = "file of two-line elements or OMM that predicts the passes (default `elements` of CONFIG)"
     parser.add_argument("--elements", type=Path, metavar="FILE", help=text)
     add_stations(parser)
@@ -86,8 +94,13 @@ def run(options: argparse.Namespace) -> int:
     """Run Yamcs, and the gateway unless a run is replayed, until a signal arrives or Yamcs ends."""
     if problem := missing():
         raise FlightError(problem)
+    if options.speed is not None and options.recorded is None:
+        raise UsageError("--speed: replays a recorded run: give --recorded RUN")
     packets = None if options.recorded is None else _packets(options.recorded)
-    section = load(options.config).link
+    epoch = options.epoch or (EPOCH if packets is None else _epoch(packets))
+    config = load(options.config)
+    section = config.link
+    body = cast("Body", config.body) if config.body in ("testbed", "orbit") else None
     frame_bytes = DEFAULTS.command_frame_bytes if section is None else section.command_frame_bytes
     if packets is None:
         options.link = options.link or _address(options.config, section)
@@ -97,25 +110,25 @@ def run(options: argparse.Namespace) -> int:
         running = _flown(options.config, folder, stack) if options.fly else {}
         gateway = None if packets is not None else _gateway(options, stack)
         served = None if gateway is None else f"127.0.0.1:{gateway.port}"
-        write(folder, served, options.port, options.epoch, options.keys, frame_bytes)
+        write(folder, served, options.port, epoch, options.keys, frame_bytes, body)
         compile_link(folder)
         yamcs = running["Yamcs"] = _process(command_line(folder), folder / "log", stack)
 
         def ended() -> bool:
             return signals.received or yamcs.poll() is not None or any(map(_failed, running.values()))
 
+        replay: Replay | None = None
         if _started(options.port, folder, forecast, ended):
-            if packets is not None:
-                # Yamcs reads a file as soon as it appears, and packets before its archive runs would be lost.
-                complete = folder / f"run{SUFFIX}"
-                complete.write_bytes(packets)
-                complete.replace(folder / RECORDED / complete.name)
+            if packets is not None:  # packets before Yamcs's archive runs would be lost
+                replay = Replay(packets, folder, options.speed, time.monotonic())
             sys.stdout.write(
                 f"Yamcs on http://127.0.0.1:{options.port}/, user {USER}, password in {folder / USERS}, "
                 f"log in {folder / 'log'} (Ctrl-C ends)\n"
             )
             sys.stdout.flush()
         while not ended():
+            if replay is not None:
+                replay.turn(time.monotonic())
             time.sleep(_ASK_S) if gateway is None else gateway.turn(_ASK_S)
         if not signals.received:
             name, process = next(one for one in running.items() if one[0] == "Yamcs" or _failed(one[1]))
@@ -151,13 +164,60 @@ def _failed(process: subprocess.Popen[bytes]) -> bool:
     return process.poll() not in (None, 0)
 
 
-def _packets(run: Path) -> bytes:
-    """Return the packets of the flight log in a run's folder. Raises UsageError."""
+def _packets(run: Path) -> list[bytes]:
+    """Return the packets of the flight log in a run's folder, in their order. Raises UsageError."""
     segments = find_segments(run, "flight")
     if not segments:
         raise UsageError(f"{run}: no flight log (flight-0001{SUFFIX}) in this folder")
     data = b"".join(path.read_bytes() for path in segments)
-    return b"".join(data[begin:end] for _, begin, end in walk(data))
+    return [data[begin:end] for _, begin, end in walk(data)]
+
+
+def _epoch(packets: Sequence[bytes]) -> str:
+    """Return the UTC of mission time zero that the packets state at last, or EPOCH if no packet states it."""
+    rows = decode(b"".join(packets))[RUN.name]
+    if not len(rows) or not rows[-1]["utc_ns"]:
+        return EPOCH
+    utc = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=int(rows[-1]["utc_ns"]) // 1000)
+    return utc.replace(tzinfo=None).isoformat(timespec="milliseconds")
+
+
+class Replay:
+    """Replay of recorded packets: the files of packets from which the data link `recorded` reads.
+
+    Yamcs reads and deletes a file as soon as it appears. A file is therefore complete when it appears, and
+    the next file follows after its deletion, so that the order of the packets remains.
+    """
+
+    def __init__(self, packets: Sequence[bytes], folder: Path, speed: float | None, begun: float) -> None:
+        """Begin a replay.
+
+        Args:
+            packets: recorded packets in their order.
+            folder: folder of Yamcs's configuration.
+            speed: mission time per time of the machine; None replays all packets at once.
+            begun: time of the machine, s.
+        """
+        self._folder, self._speed, self._begun = folder, speed, begun
+        end = HEADER_BYTES + SECONDARY_BYTES
+        times = [int.from_bytes(packet[end - 8 : end], "big", signed=True) for packet in packets]
+        self._times = list(accumulate(times, max))  # a late packet does not wait
+        self._packets = packets
+        self._sent = 0
+        self._files = 0
+
+    def turn(self, now: float) -> None:
+        """Write the packets that are due at `now`, the time of the machine (s), as a file."""
+        due = len(self._packets)
+        if self._speed is not None and self._times:
+            due = bisect_right(self._times, self._times[0] + 1e9 * self._speed * (now - self._begun))
+        if due == self._sent or any((self._folder / RECORDED).glob(f"run-*{SUFFIX}")):
+            return
+        self._files += 1
+        complete = self._folder / f"run-{self._files:06d}{SUFFIX}"
+        complete.write_bytes(b"".join(self._packets[self._sent : due]))
+        complete.replace(self._folder / RECORDED / complete.name)
+        self._sent = due
 
 
 def _address(config: Path, section: Link | None) -> str:

@@ -15,12 +15,15 @@ from pathlib import Path
 import pytest
 
 from flight.app.cli import main as command_line_main
-from flight.link.telemetry.packets import LAYOUTS
+from flight.link.telemetry.definitions import HEALTH
+from flight.link.telemetry.packets import LAYOUTS, Packer
+from ground.commands.mission_control import Replay
 from ground.passes import OrbitPrediction, station_of
 from ground.telemetry import read_run
 from ground.xtce import SPACE, TELECOMMANDS, spread
-from ground.yamcs import INSTANCE, USER, files, main, password_in, write
-from ground.yamcs_operations import Session, add_passes, stacks_and_displays
+from ground.yamcs import INSTANCE, RECORDED, USER, files, main, password_in, write
+from ground.yamcs_operations import Session, add_passes, procedures_of, stacks_and_displays
+from tests.flight.link.telemetry.samples import plain_contents
 from tests.studies.interop.yamcs import PLANS, fly
 from tests.support.linked_board import free_ports, write_linked_config
 from tests.support.linked_flight import free_port, service
@@ -54,6 +57,39 @@ def test_stacks_and_displays_name_commands_arguments_and_parameters_of_the_table
             pairs = [(fields[one["parameter"]], one["value"]) for one in step["condition"]]
         assert all(not field.states or value in dict(field.states).values() for field, value in pairs), step
     assert {step["type"] for step in steps} == {"command", "verify"}
+
+
+def test_each_kind_of_body_has_the_command_stacks_that_it_can_obey() -> None:
+    shared = {"check-health", "enter-safe", "detumble", "list-files"}
+    assert set(procedures_of("testbed")) == {*shared, "leave-safe-to-hold", "slew-to-zero"}
+    assert set(procedures_of("orbit")) == {*shared, "leave-safe-to-point"}
+
+
+def test_a_replay_writes_packets_at_their_mission_time_and_one_file_at_a_time(tmp_path: Path) -> None:
+    packets = [Packer().pack(HEALTH, second * 10**9, plain_contents(HEALTH)) for second in (5, 6, 6, 9)]
+    (tmp_path / RECORDED).mkdir()
+    replay = Replay(packets, tmp_path, 2.0, begun=100.0)
+
+    def read() -> list[bytes]:
+        """Read and delete the files as Yamcs does."""
+        found = sorted((tmp_path / RECORDED).iterdir())
+        content = [path.read_bytes() for path in found]
+        for path in found:
+            path.unlink()
+        return content
+
+    replay.turn(100.0)
+    replay.turn(100.6)
+    assert read() == packets[:1]
+    replay.turn(100.6)
+    assert read() == [packets[1] + packets[2]]
+    replay.turn(101.9)
+    assert read() == []
+    replay.turn(102.0)
+    assert read() == packets[3:]
+    at_once = Replay(packets, tmp_path, None, begun=100.0)
+    at_once.turn(100.0)
+    assert read() == [b"".join(packets)]
 
 
 @pytest.mark.parametrize(("frame_bytes", "unit_bytes"), [(1024, 900), (300, 246), (128, 74)])
@@ -92,7 +128,11 @@ def test_yamcs_does_not_obey_a_web_page_that_has_no_password(tmp_path: Path) -> 
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
 @pytest.mark.parametrize(
     ("words", "said"),
-    [((), "has no section `link`"), (("--recorded", "runs/none"), "runs/none: no flight log")],
+    [
+        ((), "has no section `link`"),
+        (("--speed", "5"), "--speed: replays a recorded run"),
+        (("--recorded", "runs/none"), "runs/none: no flight log"),
+    ],
 )
 def test_mission_control_refuses_what_it_cannot_show(
     words: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
