@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -12,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, fly, fly_here
+from ground.campaigns import CampaignError
+from ground.campaigns.runner import Campaign, Case, Result, Summary, fly, fly_here, results_in
 from knightcube.errors import UsageError
 from tests.hal.guardian.states import state, wait_until
 
@@ -35,6 +38,22 @@ def wait(case: Case) -> Result:
     Path(case.parameters["log"]).write_text(str(os.getpid()))
     time.sleep(300.0)
     return {}
+
+
+def die(case: Case) -> Result:
+    """End the worker process, in the first two attempts of a case whose factor is 1 or always if it is 2."""
+    attempts = Path(case.parameters["log"]) / case.key
+    attempts.write_text(attempts.read_text() + "x" if attempts.exists() else "x")
+    if case.parameters["factor"] == 2 or (case.parameters["factor"] == 1 and attempts.read_text() != "xxx"):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return draw(case)
+
+
+def deaths(folder: Path, *factors: int) -> Campaign:
+    """Return a campaign whose cases end their worker processes."""
+    folder.mkdir()
+    listed = [Case(f"{k}", (k,), {"factor": factor, "log": str(folder)}) for k, factor in enumerate(factors)]
+    return Campaign("deaths", "ends workers", lambda runs, seed: listed, die, summarise, 1)
 
 
 TOY = Campaign("toy", "adds draws", cases, draw, summarise, 6)
@@ -69,6 +88,37 @@ def test_a_part_of_the_cases_gives_what_these_give_in_the_whole(tmp_path: Path) 
         fly(TOY, 12, 3, tmp_path, workers=1)
     with pytest.raises(UsageError, match="no case of toy contains"):
         fly(TOY, 12, 3, tmp_path / "none", only="coil")
+
+
+@pytest.mark.slow
+def test_the_case_of_a_dead_worker_is_run_again_and_one_that_ends_three_workers_is_named(
+    tmp_path: Path,
+) -> None:
+    assert fly(deaths(tmp_path / "once", 0, 1), 1, 1, tmp_path / "a", workers=1).facts["runs"] == 2
+    assert (tmp_path / "once" / "1").read_text() == "xxx"
+    with pytest.raises(CampaignError, match="case 1 ended 3 worker processes, status -9"):
+        fly(deaths(tmp_path / "always", 0, 2), 1, 1, tmp_path / "b", workers=1)
+    assert not (tmp_path / "b" / "temporary").is_symlink()
+
+
+def test_a_second_campaign_in_the_same_folder_is_refused(tmp_path: Path) -> None:
+    fly(TOY, 0, 3, tmp_path)
+    with (tmp_path / "results.jsonl").open("a") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(UsageError, match="another process runs this campaign"):
+            fly(TOY, 0, 3, tmp_path)
+
+
+def test_a_damaged_line_is_dropped_and_the_last_line_is_whole(tmp_path: Path) -> None:
+    """A power failure can leave zeros in the middle, and a kill a part of the last line."""
+    fly(TOY, 0, 3, tmp_path)
+    log = tmp_path / "results.jsonl"
+    log.write_text(
+        '{"key": "0", "result": {"value": 1}}\n\x00\x00\n{"key": "2", "result": {"value": 2}}\n{"key'
+    )
+    fly(TOY, 0, 3, tmp_path)
+    assert log.read_text().endswith("}\n")
+    assert [result["value"] for result in results_in(tmp_path)] == [1, 2]
 
 
 def test_the_folder_of_another_campaign_is_refused(tmp_path: Path) -> None:
