@@ -331,10 +331,9 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case], out: P
                         worker.case = waiting.popleft()
                         with suppress(OSError):  # the process has died, which its end of the pipe shows
                             worker.pipe.send(worker.case)
-                busy = {worker.pipe: worker for worker in crew if worker.case is not None}
+                busy = {worker.pipe: (worker, worker.case) for worker in crew if worker.case is not None}
                 for pipe in connection.wait(list(busy)):
-                    worker = busy[pipe]
-                    case = worker.case
+                    worker, case = busy[pipe]
                     try:
                         result, error = worker.pipe.recv()
                     except (EOFError, OSError) as lost:
@@ -386,6 +385,7 @@ def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) 
     with suppress(EOFError, OSError, KeyboardInterrupt):
         while True:
             case = pipe.recv()
+            answer: tuple[Result | None, Exception | None]
             try:
                 answer = run(case), None
             except Exception as error:  # noqa: BLE001 - raised in the process of the campaign
