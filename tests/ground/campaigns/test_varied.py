@@ -19,7 +19,6 @@ from ground.campaigns.picture import draw_campaign
 from ground.campaigns.runner import Result, fly
 from ground.campaigns.varied import variation_of, varied_campaign
 from knightcube.errors import UsageError
-from tests.studies.bench.killed_campaign import killed
 
 DEMO = Path(__file__).parents[3] / "config" / "step_demo.yaml"
 ORBIT = DEMO.with_name("orbit_3u.yaml")
@@ -230,10 +229,3 @@ def test_the_picture_needs_a_drawn_number(tmp_path: Path) -> None:
     for one in results:
         one["drawn"] = {"name": "x"}
     assert not draw_campaign(results, tmp_path / "none.png")
-
-
-@pytest.mark.slow
-def test_a_killed_campaign_is_equal_to_an_undisturbed_one_and_leaves_nothing(tmp_path: Path) -> None:
-    found = killed(tmp_path, 6, 0.1, kills=2, seed=4)["killed"]
-    assert found.sound(6), found
-    assert found.interruptions >= 1

@@ -18,6 +18,7 @@ from ground.campaigns import CampaignError
 from ground.campaigns.runner import Campaign, Case, Result, Summary, fly, fly_here, results_in
 from knightcube.errors import UsageError
 from tests.hal.guardian.states import state, wait_until
+from tests.studies.bench.killed_campaign import killed
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -141,3 +142,10 @@ def test_a_campaign_that_is_killed_leaves_no_worker_behind(tmp_path: Path) -> No
         campaign.kill()
     worker = int(log.read_text())
     wait_until(lambda: state(worker) in {"", "Z"})
+
+
+@pytest.mark.slow
+def test_a_killed_campaign_is_equal_to_an_undisturbed_one_and_leaves_nothing(tmp_path: Path) -> None:
+    found = killed(tmp_path, 6, 0.1, kills=2, seed=4)["killed"]
+    assert found.sound(6), found
+    assert found.interruptions >= 1
