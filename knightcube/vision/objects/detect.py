@@ -39,6 +39,7 @@ from knightcube.vision.camera.lens import CameraModel, Pinhole, check_image
 from knightcube.vision.frame import MAD_TO_SIGMA, line_of, positions
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
+    PATHS_PER_LENGTH,
     Explanation,
     StarLight,
     at_mid_exposure,
@@ -306,6 +307,8 @@ class ObjectReport:
 _LEAST_CROSSING_PX = 10.0
 # Distance (px) of a streak's ends from the predicted ends of a star below which the streak is a star's.
 _FITTED_PX = 1.0
+# Number of trial star paths per path length in the first test of whether stars explain the pixels.
+_FEW_PATHS = 2
 # Minimum distance (px) from the image border at which the ends of a region count as inside the image.
 _BORDER_PX = 2
 
@@ -343,7 +346,8 @@ class Judge:
         except FlightError:
             return Verdict.UNCLEAR, None
         if self._is_object(light, found, self.objects.improvement):
-            return Verdict.OBJECT, self._candidate(ends, fired, light, found)
+            candidate = self._candidate(ends, fired, light, found)
+            return (Verdict.UNCLEAR if candidate is None else Verdict.OBJECT), candidate
         return self._stars_or_unclear(light), None
 
     def crowd(self, corners: FloatArray) -> tuple[Verdict, SpaceObject | None]:
@@ -365,7 +369,8 @@ class Judge:
         ends, found = min(tried, key=lambda one: one[1].chi_square)
         enough = self.objects.crossing_improvement
         if self._is_object(light, found, enough) and not self._moves_like_a_star(ends):
-            return Verdict.OBJECT, self._candidate(ends, (), light, found)
+            candidate = self._candidate(ends, (), light, found)
+            return (Verdict.UNCLEAR if candidate is None else Verdict.OBJECT), candidate
         return self._stars_or_unclear(light), None
 
     def merged(self, settled: IntArray, strange: IntArray) -> list[SpaceObject]:
@@ -396,7 +401,8 @@ class Judge:
             found = self._remaining_object(brightest_left(patch, patch.signal), ())
             if found is None:
                 stars, left = fit_stars(patch, self.rotation, self.pinhole)
-                found = self._remaining_object(brightest_left(patch, left), stars)
+                # Without stars, the light is the same as before.
+                found = self._remaining_object(brightest_left(patch, left), stars) if stars else None
                 enough = self.objects.least_share * float(regions.flux[index])
                 found = found if found is not None and found.flux >= enough else None
             objects += [found] if found is not None else []
@@ -409,16 +415,23 @@ class Judge:
         """
         if ends is None or self._moves_like_a_star(ends, _FITTED_PX):
             return None
+        enough = self.objects.crossing_improvement
         try:
+            # If a few stars explain the pixels, more stars would explain them as well.
+            few = self._light(ends, stars, _FEW_PATHS)
+            if few.chi_square - few.pixels < enough:
+                return None
             light = self._light(ends, stars)
+            if light.chi_square - light.pixels < enough:
+                return None
             found = light.explain(ends)
         except FlightError:
             return None
-        if not self._is_object(light, found, self.objects.crossing_improvement):
-            return None
-        return self._candidate(ends, (), light, found)
+        return self._candidate(ends, (), light, found) if self._is_object(light, found, enough) else None
 
-    def _light(self, corners: FloatArray, known: Sequence[FloatArray] = ()) -> StarLight:
+    def _light(
+        self, corners: FloatArray, known: Sequence[FloatArray] = (), per_length: int = PATHS_PER_LENGTH
+    ) -> StarLight:
         return StarLight(
             self.segmented,
             corners,
@@ -428,6 +441,7 @@ class Judge:
             self.settings.gain,
             self.settings.saturation or np.inf,
             known,
+            per_length,
         )
 
     def _is_object(self, light: StarLight, found: Explanation, improvement: float) -> bool:
@@ -449,8 +463,13 @@ class Judge:
 
     def _candidate(
         self, ends: FloatArray, fired: tuple[str, ...], light: StarLight, found: Explanation
-    ) -> SpaceObject:
-        """Return the object between `ends`, ordered such that the motion relative to the stars is slower."""
+    ) -> SpaceObject | None:
+        """Return the object between `ends`, ordered such that the motion relative to the stars is slower.
+
+        Returns None if the streak is dark near an end, because that end is then wrong by many pixels.
+        """
+        if not light.lit_to_ends(ends):
+            return None
         rate, direction = self._among_stars(ends)
         other, other_direction = self._among_stars(ends[::-1])
         if other < rate:
