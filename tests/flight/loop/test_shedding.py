@@ -54,15 +54,13 @@ class Bench:
 
 
 def test_levels_reduce_readings_first_then_the_search_then_frames_then_plans_and_never_restore_work() -> None:
-    first = {
-        name: next(i for i, level in enumerate(LEVELS) if reduced(level))
-        for name, reduced in {
-            "readings": lambda level: not level.every_reading,
-            "search": lambda level: not level.search,
-            "frames": lambda level: level.frame_every > 1,
-            "plans": lambda level: level.plan_every > 1,
-        }.items()
+    reduced: dict[str, list[bool]] = {
+        "readings": [not level.every_reading for level in LEVELS],
+        "search": [not level.search for level in LEVELS],
+        "frames": [level.frame_every > 1 for level in LEVELS],
+        "plans": [level.plan_every > 1 for level in LEVELS],
     }
+    first = {name: levels.index(True) for name, levels in reduced.items()}
     assert first["readings"] < first["search"] < first["frames"] < first["plans"]
     for before, after in itertools.pairwise(LEVELS):
         assert after.every_reading <= before.every_reading
@@ -135,7 +133,8 @@ def test_level_and_counters_are_recorded_when_they_change() -> None:
 
 
 def test_thinned_navigation_uses_the_newest_reading_of_a_cycle_and_watches_all() -> None:
-    ingested, noted = [], []
+    ingested: list[Any] = []
+    noted: list[Any] = []
     navigation = object.__new__(Navigation)
     readings = [
         SimpleNamespace(time_ns=time_ns, field=np.ones(3), rate=np.ones(3), has_rate=True)

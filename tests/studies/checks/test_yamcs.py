@@ -199,6 +199,7 @@ def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
+@pytest.mark.timeout(300)
 def test_yamcs_archives_and_commands_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every packet and value is ours, every command completed, no warning, no socket beyond loopback."""
     sound = fly(tmp_path, PLANS["short"])
