@@ -46,8 +46,12 @@ OF_THE_COMPUTER = {
     "run": {"config_name", "config_crc", "software", "utc_ns", "seed"},
     "health": {"cpu_share", "proportional", "memory_slope", "disk_free", "temperature"},
     "event": {"code"},
+    "plan": {"evaluations"},
 }
-"""Fields that depend on the computer, or on the text of the configuration."""
+"""Fields that depend on the computer, or on the text of the configuration.
+
+The number of evaluations in an optimisation depends on the rounding of the processor.
+"""
 UNTIMED = {"cycle_timing", "job_timing", "rate_group"}
 """Packets of real times."""
 

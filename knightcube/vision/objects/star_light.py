@@ -209,7 +209,7 @@ def star_path(direction: FloatArray, rotation: FloatArray, start: float, pinhole
 
     The star is at `direction` (3,), camera axes, when it has covered the fraction `start` of the path.
     """
-    return star_paths(direction[None], rotation, np.array([start]), pinhole)[0]
+    return np.asarray(star_paths(direction[None], rotation, np.array([start]), pinhole)[0])
 
 
 def star_paths(

@@ -232,7 +232,7 @@ def _bright_matched(
     """Return a mask of the matched stars, for the expected stars brighter than the median matched star."""
     matched = (expected[:, None] == star).any(axis=1)
     places = np.flatnonzero(matched)
-    return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]
+    return np.asarray(matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0])
 
 
 def _share_displaced(
