@@ -212,10 +212,9 @@ def files(
     command_frame_bytes: int = DEFAULTS.command_frame_bytes,
     body: Body | None = None,
 ) -> Mapping[str, str]:
-    """Return the content of each file by its name below `folder`.
+    """Return the content of each file by its name below `folder`, with the command stacks for the body.
 
-    Without a gateway, whose keys are in the folder `keys`, Yamcs reads recorded packets only. The command
-    stacks are those that the kind of body can obey.
+    Without a gateway, whose keys are in the folder `keys`, Yamcs reads recorded packets only.
     """
     host, port = host_port(gateway or ADDRESS)
     server = _SERVER.format(

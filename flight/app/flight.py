@@ -57,16 +57,19 @@ from flight.loop.facts import EventLog, Facts, FlightClock, Services, Streams, s
 from flight.loop.flight_loop import FlightLoop, FlightProgress, RunLabel, Supervisors, nothing
 from flight.loop.health import (
     Board,
+    BusyPeriods,
     HealthWatch,
     Housekeeping,
+    OverloadSign,
     PerformanceObserver,
+    Shedding,
+    ShedLevel,
     WorkerWatch,
 )
 from flight.loop.horizon_cameras import HorizonCameraSettings, HorizonCameraTask
 from flight.loop.imaging import Imaging, ImagingSettings, ObjectTracks
 from flight.loop.modes import ModeControl, ModeSettings
 from flight.loop.navigation import Navigation, NavigationSettings, Positioning, SunSensing
-from flight.loop.shedding import BusyPeriods, OverloadSign, Shedding, ShedLevel
 from flight.loop.state import Learned, StateKeeper, open_state, service_folder, state_folder
 from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
 from flight.loop.worker_processes import ProcessRunner

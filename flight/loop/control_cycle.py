@@ -17,12 +17,11 @@ from flight.loop.body import PLANNER, ControlOutput, FlightBody, Steered, Target
 from flight.loop.commanding import CommandTask
 from flight.loop.executive import Cycle
 from flight.loop.facts import Services
-from flight.loop.health import HealthWatch, Housekeeping, PerformanceObserver
+from flight.loop.health import HealthWatch, Housekeeping, PerformanceObserver, Shedding
 from flight.loop.horizon_cameras import HorizonCameraTask
 from flight.loop.imaging import Imaging
 from flight.loop.modes import ModeControl
 from flight.loop.navigation import CoilKnowledge, CurrentValidity, Navigation, Positioning, SunSensing
-from flight.loop.shedding import Shedding
 from flight.loop.steering import CoilDrive, Steering
 
 if TYPE_CHECKING:  # only flights with a section `power` load this module

@@ -98,6 +98,7 @@ def test_every_integer_of_the_testbed_may_pass_its_end(
         "link",
         "verification",
         "transfer",
+        "workload",
         *_OF_OBJECTS,
     }
     assert_survived(run, driven, {packet.name for packet in PACKETS} - elsewhere)

@@ -106,8 +106,11 @@ def differences(record: Any, found: Any, tolerance: float, place: str = "", zero
     return [] if alike else [f"{place}: {found}, recorded {record}"]
 
 
-def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE) -> None:
-    """Fail unless a result has the figures of its record, beside a test module."""
+def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zero: float = ZERO) -> None:
+    """Fail unless a result has the figures of its record, beside a test module.
+
+    Numbers agree if they differ by the fraction `tolerance`, or by `zero`.
+    """
     path = Path(module).with_name("recorded_results.json")
     records: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     found = json.loads(json.dumps(figures_of(result)))
@@ -116,4 +119,4 @@ def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE) -> 
         lines = [f"{json.dumps(key)}: {json.dumps(records[key])}" for key in sorted(records)]
         path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
         return
-    assert differences(records[name], found, tolerance, zero=ZERO) == [], CURE
+    assert differences(records[name], found, tolerance, zero=zero) == [], CURE

@@ -490,9 +490,8 @@ class ReadingConverter:
         values = self._map @ np.array((*q, *rate, *mag, *accel))
         if not has_rate:
             values[4:7] = math.nan
-        quaternion = values[:4]
         # Of the two equivalent signs of the quaternion, the sign with a positive scalar part is returned.
-        quaternion /= math.copysign(norm, quaternion[3])
+        quaternion = values[:4] / math.copysign(norm, values[3])
         length = item.layout.length if isinstance(item, BinaryPacket) else item.length
         return ImuReading(
             time_ns=item.arrival_ns - round(length * self._byte_ns),

@@ -292,9 +292,6 @@ def examine(
     used[limb.index[fit.used]] = True
     squares = np.where(members, np.nan, np.inf)
     squares[limb.index] = (fit.residuals / limb.sigma) ** 2
-    night = 0.0
-    if sun is not None and np.any(members):
-        night = float(np.mean(sun_elevation(view, observation.rays.rays[members], sun) < _NIGHT))
     pixel = float(np.median(observation.rays.pixel[used]))
     air = UNIT_DEPTH_HEIGHT / (view.limb_distance * pixel)
     # The part of the limb that is known to be on the night side is not expected to show edges.
@@ -316,13 +313,20 @@ def examine(
         guess,
         agreement(view, sun, observation.samples),
         _coverage(view, observation, used, sun, camera),
-        night,
+        _night_share(view, observation.rays.rays[members], sun),
         limb_tilt_sigma(view, stand, settings),
         chance + math.log10(stand.share),
         float(np.median(observation.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma),
         why_not_space(view, sun, observation.samples, pixel),
         0.0 if altitude_known else _altitude_off(fit, settings.altitudes),
     )
+
+
+def _night_share(view: LimbView, rays: FloatArray, sun: FloatArray | None) -> float:
+    """Return the fraction of limb points at `rays` (n, 3) at which the Sun is well below the horizon."""
+    if sun is None or not len(rays):
+        return 0.0
+    return float(np.mean(sun_elevation(view, rays, sun) < _NIGHT))
 
 
 def _altitude_off(fit: FittedLimb, altitudes: tuple[float, float]) -> float:

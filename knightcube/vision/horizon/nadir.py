@@ -236,12 +236,10 @@ def nadir_of_uncertain_field(
 ) -> HorizonSolution:
     """Return the nadir if the camera's focal length has the relative standard deviation `sigma`.
 
-    The image is searched with eleven focal lengths, which are refined around the most probable ones. The
-    weight of a horizon is the probability of its focal length and of its misfit. Nadir and altitude are the
-    weighted means of all horizons, and their uncertainties include the differences between the horizons.
-    The brightness of the image does not determine the focal length: horizons that contradict the brightness
-    have their weight too, and the image is refused if they have most of the weight. The other arguments are
-    those of `find_nadir`.
+    The image is searched with eleven focal lengths. Nadir and altitude are the means of all horizons,
+    weighted with the probability of focal length and misfit; their uncertainties include the differences
+    between the horizons. The brightness of the image does not determine the focal length: horizons that
+    contradict it keep their weight, and if they have most of it, the image is refused. See `find_nadir`.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     first = find_nadir(image, camera, knowledge, settings, hidden)

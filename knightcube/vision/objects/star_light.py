@@ -327,6 +327,16 @@ _LEAST_AHEAD = 0.85
 _LEAST_POINTS = 4
 
 
+def _points_at(pixels: IntArray, points: FloatArray, sigma: float) -> FloatArray:
+    """Return the image on the pixels (p, 2), (p,), of one count that the `points` (m, 2), px, share."""
+    image = np.zeros(len(pixels))
+    for point in points:
+        near = np.flatnonzero(np.abs(pixels - point).max(axis=1) < _FARTHEST * sigma + 1.0)
+        edges = (pixels[near] - point)[:, :, None] + np.array([-0.5, 0.5])
+        image[near] += np.prod(np.diff(ndtr(edges / sigma), axis=2)[..., 0], axis=1) / len(points)
+    return image
+
+
 def streak_at(pixels: IntArray, path: FloatArray, sigma: float) -> FloatArray:
     """Return the image of a streak of one count along `path` (m, 2), px, on the given pixels (p, 2), (p,).
 
@@ -335,17 +345,12 @@ def streak_at(pixels: IntArray, path: FloatArray, sigma: float) -> FloatArray:
     the pixel. The error is at most 2 % of the largest value. The image of a strongly bent path is the sum of
     the images of its points.
     """
-    image = np.zeros(len(pixels))
     chord = path[-1] - path[0]
     length = float(np.linalg.norm(chord))
     steps = np.diff(path, axis=0)
     ahead = steps @ chord - _LEAST_AHEAD * length * np.hypot(steps[:, 0], steps[:, 1])
     if len(path) < _LEAST_POINTS or length == 0.0 or ahead.min() < 0.0:
-        for point in path:
-            near = np.flatnonzero(np.abs(pixels - point).max(axis=1) < _FARTHEST * sigma + 1.0)
-            edges = (pixels[near] - point)[:, :, None] + np.array([-0.5, 0.5])
-            image[near] += np.prod(np.diff(ndtr(edges / sigma), axis=2)[..., 0], axis=1) / len(path)
-        return image
+        return _points_at(pixels, path, sigma)
     width = float(np.sqrt(sigma**2 + 1.0 / 12.0))
     tangent = chord / length
     normal = np.array([-tangent[1], tangent[0]])
@@ -378,6 +383,7 @@ def streak_at(pixels: IntArray, path: FloatArray, sigma: float) -> FloatArray:
     for distance in (first, last):
         ending = np.flatnonzero(distance < _FARTHEST * width)
         light[ending] *= ndtr(distance[ending] / width)
+    image = np.zeros(len(pixels))
     image[chosen] = light
     return image
 

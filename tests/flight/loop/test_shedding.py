@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from flight.link import events
+from flight.loop.health import LEVELS, BusyPeriods, OverloadSign, Shedding, ShedLevel
 from flight.loop.navigation import Navigation
-from flight.loop.shedding import LEVELS, BusyPeriods, OverloadSign, Shedding, ShedLevel
 
 S = 1_000_000_000
 

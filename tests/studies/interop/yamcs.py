@@ -102,6 +102,8 @@ _RACE = 'because "paramProcessor" is null'
 
 The packet is archived and its values are right; displays miss it. Counted apart.
 """
+_LOST_S = 15.0
+"""Time (s) after which a command is issued again if Yamcs has lost a report."""
 _REFUSED = ("clear", {"event": "too-hot"})
 _STEADY = LAYOUTS["health"].identifier.to_bytes(2, "big")
 """How the packet begins that a flight writes each second once it steers."""
@@ -142,20 +144,40 @@ def _command(server: Yamcs, flight: LinkedFlight, plan: Plan) -> bool:
     for name, arguments in plan.commands:
         if name == "clear":
             _until(lambda: _BROKEN.encode() in _log(flight.run), plan.patience)
-        history = _followed(server, server.command(name, arguments), plan.patience)
+        history = _followed(server, name, arguments, plan.patience)
         ends[name] = history.get("CommandComplete_Status", "none")
         stages = [history.get(f"Verifier_{stage}_Status") for stage in ("Accepted", "Execution", "Complete")]
         ends[name] += "" if "NOK" not in stages else " with a stage that failed"
-    refused = _followed(server, server.command(*_REFUSED), _DEADLINE_S)
+    refused = _followed(server, *_REFUSED, _DEADLINE_S)
     failed = refused.get("CommandComplete_Status") == "NOK"
     _say("commands", **ends, refused=refused.get("CommandComplete_Message", "not reported"))
     return failed and all(end == "OK" for end in ends.values())
 
 
-def _followed(server: Yamcs, command: str, seconds: float) -> dict[str, Any]:
-    """Return a command's history when it is completed, or when the time is over."""
-    _until(lambda: "CommandComplete_Status" in server.history(command), seconds)
+def _followed(server: Yamcs, name: str, arguments: dict[str, Any], seconds: float) -> dict[str, Any]:
+    """Issue a command, and return its history when it is completed, or when the time is over.
+
+    A command of which Yamcs lost a report in its race (`_RACE`) never completes, and is issued again.
+    """
+    races, begun = _races(server), time.monotonic()
+    command = server.command(name, arguments)
+
+    def is_lost() -> bool:
+        return time.monotonic() > begun + _LOST_S and _races(server) > races
+
+    def is_completed() -> bool:
+        return "CommandComplete_Status" in server.history(command)
+
+    _until(lambda: is_completed() or is_lost(), seconds)
+    if not is_completed() and is_lost():
+        command = server.command(name, arguments)
+        _until(is_completed, seconds)
     return server.history(command)
+
+
+def _races(server: Yamcs) -> int:
+    """Return how often Yamcs has lost a packet in its race."""
+    return sum(_RACE in line for line in troubles(server.log.read_text()))
 
 
 def _sockets(server: Yamcs, flight: LinkedFlight) -> bool:

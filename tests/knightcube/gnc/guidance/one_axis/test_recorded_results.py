@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
-from knightcube.gnc.guidance.one_axis.vmc import plan
+from knightcube.gnc.guidance.one_axis.vmc import StepPlan, plan
 from tests.support.flights import demo_config
 from tests.support.recorded_flights import unlike_record
 from tests.support.recorded_results import check
@@ -24,16 +25,25 @@ def plant(current_limit: float | None = None) -> SingleAxisPlant:
     return plant_of(config)
 
 
+_ROUNDING = 1e-10
+"""Largest coefficient of a path that rounding leaves of an exact zero."""
+
+
+def without_counts(found: StepPlan) -> StepPlan:
+    """Return a plan without its number of evaluations, which depends on the rounding of the processor."""
+    return replace(found, evaluations=0)
+
+
 def test_a_plan_from_rest_is_as_recorded() -> None:
-    check(__file__, "rest", plan(plant(), -0.3, 0.0, -0.2, 0.0, 10.0), 1e-3)
+    check(__file__, "rest", without_counts(plan(plant(), -0.3, 0.0, -0.2, 0.0, 10.0)), 1e-3, _ROUNDING)
 
 
 def test_a_plan_from_a_rotating_body_is_as_recorded() -> None:
-    check(__file__, "rotating", plan(plant(), 0.1, 0.03, -0.15, 0.0, 12.0), 1e-3)
+    check(__file__, "rotating", without_counts(plan(plant(), 0.1, 0.03, -0.15, 0.0, 12.0)), 1e-3, _ROUNDING)
 
 
 def test_a_plan_that_must_be_stretched_is_as_recorded() -> None:
-    check(__file__, "stretched", plan(plant(0.08), -0.3, 0.0, 0.0, 0.0, 6.0), 1e-3)
+    check(__file__, "stretched", without_counts(plan(plant(0.08), -0.3, 0.0, 0.0, 0.0, 6.0)), 1e-3, _ROUNDING)
 
 
 def test_the_motion_of_the_plant_is_as_recorded() -> None:
