@@ -479,8 +479,10 @@ def test_without_the_motion_nothing_is_contradicted() -> None:
     assert not MotionWitness(None, FULL).contradicts(0, CoilFault.OPEN, 0, 0, 0)
 
 
-def _point_in_dense_air(disturbance: float | None, seed: int) -> tuple[dict[Finding, int], FloatArray]:
-    """Hold an attitude for 150 s by healthy coils against a torque that changes its direction.
+def _point_in_dense_air(
+    disturbance: float | None, seed: int, gains: tuple[int, int, int] = (1, 1, 1)
+) -> tuple[dict[Finding, int], FloatArray]:
+    """Command coils with the given `gains` for 150 s to hold an attitude against a torque that changes.
 
     Returns how many fits of how many axes made each finding, and the errors of the gains in standard
     deviations.
@@ -502,7 +504,7 @@ def _point_in_dense_air(disturbance: float | None, seed: int) -> tuple[dict[Find
             currents = np.clip(np.cross(field, wanted) / (0.65 * field @ field), -0.148, 0.148)
         response.commanded(now_ns, tuple(currents.tolist()))
         air = 3e-4 * np.sin(2.0 * math.pi * time / period + phase)
-        rate = rate + (np.cross(0.65 * currents, field) / MOMENTS + air) / 40
+        rate = rate + (np.cross(0.65 * np.array(gains) * currents, field) / MOMENTS + air) / 40
         angle = angle + rate / 40
         if response.observe_motion(now_ns + TICK_NS, rate + 2.8e-4 * generator.standard_normal(3), field):
             for finding in Finding:
@@ -519,3 +521,4 @@ def test_no_healthy_coil_looks_reversed_in_dense_air() -> None:
         assert np.mean(errors > 3.0) < 0.02
         misled += _point_in_dense_air(None, seed)[0][Finding.REVERSED]
     assert misled > 0, "a fit that assumes a constant disturbance is misled"
+    assert _point_in_dense_air(3e-4, 1, (-1, 1, 1))[0][Finding.REVERSED] > 0, "a reversed coil is still found"
