@@ -23,6 +23,9 @@ from hypothesis import settings
 # As `python -m flight` does: OpenBLAS's waiting threads would take a third of the tests' processor time.
 # No test imports numpy before this file is read, and started programs inherit the setting.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# The tests hold the numpy forms to their requirements, and the compiled forms to the numpy forms: recorded
+# results stay the same bytes, and no started program loads numba.
+os.environ.setdefault("KNIGHTCUBE_COMPILED", "0")
 
 # No test may fail because the machine is busy, or because hypothesis draws a rare example in one run of many.
 # The examples are the same in each run, so that more of them cost time in each run and find nothing new.

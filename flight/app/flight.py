@@ -80,6 +80,7 @@ from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.buses.clock import SystemClock
 from hal.buses.linux_process import worker_cores
 from hal.interfaces.wires import SECOND_NS, Clock, Rig
+from knightcube.compiled import use_numpy_forms
 from knightcube.errors import UsageError
 from knightcube.gnc.tracker import TrackSettings
 from knightcube.vision import frame_job, horizon_camera_job
@@ -114,6 +115,8 @@ def open_flight(
     BOOT for missing devices and for a disk that cannot be written; any other flight raises DeviceError for a
     missing device. The folders `earlier` of earlier runs serve to detect that the stored state is outdated.
     """
+    if rig.realtime:
+        use_numpy_forms()
     flight_log = open_log(folder, "flight", rig, config, stack, patient)
     performance_log = open_log(folder, "performance", rig, config, stack, patient)
     # The stored state is closed after the devices, and opened last, so that only a boot that flies counts.

@@ -1,0 +1,98 @@
+"""Machine code for hot functions, by numba where it is installed.
+
+A hot function has two forms that return the same values up to rounding. The numpy form is the reference, and
+works everywhere. The loop form is plain Python with loops over elements, which numba compiles at its first
+call. `@compiled_form_of(numpy_form)` joins the two:
+
+    @compiled_form_of(sum_of_squares_numpy)
+    def sum_of_squares(values: FloatArray) -> float:
+        total = 0.0
+        for value in values:
+            total += value * value
+        return total
+
+`pip install knightcube[fast]` installs numba. The environment variable KNIGHTCUBE_COMPILED=0 selects the
+numpy forms although numba is installed; so does `use_numpy_forms()`, which the control loop of a flight in
+real time calls, because the first call of a compiled form takes up to some seconds.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+import os
+from collections.abc import Callable
+from typing import Any, Generic, ParamSpec, TypeVar
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+_SWITCH = "KNIGHTCUBE_COMPILED"
+_helpers: list[Callable[..., Any]] = []
+"""Functions that loop forms call, until numba knows them."""
+
+
+class HotFunction(Generic[Parameters, Result]):
+    """Function with a numpy form and a loop form, of which each process uses one."""
+
+    def __init__(
+        self, numpy_form: Callable[Parameters, Result], loop_form: Callable[Parameters, Result]
+    ) -> None:
+        functools.update_wrapper(self, loop_form)
+        self.numpy_form = numpy_form
+        self.loop_form = loop_form
+        self._chosen: Callable[Parameters, Result] | None = None
+
+    def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        """Return the result of the compiled form, or of the numpy form where that is in use."""
+        chosen = self._chosen
+        if chosen is None:
+            chosen = self._chosen = self.compiled_form() if in_use() else self.numpy_form
+        return chosen(*args, **kwargs)
+
+    def compiled_form(self) -> Callable[Parameters, Result]:
+        """Return the loop form as a function that numba compiles, and keeps in a file where it can write one.
+
+        Raises ImportError if numba is not installed.
+        """
+        numba = importlib.import_module("numba")
+        while _helpers:
+            numba.extending.register_jitable(error_model="numpy")(_helpers.pop())
+        try:
+            return _typed(numba.njit(cache=True, error_model="numpy")(self.loop_form))
+        except RuntimeError:  # no folder for the file can be written
+            return _typed(numba.njit(error_model="numpy")(self.loop_form))
+
+
+def compiled_form_of(
+    numpy_form: Callable[Parameters, Result],
+) -> Callable[[Callable[Parameters, Result]], HotFunction[Parameters, Result]]:
+    """Return the decorator that joins a loop form to its numpy form.
+
+    The loop form takes arrays and numbers by position. It calls only functions of numpy that numba knows, and
+    functions of its own module that `loop_helper` decorates: the kept machine code is made again when this
+    module changes, and not when another one does.
+    """
+    return lambda loop_form: HotFunction(numpy_form, loop_form)
+
+
+def loop_helper(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Decorate a function that loop forms of the same module call, and return it as it is."""
+    _helpers.append(function)
+    return function
+
+
+def in_use() -> bool:
+    """Return whether this process uses compiled forms from now on."""
+    return os.environ.get(_SWITCH, "1") != "0" and importlib.util.find_spec("numba") is not None
+
+
+def use_numpy_forms() -> None:
+    """Make this process, and those that it starts, use numpy forms for all functions not yet called."""
+    os.environ[_SWITCH] = "0"
+
+
+def _typed(compiled: Any) -> Callable[..., Any]:
+    function: Callable[..., Any] = compiled
+    return function
