@@ -483,6 +483,10 @@ class LensCalibration:
         """Return whether a lens was determined."""
         return self.determined is not None
 
+    def __repr__(self) -> str:
+        """Return the lens and the number of images, in one line."""
+        return f"<LensCalibration of {len(self.images)} images: {self.lens or 'no lens was determined'}>"
+
     @property
     def lens(self) -> Lens | None:
         """The calibrated lens, for use as `StarTracker(camera=...)`, or None if no image was solved."""

@@ -57,6 +57,11 @@ class MatchedStars:
     def __len__(self) -> int:
         return len(self.hip)
 
+    def __repr__(self) -> str:
+        """Return the number of stars and the names of the three brightest."""
+        names = ", ".join(f"HIP {hip}" for hip in self.hip[:3])
+        return f"<MatchedStars: {len(self)} stars{', brightest ' + names if names else ''}>"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarSolution:
@@ -116,6 +121,17 @@ class StarSolution:
     def __bool__(self) -> bool:
         """Return whether the image was solved."""
         return self.frame.fix is not None
+
+    def __repr__(self) -> str:
+        """Return status, pointing, uncertainty and number of stars, or the reason, in one line."""
+        if not self:
+            return f"<StarSolution {self.status}: {self.reason}>"
+        across = 3_600.0 * math.degrees(math.sqrt(max(self.covariance[0, 0], self.covariance[1, 1])))
+        return (
+            f"<StarSolution {self.status}: right ascension {self.right_ascension_deg:.4f}, declination "
+            f"{self.declination_deg:.4f}, roll {self.roll_deg:.3f} deg, 1 sigma {across:.2g} arcsec, "
+            f"{len(self.stars)} stars>"
+        )
 
     @property
     def right_ascension_deg(self) -> float:

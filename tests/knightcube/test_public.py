@@ -5,13 +5,19 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import knightcube
+from knightcube import LensCalibration, SingleAxisPlant, StarTracker, plan_step
+from knightcube.vision.horizon.nadir import HorizonSolution, HorizonStatus, NadirMeasurement
+from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 
 
 def _names_for_type_checkers() -> set[tuple[str, str]]:
@@ -42,6 +48,42 @@ def test_every_public_name_is_documented_with_its_public_methods(name: str) -> N
     for member, method in vars(value).items() if inspect.isclass(value) else ():
         if callable(method) and not member.startswith("_"):
             assert inspect.getdoc(method)
+
+
+NADIR = NadirMeasurement(np.array([0.6, 0.0, 0.8]), 1e-6 * np.eye(3), 5e5, 1e3, 0.1, used=90)
+PLANT = SingleAxisPlant(inertia=1.05e-3, torque_constant=2.9e-4, resistance=23.0, current_limit=0.148)
+
+
+@pytest.mark.parametrize(
+    ("result", "shown"),
+    [
+        (lambda: StarTracker(fov_deg=10.0).solve(np.zeros((64, 64))), "<StarSolution no-stars: .+>"),
+        (lambda: LensCalibration(None, ()), "<LensCalibration of 0 images: no lens was determined>"),
+        (
+            lambda: MotionResult(
+                StreakStatus.RATE, 0, 0.5, rate=np.array([0.1, 0.0, -0.2]), covariance=np.eye(3)
+            ),
+            r"<MotionResult rate: rate \[0.100000, 0.000000, -0.200000\] \+- 1.7 rad/s, 0 stars>",
+        ),
+        (lambda: MotionResult(StreakStatus.BLACK, 0, 0.5, reason="dark"), "<MotionResult black: dark>"),
+        (
+            lambda: HorizonSolution(HorizonStatus.FOUND, nadir=NADIR),
+            r"<HorizonSolution found: nadir \[0.60000, "
+            r"0.00000, 0.80000\], 1 sigma 0.057 deg>",
+        ),
+        (
+            lambda: HorizonSolution(HorizonStatus.NO_HORIZON, "all dark"),
+            "<HorizonSolution no-horizon: all dark>",
+        ),
+        (
+            lambda: plan_step(PLANT, start_angle=0.0, end_angle=0.5, horizon=15.0),
+            "<StepPlan optimal: 15 s, heat .+ mJ, peak current .+ mA>",
+        ),
+    ],
+)
+def test_a_result_is_shown_in_one_line(result: Callable[[], object], shown: str) -> None:
+    """The arrays of a result would fill pages in an interactive session."""
+    assert re.fullmatch(shown, repr(result()))
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

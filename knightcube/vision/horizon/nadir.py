@@ -143,6 +143,14 @@ class HorizonSolution:
         """Return whether a nadir was found."""
         return self.nadir is not None
 
+    def __repr__(self) -> str:
+        """Return status, nadir and uncertainty, or the reason, in one line."""
+        if self.nadir is None:
+            return f"<HorizonSolution {self.status.value}: {self.reason}>"
+        nadir = ", ".join(f"{value:.5f}" for value in self.nadir.direction)
+        sigma = math.degrees(math.sqrt(np.linalg.eigvalsh(self.nadir.covariance)[-1]))
+        return f"<HorizonSolution {self.status.value}: nadir [{nadir}], 1 sigma {sigma:.2g} deg>"
+
 
 _WIDER = 2.0
 """Factor that widens the altitude range in the search for cones, because a cone of three edges is

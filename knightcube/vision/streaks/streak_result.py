@@ -151,6 +151,15 @@ class MotionResult(FrameMotion):
     course: Course | None = None
     line_time_sigma: float = 0.0
 
+    def __repr__(self) -> str:
+        """Return status, rate, uncertainty and number of stars, or the reason, in one line."""
+        if self.rate is None or self.covariance is None:
+            return f"<MotionResult {self.status.value}: {self.reason}>"
+        sigma = float(np.sqrt(np.trace(self.covariance)))
+        rate = ", ".join(f"{value:.6f}" for value in self.rate)
+        stars = f"{len(self.stars)} stars"
+        return f"<MotionResult {self.status.value}: rate [{rate}] +- {sigma:.2g} rad/s, {stars}>"
+
     @property
     def start_to_end(self) -> FloatArray | None:
         """The quaternion (4,) of the rotation over the exposure, A(q) v_start = v_end; None without a rate.

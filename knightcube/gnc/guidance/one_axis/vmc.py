@@ -299,6 +299,13 @@ class StepPlan:
     node_times: FloatArray
     node_q2: FloatArray
 
+    def __repr__(self) -> str:
+        """Return status, duration, energy and peak current, in one line."""
+        return (
+            f"<StepPlan {self.status}: {self.horizon:g} s, heat {1e3 * self.energy:.4g} mJ, "
+            f"peak current {1e3 * self.peak_current:.4g} mA>"
+        )
+
     def spent(self, cost: PathCost) -> float:
         """Return the energy of the given kind, J."""
         return self.energy if cost is PathCost.HEAT else self.supplied

@@ -165,6 +165,13 @@ class SlewPlan:
     clearance: tuple[float, ...]
     steps: int
 
+    def __repr__(self) -> str:
+        """Return status, duration, heat and largest dipole moment, in one line."""
+        return (
+            f"<SlewPlan {self.status}: {self.horizon:g} s, heat {1e3 * self.energy:.4g} mJ, "
+            f"peak dipole {100.0 * self.peak:.3g} % of the limit>"
+        )
+
 
 def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
     """Return the best plan found for a slew task. Raises PlanningError with the reason if no path is found.
@@ -344,6 +351,10 @@ class OrderedSlew:
     plan: SlewPlan
     begin: float
     compared: int
+
+    def __repr__(self) -> str:
+        """Return the start and the plan, in one line."""
+        return f"<OrderedSlew: begins at {self.begin:g} s, {self.plan!r}>"
 
 
 def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedSlew:
