@@ -7,7 +7,7 @@ values of a configuration are consistent with each other, and defines the networ
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from ipaddress import IPv4Address, IPv4Network
 from itertools import pairwise
 from pathlib import Path
@@ -21,9 +21,11 @@ from flight.schema.devices import (
     Camera,
     Coils,
     Power,
+    PowerMonitorSection,
     SolarStringsSection,
     UnitSection,
     V4l2Device,
+    fitted_devices,
     structure_mask,
     with_drivers,
 )
@@ -32,6 +34,7 @@ from flight.schema.orbit import Craft, ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
 from flight.schema.values import Quaternion, Vector, check_aim
+from hal.buses.i2c_bus import device_file
 from hal.interfaces.devices import MOST_COILS
 from knightcube.astro.inertia import inertia_problem
 from knightcube.errors import UsageError
@@ -106,6 +109,7 @@ def check_consistency(config: Config, document: Document) -> None:
                     f"is {value!r}: must be equal for all wide-angle cameras, the first has {wanted!r}",
                 )
     _check_supplies(config, refuse)
+    _check_connections(config, refuse)
 
 
 def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
@@ -221,21 +225,12 @@ def _check_coils(config: Config, refuse: Refuse) -> None:
         free = [channel for channel in range(16) if channel not in used]
         cure = f"give one of the two coils other `channels`, of {free}"
         refuse("coils.windings", f"use channel {twice} of the PWM chip twice: {cure}")
-    if config.power_monitor is not None and config.power_monitor.address == config.coils.address:
-        refuse(
-            "power_monitor.address",
-            f"is 0x{config.power_monitor.address:02x}, the address of the PWM chip: "
-            "set another address (0x45) by the monitor's address pins, and give it here",
-        )
 
 
-def _check_strings(config: Config, strings: SolarStringsSection, refuse: Refuse) -> None:
-    others = {config.coils.address} | ({config.power_monitor.address} if config.power_monitor else set())
+def _check_strings(strings: SolarStringsSection, refuse: Refuse) -> None:
     inputs = set()
     for index, string in enumerate(strings.strings):
         place = f"solar_strings.strings[{index}]"
-        if string.address in others:
-            refuse(f"{place}.address", f"is 0x{string.address:02x}, the address of another chip on the bus")
         if (string.address, string.channel) in inputs:
             refuse(f"{place}.channel", f"is {string.channel}: this ADC channel measures another string")
         inputs.add((string.address, string.channel))
@@ -245,7 +240,7 @@ def _check_strings(config: Config, strings: SolarStringsSection, refuse: Refuse)
 
 def _check_supplies(config: Config, refuse: Refuse) -> None:
     if config.solar_strings is not None:
-        _check_strings(config, config.solar_strings, refuse)
+        _check_strings(config.solar_strings, refuse)
     if config.power is not None:
         _check_power(config, config.power, refuse)
 
@@ -263,16 +258,49 @@ def _check_power(config: Config, power: Power, refuse: Refuse) -> None:
     if config.camera is not None and limits.camera_period < config.camera.period:
         period = f"is {limits.camera_period:g} s: must be at least `camera.period`"
         refuse("power.low_battery.camera_period", f"{period}, {config.camera.period:g} s")
-    bus, strings = config.coils.bus, config.solar_strings
-    used = {(bus, config.coils.address)}
-    if config.power_monitor is not None:
-        used.add((config.power_monitor.bus or bus, config.power_monitor.address))
-    if strings is not None:
-        used |= {(strings.bus or bus, string.address) for string in strings.strings}
-    for key, monitor in power.monitors().items():
-        if (monitor.bus or bus, monitor.address) in used:
-            refuse(f"{key}.address", f"is 0x{monitor.address:02x}, the address of another chip on the bus")
-        used.add((monitor.bus or bus, monitor.address))
+
+
+def _connections(config: Config) -> Iterator[tuple[str, str, str]]:
+    """Yield the dotted key, the value and the place of each device file and each I2C address in use.
+
+    Two devices must not have one place. An I2C bus is shared, so that its place includes the address.
+    """
+
+    def chip(key: str, address: int, bus: int | str | None) -> tuple[str, str, str]:
+        on = device_file(config.coils.bus if bus is None else bus)
+        return key, f"0x{address:02x}", f"0x{address:02x} on {on}"
+
+    for offset in range(len(config.coils.windings) if config.coils.driver == "drv8830" else 1):
+        yield chip("coils.address", config.coils.address + offset, None)
+    for key, _, section in fitted_devices(config):
+        if isinstance(section, PowerMonitorSection):
+            yield chip(f"{key}.address", section.address, section.bus)
+        elif isinstance(section, SolarStringsSection):
+            first = {string.address: index for index, string in reversed(list(enumerate(section.strings)))}
+            for address, index in first.items():
+                yield chip(f"{key}.strings[{index}].address", address, section.bus)
+        for number, sensor in enumerate(getattr(section, "sensors", ())):
+            if sensor.address is not None:
+                yield chip(f"{key}.sensors[{number}].address", sensor.address, sensor.bus)
+            if sensor.spi is not None:
+                yield f"{key}.sensors[{number}].spi", sensor.spi, sensor.spi
+        if isinstance(file := getattr(section, "device", None), str):
+            yield f"{key}.device", file, file
+    cameras = [("camera", config.camera)] if config.camera is not None else []
+    for key, camera in cameras + [(f"wide_cameras[{k}]", one) for k, one in enumerate(config.wide_cameras)]:
+        for name in ("path", "name"):
+            if isinstance(place := getattr(camera.device, name, None), str):
+                yield f"{key}.device.{name}", place, place
+
+
+def _check_connections(config: Config, refuse: Refuse) -> None:
+    taken: dict[str, str] = {}
+    for key, value, place in _connections(config):
+        first = taken.setdefault(place, key)
+        if first != key:
+            refuse(
+                key, f"is {value}, which `{first}` has too: give each device an address or file of its own"
+            )
 
 
 def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
