@@ -1,0 +1,31 @@
+"""Each measured figure stands on one page. The figures that the README quotes from a page are compared."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.docs.blocks import ROOT
+
+
+def _rows(page: str) -> dict[str, list[str]]:
+    """Return the cells of all table rows of a page by their first cell."""
+    lines = (ROOT / page).read_text(encoding="utf-8").replace(r"\|", "¦").splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
+    return {first: others for first, *others in cells}
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/results/testbed.md"])
+def test_the_thesis_s_power_stands_beside_the_power_from_the_supply(page: str) -> None:
+    rows = [first for first, others in _rows(page).items() if "0.10 W" in others]
+    assert rows
+    assert all("from the supply" in first and "R I²" not in first for first in rows)
+
+
+def test_the_readme_has_the_figures_of_the_results_page() -> None:
+    quoted = {
+        first: cells for first, cells in _rows("README.md").items() if "power" in first or "worst" in first
+    }
+    stated = _rows("docs/results/testbed.md")
+    assert len(quoted) == 4
+    for first, (thesis, here) in quoted.items():
+        assert (thesis, here) == (stated[first][0], stated[first][2]), first
