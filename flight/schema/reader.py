@@ -34,7 +34,6 @@ from flight.schema.orbit import Craft, ExclusionCones, OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig, as_testbed
 from flight.schema.values import Quaternion, Vector, check_aim
-from hal.buses.i2c_bus import device_file
 from hal.interfaces.devices import MOST_COILS
 from knightcube.astro.inertia import inertia_problem
 from knightcube.errors import UsageError
@@ -267,8 +266,9 @@ def _connections(config: Config) -> Iterator[tuple[str, str, str]]:
     """
 
     def chip(key: str, address: int, bus: int | str | None) -> tuple[str, str, str]:
-        on = device_file(config.coils.bus if bus is None else bus)
-        return key, f"0x{address:02x}", f"0x{address:02x} on {on}"
+        on = config.coils.bus if bus is None else bus
+        file = f"/dev/i2c-{on}" if isinstance(on, int) else on
+        return key, f"0x{address:02x}", f"0x{address:02x} on {file}"
 
     for offset in range(len(config.coils.windings) if config.coils.driver == "drv8830" else 1):
         yield chip("coils.address", config.coils.address + offset, None)
