@@ -29,6 +29,8 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 _SWITCH = "KNIGHTCUBE_COMPILED"
+_ANY_ORDER = {"reassoc", "contract", "nsz"}
+"""Options of LLVM for helpers: sums may be computed in any order, which lets them use vector instructions."""
 _helpers: list[Callable[..., Any]] = []
 """Functions that loop forms call, until numba knows them."""
 
@@ -58,7 +60,7 @@ class HotFunction(Generic[Parameters, Result]):
         """
         numba = importlib.import_module("numba")
         while _helpers:
-            numba.extending.register_jitable(error_model="numpy")(_helpers.pop())
+            numba.extending.register_jitable(error_model="numpy", fastmath=_ANY_ORDER)(_helpers.pop())
         try:
             return _typed(numba.njit(cache=True, error_model="numpy")(self.loop_form))
         except RuntimeError:  # no folder for the file can be written
@@ -78,7 +80,10 @@ def compiled_form_of(
 
 
 def loop_helper(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Decorate a function that loop forms of the same module call, and return it as it is."""
+    """Decorate a function that loop forms of the same module call, and return it as it is.
+
+    The machine code of a helper may add in any order.
+    """
     _helpers.append(function)
     return function
 

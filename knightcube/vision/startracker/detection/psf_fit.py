@@ -21,6 +21,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
+from knightcube.compiled import compiled_form_of, loop_helper
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +135,7 @@ class StarTargets:
 _SHORTEST = 0.2
 # Number of quadrature nodes, which are accurate to 0.1 % of the flux for paths of four PSF widths.
 _NODES = 4
-_BELL = 1.0 / math.sqrt(2.0 * math.pi)
+_BELL, _ROOT_HALF = 1.0 / math.sqrt(2.0 * math.pi), math.sqrt(0.5)
 
 
 def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -367,60 +368,259 @@ def fit(
         free_width: whether the width of each star is fitted.
         steps: number of Gauss-Newton steps.
     """
-    count = 5 if free_width else 4
     values = np.concatenate([offset, flux[:, None], np.zeros((len(flux), 1)), width[:, None]], axis=1)
+    shift, share = zip(*path(windows.trail), strict=True)
+    found = _solve(
+        np.ascontiguousarray(windows.light),
+        np.ascontiguousarray(windows.good),
+        np.ascontiguousarray(windows.noise),
+        np.array(shift),
+        np.array(share),
+        values,
+        (noise.photon, noise.mismatch),
+        5 if free_width else 4,
+        steps,
+    )
+    return PsfFit(values[:, :2], values[:, FLUX], values[:, SKY], values[:, WIDTH], *found)
+
+
+_Solved = tuple[FloatArray, FloatArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]
+"""Covariance, chi2, used, residual, variance, leverage and model, as in `PsfFit`."""
+
+
+def _solve_numpy(
+    light: FloatArray,
+    good: BoolArray,
+    noise: FloatArray,
+    shift: FloatArray,
+    share: FloatArray,
+    values: FloatArray,
+    model: tuple[float, float],
+    count: int,
+    steps: int,
+) -> _Solved:
+    """Fit the parameters `values` (n, 5) in place, the first `count` of which are free, and return the fits.
+
+    The m nodes of the stars' paths have the displacements `shift` (m, n, 2), px, and the weights `share`
+    (m,). The noise `model` has the photon noise and the mismatch.
+    """
+    size = light.shape[1]
     # All steps share two arrays, because allocating large arrays takes more time than the arithmetic.
-    jacobian = np.empty((len(values), count, (2 * windows.half + 1) ** 2))
+    jacobian = np.empty((len(values), count, size * size))
     weighted = np.empty_like(jacobian)
     for step in range(steps + 1):
-        star = _model(values, windows, jacobian)
-        residual = windows.light - star
+        star = _model(values, shift, share, jacobian)
+        residual = light - star
         residual -= values[:, SKY, None, None]
-        variance = noise.variance(star, windows.noise)
-        good = windows.good
+        variance = NoiseModel(*model).variance(star, noise)
+        used = good
         if step >= steps - _CLIP_FROM_END:
             # The limit above which pixels are excluded tolerates PSFs that are not Gaussian.
-            good = good & ~(residual * residual > _CLIP**2 * (variance + (_TOLERATED * star) ** 2))
-        weight = (good / variance).reshape(len(values), -1)
+            used = used & ~(residual * residual > _CLIP**2 * (variance + (_TOLERATED * star) ** 2))
+        weight = (used / variance).reshape(len(values), -1)
         np.multiply(jacobian, weight[:, None, :], out=weighted)
         normal = weighted @ jacobian.transpose(0, 2, 1)
         inverse = _inverse(normal)
         if step < steps:
             gradient = (weighted @ residual.reshape(len(values), -1, 1))[:, :, 0]
-            _advance(values, (inverse @ gradient[:, :, None])[:, :, 0], windows.half)
+            _advance(values, (inverse @ gradient[:, :, None])[:, :, 0], size // 2)
     np.matmul(inverse, jacobian, out=weighted)
     weighted *= jacobian
-    leverage = weight * np.sum(weighted, axis=1)
-    return PsfFit(
-        values[:, :2],
-        values[:, FLUX],
-        values[:, SKY],
-        values[:, WIDTH],
+    return (
         inverse,
         np.sum(weight * residual.reshape(len(values), -1) ** 2, axis=1),
-        np.count_nonzero(good, axis=(1, 2)),
+        np.count_nonzero(used, axis=(1, 2)),
         residual,
-        np.where(good, variance, np.inf),
-        leverage.reshape(residual.shape),
+        np.where(used, variance, np.inf),
+        (weight * np.sum(weighted, axis=1)).reshape(residual.shape),
         star,
     )
 
 
-def _model(values: FloatArray, windows: StarWindows, jacobian: FloatArray) -> FloatArray:
+@compiled_form_of(_solve_numpy)
+def _solve(
+    light: FloatArray,
+    good: BoolArray,
+    noise: FloatArray,
+    shift: FloatArray,
+    share: FloatArray,
+    values: FloatArray,
+    model: tuple[float, float],
+    count: int,
+    steps: int,
+) -> _Solved:
+    """See `_solve_numpy`."""
+    stars, size = light.shape[0], light.shape[1]
+    area, half = size * size, float(size // 2)
+    covariance = np.empty((stars, count, count))
+    chi2, number = np.zeros(stars), np.zeros(stars, dtype=np.int64)
+    residual, variance = np.empty((stars, area)), np.empty((stars, area))
+    leverage, modelled = np.empty((stars, area)), np.empty((stars, area))
+    jacobian, weight, weighted = np.empty((5, area)), np.empty(area), np.empty(area)
+    normal, gradient = np.empty((count, count)), np.empty(count)
+    for star in range(stars):
+        value, counts, off, expected = values[star], modelled[star], residual[star], variance[star]
+        usable = good[star].reshape(area)
+        for step in range(steps + 1):
+            _derivatives(value, shift[:, star], share, size, jacobian)
+            for pixel in range(area):
+                counts[pixel] = value[FLUX] * jacobian[FLUX, pixel]
+                off[pixel] = light[star, pixel // size, pixel % size] - counts[pixel] - value[SKY]
+            # In the last steps, pixels above a limit are excluded; see `_solve_numpy`.
+            limit = _CLIP**2 if step >= steps - _CLIP_FROM_END else np.inf
+            _weights(counts, off, usable, noise[star], model, limit, expected, weight)
+            for i in range(count):
+                for pixel in range(area):
+                    weighted[pixel] = weight[pixel] * jacobian[i, pixel]
+                gradient[i] = _inner(weighted, off)
+                for j in range(i + 1):
+                    normal[i, j] = _inner(weighted, jacobian[j])
+            _invert(normal, covariance[star])
+            if step < steps:
+                for i in range(count):
+                    longest = _LONGEST_STEP if i < FLUX else (_WIDEST_STEP if i == WIDTH else np.inf)
+                    value[i] += min(max(_inner(covariance[star, i], gradient), -longest), longest)
+                value[X] = min(max(value[X], -half), half)
+                value[Y] = min(max(value[Y], -half), half)
+                value[WIDTH] = min(max(value[WIDTH], NARROWEST), WIDEST, half)
+        for pixel in range(area):
+            square = 0.0
+            for i in range(count):
+                for j in range(count):
+                    square += jacobian[i, pixel] * covariance[star, i, j] * jacobian[j, pixel]
+            leverage[star, pixel] = weight[pixel] * square
+            chi2[star] += weight[pixel] * off[pixel] ** 2
+            number[star] += weight[pixel] > 0.0
+            if weight[pixel] == 0.0:
+                expected[pixel] = np.inf
+    return (
+        covariance,
+        chi2,
+        number,
+        residual.reshape(light.shape),
+        variance.reshape(light.shape),
+        leverage.reshape(light.shape),
+        modelled.reshape(light.shape),
+    )
+
+
+@loop_helper
+def _derivatives(
+    value: FloatArray, shift: FloatArray, share: FloatArray, size: int, jacobian: FloatArray
+) -> None:
+    """Write the derivatives (5, k * k) of the counts of one star by its parameters `value` (5,)."""
+    across, down = np.empty((3, size)), np.empty((3, size))
+    jacobian[:] = 0.0
+    for node in range(len(share)):
+        _profile(value[X] + shift[node, 0], value[WIDTH], across)
+        _profile(value[Y] + shift[node, 1], value[WIDTH], down)
+        flux = share[node] * value[FLUX]
+        for row in range(size):
+            of_x, of_y, of_flux = flux * down[0, row], flux * down[1, row], share[node] * down[0, row]
+            of_width, pixel = flux * down[2, row], row * size
+            for column in range(size):
+                jacobian[X, pixel + column] += of_x * across[1, column]
+                jacobian[Y, pixel + column] += of_y * across[0, column]
+                jacobian[FLUX, pixel + column] += of_flux * across[0, column]
+                jacobian[SKY, pixel + column] += share[node]
+                jacobian[WIDTH, pixel + column] += of_x * across[2, column] + of_width * across[0, column]
+
+
+@loop_helper
+def _weights(
+    counts: FloatArray,
+    off: FloatArray,
+    usable: BoolArray,
+    noise: float,
+    model: tuple[float, float],
+    limit: float,
+    variance: FloatArray,
+    weight: FloatArray,
+) -> None:
+    """Write variance and weight of the pixels of one star.
+
+    A pixel that is not `usable`, or whose residual `off` has a square above `limit` times the tolerated
+    variance, has the weight zero.
+    """
+    photon, mismatch = model
+    for pixel in range(len(counts)):
+        of_star = max(counts[pixel], 0.0)
+        variance[pixel] = noise**2 + photon * of_star + (mismatch * of_star) ** 2
+        largest = limit * (variance[pixel] + (_TOLERATED * counts[pixel]) ** 2)
+        kept = usable[pixel] and off[pixel] * off[pixel] <= largest
+        weight[pixel] = 1.0 / variance[pixel] if kept else 0.0
+
+
+@loop_helper
+def _inner(first: FloatArray, second: FloatArray) -> float:
+    """Return the inner product of two vectors."""
+    total = 0.0
+    for k in range(len(first)):
+        total += first[k] * second[k]
+    return total
+
+
+@loop_helper
+def _profile(offset: float, sigma: float, out: FloatArray) -> None:
+    """Write `profile` of one star to `out` (3, k): the fractions, and their derivatives."""
+    size = out.shape[1]
+    edge = (-0.5 * size - offset) / sigma
+    whole, slope = 0.5 * math.erfc(-edge * _ROOT_HALF), _BELL * math.exp(-0.5 * edge * edge) / sigma
+    for k in range(size):
+        edge_after = (k + 1 - 0.5 * size - offset) / sigma
+        whole_after = 0.5 * math.erfc(-edge_after * _ROOT_HALF)
+        slope_after = _BELL * math.exp(-0.5 * edge_after * edge_after) / sigma
+        out[0, k] = whole_after - whole
+        out[1, k] = slope - slope_after
+        out[2, k] = edge * slope - edge_after * slope_after
+        edge, whole, slope = edge_after, whole_after, slope_after
+
+
+@loop_helper
+def _invert(normal: FloatArray, out: FloatArray) -> None:
+    """Write `_inverse` of one normal matrix (p, p), of which the lower triangle is given, to `out`."""
+    count = len(normal)
+    scale = np.empty(count)
+    for i in range(count):
+        scale[i] = math.sqrt(max(normal[i, i], 1e-30))
+    # Cholesky factor of the scaled matrix, then its inverse.
+    factor = np.zeros((count, count))
+    for i in range(count):
+        for j in range(i + 1):
+            value = normal[i, j] / (scale[i] * scale[j]) + (_RIDGE if i == j else 0.0)
+            for k in range(j):
+                value -= factor[i, k] * factor[j, k]
+            factor[i, j] = math.sqrt(max(value, _RIDGE)) if i == j else value / factor[j, j]
+    for j in range(count):
+        factor[j, j] = 1.0 / factor[j, j]
+        for i in range(j + 1, count):
+            value = 0.0
+            for k in range(j, i):
+                value -= factor[i, k] * factor[k, j]
+            factor[i, j] = value / factor[i, i]
+    for i in range(count):
+        for j in range(i + 1):
+            value = 0.0
+            for k in range(i, count):
+                value += factor[k, i] * factor[k, j]
+            out[i, j] = value / (scale[i] * scale[j])
+            out[j, i] = out[i, j]
+
+
+def _model(values: FloatArray, shift: FloatArray, share: FloatArray, jacobian: FloatArray) -> FloatArray:
     """Return the modelled counts of the stars (n, k, k), and write their derivatives to `jacobian`.
 
     The array `jacobian` (n, p, k * k) receives the derivatives by the first p of the parameters `values`
     (n, 5), where p is 4 or 5.
     """
-    flux, size, count = values[:, FLUX, None], 2 * windows.half + 1, jacobian.shape[1]
-    nodes = path(windows.trail)
+    flux, size, count = values[:, FLUX, None], math.isqrt(jacobian.shape[2]), jacobian.shape[1]
     total = jacobian.reshape(len(values), count, size, size)
-    out = total if len(nodes) == 1 else np.empty_like(total)
-    if len(nodes) > 1:
+    out = total if len(share) == 1 else np.empty_like(total)
+    if len(share) > 1:
         total[:] = 0.0
-    for shift, share in nodes:
-        across, across_x, across_w = profile(values[:, X] + shift[:, 0], values[:, WIDTH], windows.half)
-        down, down_y, down_w = profile(values[:, Y] + shift[:, 1], values[:, WIDTH], windows.half)
+    for moved, part in zip(shift, share, strict=True):
+        across, across_x, across_w = profile(values[:, X] + moved[:, 0], values[:, WIDTH], size // 2)
+        down, down_y, down_w = profile(values[:, Y] + moved[:, 1], values[:, WIDTH], size // 2)
         np.multiply(down[:, :, None], (flux * across_x)[:, None, :], out=out[:, X])
         np.multiply((flux * down_y)[:, :, None], across[:, None, :], out=out[:, Y])
         np.multiply(down[:, :, None], across[:, None, :], out=out[:, FLUX])
@@ -429,7 +629,7 @@ def _model(values: FloatArray, windows: StarWindows, jacobian: FloatArray) -> Fl
             np.multiply((flux * down)[:, :, None], across_w[:, None, :], out=out[:, WIDTH])
             out[:, WIDTH] += (flux * down_w)[:, :, None] * across[:, None, :]
         if out is not total:
-            out *= share
+            out *= part
             total += out
     return np.asarray(values[:, FLUX, None, None] * total[:, FLUX])
 

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.vision.startracker.detection.psf_fit import NoiseModel, cut, measure_noise, smoothed
+from knightcube.vision.startracker.detection.psf_fit import (
+    NoiseModel,
+    _solve,
+    cut,
+    light,
+    measure_noise,
+    path,
+    smoothed,
+)
 
 
 def test_a_window_holds_the_counts_above_the_sky_and_marks_pixels_that_cannot_be_used() -> None:
@@ -82,3 +90,31 @@ def test_the_variance_of_a_pixel_is_the_sum_of_sky_photons_and_mismatch() -> Non
     light = np.array([[[20.0, -20.0]]])
     variance = NoiseModel(photon=0.5, mismatch=0.1).variance(light, np.array([3.0]))
     assert variance[0, 0] == pytest.approx([23.0, 9.0])
+
+
+@pytest.mark.parametrize("count", [4, 5])
+@pytest.mark.parametrize("length", [0.0, 3.0])
+def test_the_compiled_fit_equals_the_fit_in_numpy(count: int, length: float) -> None:
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    draw = np.random.default_rng([count, round(length)])
+    stars, half = 40, 4
+    offset, width = draw.uniform(-0.6, 0.6, (stars, 2)), draw.uniform(0.6, 1.6, stars)
+    flux = 10.0 ** draw.uniform(1.5, 5.0, stars)
+    trail = np.full((stars, 2), [length, 0.5 * length])
+    seen = light(offset, width, half, trail) * flux[:, None, None] + draw.normal(0.0, 10.0, (stars, 9, 9))
+    seen[3, 4, 4] += 3_000.0  # a hot pixel
+    good = draw.random(seen.shape) < 0.95
+    good[5], good[6, :, :5] = False, False  # a star without a usable pixel, and one at the frame's edge
+    shift, share = zip(*path(trail), strict=True)
+    start = np.column_stack([offset + 0.3, 0.8 * flux, np.zeros(stars), width + 0.2])
+    results = []
+    for form in (_solve.numpy_form, _solve.loop_form, _solve.compiled_form()):
+        values = start.copy()
+        found = form(
+            seen, good, np.full(stars, 10.0), np.array(shift), np.array(share), values, (0.5, 0.02), count, 4
+        )
+        results.append((values, *found))
+    for other in results[1:]:
+        for expected, same in zip(results[0], other, strict=True):
+            scale = np.abs(expected[np.isfinite(expected)]).max()
+            np.testing.assert_allclose(same, expected, rtol=1e-7, atol=1e-9 * scale)
