@@ -24,7 +24,8 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
+from knightcube.compiled import compiled_form_of, loop_helper
 
 _CLIP, _CLIPPED_SIGMA = 3.0, 0.98658
 """Clipping limit (standard deviations), and standard deviation of a unit normal variable after clipping."""
@@ -76,6 +77,13 @@ def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Back
     sample = pixels[: down * height, : across * width].reshape(down, height, across, width)
     sample = sample[:, stride // 2 :: stride, :, stride // 2 :: stride].transpose(0, 2, 1, 3)
     values = sample.reshape(down, across, -1).astype(np.float64)
+    level, variance = _clipped_moments(values)
+    noise = np.sqrt(np.maximum(variance / _CLIPPED_SIGMA**2, _ROUNDING_VARIANCE))
+    return Background(level, ndimage.median_filter(noise, size=3, mode="nearest"), (rows, columns))
+
+
+def _clipped_moments_numpy(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance (down, across) of the values (down, across, k) without outliers."""
     median = _median_of_blocks(values)
     apart = np.abs(values - median)
     spread = MAD_TO_SIGMA * _median_of_blocks(apart)
@@ -83,9 +91,129 @@ def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Back
     kept = apart <= _CLIP * np.maximum(spread, 0.5)
     count = kept.sum(axis=-1)
     level = np.where(kept, values, 0.0).sum(axis=-1) / count
-    variance = np.where(kept, (values - level[..., None]) ** 2, 0.0).sum(axis=-1) / count
-    noise = np.sqrt(np.maximum(variance / _CLIPPED_SIGMA**2, _ROUNDING_VARIANCE))
-    return Background(level, ndimage.median_filter(noise, size=3, mode="nearest"), (rows, columns))
+    return level, np.where(kept, (values - level[..., None]) ** 2, 0.0).sum(axis=-1) / count
+
+
+@compiled_form_of(_clipped_moments_numpy)
+def _clipped_moments(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """See `_clipped_moments_numpy`."""
+    level, variance = np.empty(values.shape[:2]), np.empty(values.shape[:2])
+    apart, scratch = np.empty(values.shape[2]), np.empty(values.shape[2])
+    for down in range(values.shape[0]):
+        for across in range(values.shape[1]):
+            block = values[down, across]
+            median = _median(block, scratch)
+            for k in range(len(block)):
+                apart[k] = abs(block[k] - median)
+            limit = _CLIP * max(MAD_TO_SIGMA * _median(apart, scratch), 0.5)
+            count, total, square = 0, 0.0, 0.0
+            for k in range(len(block)):
+                count += apart[k] <= limit
+                total += block[k] if apart[k] <= limit else 0.0
+            mean = total / count
+            for k in range(len(block)):
+                square += (block[k] - mean) ** 2 if apart[k] <= limit else 0.0
+            level[down, across], variance[down, across] = mean, square / count
+    return level, variance
+
+
+_SAMPLES, _FEW = 16, 24
+"""Number of values from which a pivot is chosen, and number of values that are sorted."""
+
+
+@loop_helper
+def _ordered(values: FloatArray, place: int, scratch: FloatArray) -> float:
+    """Return the value that has the index `place` in ascending order; `scratch` is overwritten.
+
+    The pivot of this quickselect is taken from a sorted sample, and the values on its other side are omitted
+    without unpredictable branches.
+    """
+    current, size, few = values, len(values), np.empty(_SAMPLES)
+    while size > _FEW:
+        for k in range(_SAMPLES):
+            few[k] = current[k * size // _SAMPLES]
+        _sort(few, _SAMPLES)
+        pivot, less, equal = few[place * _SAMPLES // size], 0, 0
+        for k in range(size):
+            less += current[k] < pivot
+            equal += current[k] == pivot
+        if less <= place < less + equal:
+            return pivot
+        count, side = 0, 1.0 if place >= less else -1.0
+        for k in range(size):
+            value = current[k]
+            scratch[count] = value
+            count += side * (value - pivot) > 0.0
+        current, size, place = scratch, count, place - less - equal if place >= less else place
+    for k in range(size):
+        scratch[k] = current[k]
+    _sort(scratch, size)
+    return scratch[place]
+
+
+@loop_helper
+def _sort(values: FloatArray, count: int) -> None:
+    """Sort the first `count` values in place."""
+    for k in range(1, count):
+        value, place = values[k], k
+        while place > 0 and values[place - 1] > value:
+            values[place] = values[place - 1]
+            place -= 1
+        values[place] = value
+
+
+@loop_helper
+def _median(values: FloatArray, scratch: FloatArray) -> float:
+    """Return the median of the values; `scratch` is overwritten."""
+    middle = len(values) // 2
+    upper = _ordered(values, middle, scratch)
+    if len(values) % 2:
+        return upper
+    lower, smaller = -np.inf, 0
+    for value in values:
+        smaller += value < upper
+        lower = max(lower, value if value < upper else -np.inf)
+    return upper if smaller < middle else 0.5 * (lower + upper)
+
+
+def _places_in_blocks_numpy(
+    sample: Float32Array, level: FloatArray, noise: FloatArray, low: int, high: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the values with the indices `low` and `high` in the ascending order of each block's pixels.
+
+    The pixels `sample` (rows, columns) are divided into the blocks of `level` and `noise` (down, across). The
+    values (down, across) are relative to level and noise.
+    """
+    (rows, columns), (down, across) = sample.shape, level.shape
+    block = np.ix_(np.arange(rows) * down // rows, np.arange(columns) * across // columns)
+    relative = (sample - level[block]) / noise[block]
+    height, width = rows // down, columns // across
+    blocks = relative[: down * height, : across * width].reshape(down, height, across, width)
+    values = blocks.transpose(0, 2, 1, 3).reshape(down, across, -1)
+    ordered = np.partition(values, (low, high), axis=-1)
+    return ordered[..., low], ordered[..., high]
+
+
+@compiled_form_of(_places_in_blocks_numpy)
+def places_in_blocks(
+    sample: Float32Array, level: FloatArray, noise: FloatArray, low: int, high: int
+) -> tuple[FloatArray, FloatArray]:
+    """See `_places_in_blocks_numpy`."""
+    (rows, columns), (down, across) = sample.shape, level.shape
+    height, width = rows // down, columns // across
+    lower, upper = np.empty((down, across)), np.empty((down, across))
+    values, scratch = np.empty(height * width), np.empty(height * width)
+    for i in range(down):
+        for j in range(across):
+            for row in range(height):
+                for column in range(width):
+                    # The pixels of the last rows and columns belong to the last blocks.
+                    of_row = (i * height + row) * down // rows
+                    of_column = (j * width + column) * across // columns
+                    value = sample[i * height + row, j * width + column] - level[of_row, of_column]
+                    values[row * width + column] = value / noise[of_row, of_column]
+            lower[i, j], upper[i, j] = _ordered(values, low, scratch), _ordered(values, high, scratch)
+    return lower, upper
 
 
 def _median_of_blocks(values: FloatArray) -> FloatArray:
@@ -316,7 +444,7 @@ def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
-    (rows, columns), (down, across) = pixels.shape, background.level.shape
+    columns = pixels.shape[1]
     # Between block centres, level and noise are interpolated with those of the adjacent blocks.
     limit = background.level + _HOT_SIGMAS * background.noise
     lowest = ndimage.minimum_filter(limit, size=3, mode="nearest")
@@ -324,12 +452,7 @@ def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[
         # Integer pixels are compared in their own type, which is four times as fast.
         lowest = np.clip(np.ceil(lowest), np.iinfo(pixels.dtype).min, np.iinfo(pixels.dtype).max)
     lowest = lowest.astype(pixels.dtype)
-    height, owner = rows // down, np.minimum(np.arange(columns) // (columns // across), across - 1)
-    found: list[IntArray] = []
-    for block in range(down):
-        first, last = block * height, rows if block == down - 1 else (block + 1) * height
-        found.append(np.flatnonzero(pixels[first:last] >= lowest[block, owner]) + first * columns)
-    row, column = np.divmod(np.concatenate(found), columns)
+    row, column = np.divmod(_bright_indices(np.ascontiguousarray(pixels), lowest), columns)
     if len(row) <= most:
         return row[:0], column[:0]
     level, noise = (
@@ -339,6 +462,37 @@ def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[
     row, column, level, noise = row[bright], column[bright], level[bright], noise[bright]
     row, column, _ = _hot(pixels, row, column, noise, level)
     return row, column
+
+
+def _bright_indices_numpy(pixels: Image, lowest: Image) -> IntArray:
+    """Return the ascending flat indices (m,) of the pixels that are at least `lowest` (down, across).
+
+    Rows and columns beyond the last whole block belong to the last blocks.
+    """
+    (rows, columns), (down, across) = pixels.shape, lowest.shape
+    height, owner = rows // down, np.minimum(np.arange(columns) // (columns // across), across - 1)
+    found: list[IntArray] = []
+    for block in range(down):
+        first, last = block * height, rows if block == down - 1 else (block + 1) * height
+        found.append(np.flatnonzero(pixels[first:last] >= lowest[block, owner]) + first * columns)
+    return np.concatenate(found)
+
+
+@compiled_form_of(_bright_indices_numpy)
+def _bright_indices(pixels: Image, lowest: Image) -> IntArray:
+    """See `_bright_indices_numpy`."""
+    (rows, columns), (down, across) = pixels.shape, lowest.shape
+    found, count = np.empty(rows * columns, dtype=np.int64), 0
+    for row in range(rows):
+        of_row = lowest[min(row // (rows // down), down - 1)]
+        for block in range(across):
+            limit, first = of_row[block], block * (columns // across)
+            last = columns if block == across - 1 else first + columns // across
+            for column in range(first, last):
+                if pixels[row, column] >= limit:
+                    found[count] = row * columns + column
+                    count += 1
+    return found[:count].copy()
 
 
 def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:

@@ -9,6 +9,8 @@ from scipy import ndimage
 from knightcube.astro.arrays import BoolArray
 from knightcube.vision.frame import (
     FrameState,
+    _bright_indices,
+    _clipped_moments,
     are_hot,
     at_least,
     box_sum,
@@ -22,10 +24,12 @@ from knightcube.vision.frame import (
     less_boxes,
     line_of,
     moments,
+    places_in_blocks,
     saturation_count,
     saturation_level,
     saturation_of_bright,
 )
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_frames import rate_at, star_camera, star_frame
 
 
@@ -268,3 +272,33 @@ def test_levels_between_counts_and_beyond_the_type_compare_as_numbers_do() -> No
     assert at_least(pixels, 256.0).tolist() == [False] * 4
     assert at_least(pixels, -1.0).tolist() == [True] * 4
     assert at_least(pixels.astype(float), 9.5).tolist() == [False, False, True, True]
+
+
+@pytest.mark.parametrize("size", [1, 2, 24, 25, 64, 255])
+@pytest.mark.parametrize("sigma", [0.0, 0.4, 3.0, 500.0])
+def test_the_compiled_moments_of_blocks_equal_those_in_numpy(size: int, sigma: float) -> None:
+    """Whole counts of little noise are equal in many pixels, and a bright object is in each block."""
+    draw = np.random.default_rng([size, round(10 * sigma)])
+    values = np.round(draw.normal(100.0, sigma, (3, 4, size)))
+    values[:, :, size // 2 :] += draw.choice([0.0, 3_000.0], (3, 4, 1))
+    assert_forms_agree(_clipped_moments, values)
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (70, 45), (33, 64)])
+@pytest.mark.parametrize("rounded", [False, True])
+def test_the_compiled_order_of_pixels_equals_that_in_numpy(shape: tuple[int, int], rounded: bool) -> None:
+    draw = np.random.default_rng(shape)
+    sample = draw.normal(0.0, 3.0, shape)
+    sample = (np.round(sample) if rounded else sample).astype(np.float32)
+    level, noise = draw.normal(0.0, 1.0, (2, 3)), draw.uniform(1.0, 2.0, (2, 3))
+    area = (shape[0] // 2) * (shape[1] // 3)
+    for low, high in ((2, area - 3), (0, area - 1), (area // 2, area // 2)):
+        assert_forms_agree(places_in_blocks, sample, level, noise, low, high)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_the_compiled_search_of_bright_pixels_equals_that_in_numpy(dtype: type) -> None:
+    draw = np.random.default_rng(5)
+    pixels = draw.integers(0, 200, (50, 37)).astype(dtype)
+    assert_forms_agree(_bright_indices, pixels, draw.integers(150, 199, (3, 2)).astype(dtype))
+    assert_forms_agree(_bright_indices, pixels, np.full((1, 1), 255, dtype=dtype))

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.frame import (
     MAD_TO_SIGMA,
     Background,
@@ -28,6 +29,7 @@ from knightcube.vision.frame import (
     interpolation_weights,
     label_pixels,
     moments,
+    places_in_blocks,
     saturation_of_bright,
 )
 
@@ -199,6 +201,20 @@ def find_bright(pixels: Image, sky: SkyBackground, sigmas: float) -> BrightPixel
     rows, columns = pixels.shape
     limit = Surface(sky.smooth_level.values + sigmas * sky.smooth_noise.values, (rows, columns))
     down, across = limit.factors()
+    index, smooth = _smoothed_above(np.ascontiguousarray(pixels), down, across)
+    row, column = np.divmod(index, columns)
+    return BrightPixels(index, smooth - sky.smooth_level.at(column, row), (rows, columns))
+
+
+def _smoothed_above_numpy(
+    pixels: Image, down: Float32Array, across: Float32Array
+) -> tuple[IntArray, Float32Array]:
+    """Return the ascending flat indices (m,) of the pixels whose smoothed counts exceed a limit.
+
+    The second returned array has the smoothed counts (m,). The limit of each pixel is the product of `down`
+    (rows, k), which has two nonzero elements in each row at most, and `across` (k, columns).
+    """
+    rows, columns = pixels.shape
     across = np.ascontiguousarray(across[:, 1:-1])
     count = min(_BAND, rows - 2)
     band = np.empty((count + 2, columns), dtype=np.float32)
@@ -227,12 +243,39 @@ def find_bright(pixels: Image, sky: SkyBackground, sigmas: float) -> BrightPixel
         new = slice(0, None) if not places or not len(places[-1]) else place > places[-1][-1]
         places.append(place[new])
         values.append(smooth.reshape(-1)[above][new])
-    index = np.concatenate(places)
-    row, column = np.divmod(index, columns)
-    return BrightPixels(index, np.concatenate(values) - sky.smooth_level.at(column, row), (rows, columns))
+    return np.concatenate(places), np.concatenate(values)
 
 
-def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array:
+@compiled_form_of(_smoothed_above_numpy)
+def _smoothed_above(pixels: Image, down: Float32Array, across: Float32Array) -> tuple[IntArray, Float32Array]:
+    """See `_smoothed_above_numpy`."""
+    rows, columns = pixels.shape
+    index, found, count = np.empty(rows * columns, np.int64), np.empty(rows * columns, np.float32), 0
+    twice, smooth = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
+    bound = np.empty(columns, dtype=np.float32)
+    for row in range(1, rows - 1):
+        first = 0
+        while first < down.shape[1] - 1 and down[row, first] == 0.0:
+            first += 1
+        second = min(first + 1, down.shape[1] - 1)
+        one, other = down[row, first], down[row, second] if second > first else np.float32(0.0)
+        for column in range(columns):
+            above, own = np.float32(pixels[row - 1, column]), np.float32(pixels[row, column])
+            twice[column] = (above + own) + (own + np.float32(pixels[row + 1, column]))
+            bound[column] = one * across[first, column] + other * across[second, column]
+        some = False
+        for column in range(1, columns - 1):
+            smooth[column] = (twice[column - 1] + twice[column]) + (twice[column] + twice[column + 1])
+            some |= smooth[column] > bound[column]
+        if some:
+            for column in range(1, columns - 1):
+                if smooth[column] > bound[column]:
+                    index[count], found[count] = row * columns + column, smooth[column]
+                    count += 1
+    return index[:count].copy(), found[:count].copy()
+
+
+def _smoothed_at_numpy(pixels: Image, row: IntArray, column: IntArray) -> Float32Array:
     """Return the smoothed frame at evenly spaced rows (r,) and columns (c,), as (r, c)."""
     total = np.zeros((len(row), len(column)), dtype=np.float32)
     for dy in (-1, 0, 1):
@@ -241,6 +284,21 @@ def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array
             part = pixels[rows, column[0] + dx : column[-1] + dx + 1 : _STRIDE]
             total += np.float32((2 - abs(dy)) * (2 - abs(dx))) * part
     return total
+
+
+@compiled_form_of(_smoothed_at_numpy)
+def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array:
+    """See `_smoothed_at_numpy`."""
+    out = np.empty((len(row), len(column)), dtype=np.float32)
+    for i in range(len(row)):
+        for j in range(len(column)):
+            total = np.float32(0.0)
+            for dy in range(-1, 2):
+                for dx in range(-1, 2):
+                    weight = np.float32((2 - abs(dy)) * (2 - abs(dx)))
+                    total += weight * np.float32(pixels[row[i] + dy, column[j] + dx])
+            out[i, j] = total
+    return out
 
 
 def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -255,16 +313,11 @@ def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
     (rows, columns), (down, across) = sample.shape, level.shape
-    block = np.ix_(np.arange(rows) * down // rows, np.arange(columns) * across // columns)
-    relative = (sample - level[block]) / noise[block]
-    height, width = rows // down, columns // across
-    blocks = relative[: down * height, : across * width].reshape(down, height, across, width)
-    values = blocks.transpose(0, 2, 1, 3).reshape(down, across, -1)
-    last = values.shape[-1] - 1
-    high = min(last, int(TAIL_PART * values.shape[-1]))
-    ordered = np.partition(values, (last - high, high), axis=-1)
-    tail = np.maximum(1.0, 0.5 * ordered[..., high])
-    reach = ndimage.median_filter(-ordered[..., last - high], size=3, mode="nearest")
+    last = (rows // down) * (columns // across) - 1
+    high = min(last, int(TAIL_PART * (last + 1)))
+    lower, upper = places_in_blocks(np.ascontiguousarray(sample), level, noise, last - high, high)
+    tail = np.maximum(1.0, 0.5 * upper)
+    reach = ndimage.median_filter(-lower, size=3, mode="nearest")
     return np.asarray(ndimage.median_filter(tail, size=3, mode="nearest")), one_sided(reach * noise, noise)
 
 

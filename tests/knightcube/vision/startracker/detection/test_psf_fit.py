@@ -14,6 +14,7 @@ from knightcube.vision.startracker.detection.psf_fit import (
     path,
     smoothed,
 )
+from tests.support.compiled_forms import assert_forms_agree
 
 
 def test_a_window_holds_the_counts_above_the_sky_and_marks_pixels_that_cannot_be_used() -> None:
@@ -95,7 +96,6 @@ def test_the_variance_of_a_pixel_is_the_sum_of_sky_photons_and_mismatch() -> Non
 @pytest.mark.parametrize("count", [4, 5])
 @pytest.mark.parametrize("length", [0.0, 3.0])
 def test_the_compiled_fit_equals_the_fit_in_numpy(count: int, length: float) -> None:
-    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     draw = np.random.default_rng([count, round(length)])
     stars, half = 40, 4
     offset, width = draw.uniform(-0.6, 0.6, (stars, 2)), draw.uniform(0.6, 1.6, stars)
@@ -107,14 +107,16 @@ def test_the_compiled_fit_equals_the_fit_in_numpy(count: int, length: float) -> 
     good[5], good[6, :, :5] = False, False  # a star without a usable pixel, and one at the frame's edge
     shift, share = zip(*path(trail), strict=True)
     start = np.column_stack([offset + 0.3, 0.8 * flux, np.zeros(stars), width + 0.2])
-    results = []
-    for form in (_solve.numpy_form, _solve.loop_form, _solve.compiled_form()):
-        values = start.copy()
-        found = form(
-            seen, good, np.full(stars, 10.0), np.array(shift), np.array(share), values, (0.5, 0.02), count, 4
-        )
-        results.append((values, *found))
-    for other in results[1:]:
-        for expected, same in zip(results[0], other, strict=True):
-            scale = np.abs(expected[np.isfinite(expected)]).max()
-            np.testing.assert_allclose(same, expected, rtol=1e-7, atol=1e-9 * scale)
+    assert_forms_agree(
+        _solve,
+        seen,
+        good,
+        np.full(stars, 10.0),
+        np.array(shift),
+        np.array(share),
+        start,
+        (0.5, 0.02),
+        count,
+        4,
+        relative=1e-7,
+    )

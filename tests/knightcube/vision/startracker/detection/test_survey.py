@@ -18,6 +18,8 @@ from knightcube.vision.startracker.detection.measurement import centre_of_mass
 from knightcube.vision.startracker.detection.psf_fit import NoiseModel, cut, light, measure_noise, profile
 from knightcube.vision.startracker.detection.survey import (
     Surface,
+    _smoothed_above,
+    _smoothed_at,
     find_areas,
     find_bright,
     measure_sky,
@@ -31,6 +33,7 @@ from tests.knightcube.vision.startracker.spoilt_scenes import (
     spoilt_scene,
 )
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.photographs import PHOTOGRAPHS, angle_arcsec
 
 
@@ -182,3 +185,14 @@ def test_lines_along_the_flow_of_a_rotation_share_it_and_other_lines_do_not(
     assert not share_one_rotation(pixels, rng.permutation(direction) + 0.3 * rng.standard_normal(30))
     diverging = np.arctan2(centre[:, 1], centre[:, 0])
     assert not share_one_rotation(pixels, diverging)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("shape", [(16, 16), (70, 131)])
+def test_the_compiled_smoothing_equals_that_in_numpy(dtype: type, shape: tuple[int, int]) -> None:
+    draw = np.random.default_rng(shape)
+    pixels = draw.integers(0, 200, shape).astype(dtype)
+    limit = Surface(draw.uniform(1_500.0, 1_900.0, (shape[0] // 16, shape[1] // 16)), shape)
+    assert_forms_agree(_smoothed_above, pixels, *limit.factors())
+    row, column = np.arange(2, shape[0] - 1, 4), np.arange(2, shape[1] - 1, 4)
+    assert_forms_agree(_smoothed_at, pixels, row, column)

@@ -1,0 +1,39 @@
+"""Comparison of the forms of a function that numba compiles."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+
+from knightcube.compiled import HotFunction
+
+
+def assert_forms_agree(
+    hot: HotFunction[Any, Any], *args: Any, relative: float = 1e-9, interpreted: bool = True
+) -> None:
+    """Call all forms of a function with copies of the arguments, and compare results and changed arguments.
+
+    Arrays must agree to the `relative` tolerance of each value and of the largest one. The loop form is also
+    called without compilation if `interpreted`, because Python checks every index, and machine code none.
+    """
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    forms = [hot.numpy_form, hot.compiled_form(), *([hot.loop_form] if interpreted else [])]
+    expected, *others = (_called(form, args) for form in forms)
+    for found in others:
+        assert len(found) == len(expected)
+        for one, other in zip(expected, found, strict=True):
+            first, second = np.asarray(one), np.asarray(other)
+            assert first.dtype.kind == second.dtype.kind
+            scale = np.abs(first[np.isfinite(first)]).max(initial=0.0)
+            np.testing.assert_allclose(second, first, rtol=relative, atol=relative * float(scale))
+
+
+def _called(form: Any, args: tuple[Any, ...]) -> list[Any]:
+    """Return the results of a form, followed by its array arguments after the call."""
+    own = copy.deepcopy(args)
+    result = form(*own)
+    results = list(result) if isinstance(result, tuple) else [] if result is None else [result]
+    return results + [each for each in own if isinstance(each, np.ndarray)]
