@@ -138,7 +138,7 @@ def _ordered(values: FloatArray, place: int, scratch: FloatArray) -> float:
             less += current[k] < pivot
             equal += current[k] == pivot
         if less <= place < less + equal:
-            return pivot
+            return float(pivot)
         count, side = 0, 1.0 if place >= less else -1.0
         for k in range(size):
             value = current[k]
@@ -148,7 +148,7 @@ def _ordered(values: FloatArray, place: int, scratch: FloatArray) -> float:
     for k in range(size):
         scratch[k] = current[k]
     _sort(scratch, size)
-    return scratch[place]
+    return float(scratch[place])
 
 
 @loop_helper

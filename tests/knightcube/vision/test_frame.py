@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -297,7 +299,7 @@ def test_the_compiled_order_of_pixels_equals_that_in_numpy(shape: tuple[int, int
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-def test_the_compiled_search_of_bright_pixels_equals_that_in_numpy(dtype: type) -> None:
+def test_the_compiled_search_of_bright_pixels_equals_that_in_numpy(dtype: type[np.number[Any]]) -> None:
     draw = np.random.default_rng(5)
     pixels = draw.integers(0, 200, (50, 37)).astype(dtype)
     assert_forms_agree(_bright_indices, pixels, draw.integers(150, 199, (3, 2)).astype(dtype))

@@ -237,6 +237,14 @@ def measure_noise(
         return NoiseModel(given, 0.0)
     if gain is not None:
         return NoiseModel(given, _shared_mismatch(residual, leverage, light, noise, used, given))
+    photon, square = _noise_terms(residual, leverage, light, noise, used)
+    return NoiseModel(photon, math.sqrt(square))
+
+
+def _noise_terms_numpy(
+    residual: FloatArray, leverage: FloatArray, light: FloatArray, noise: FloatArray, used: BoolArray
+) -> tuple[float, float]:
+    """Return the non-negative coefficients of light and light^2 in the variance of the `used` pixels."""
     m = light[used]
     floor = np.broadcast_to((noise**2)[:, None, None], light.shape)[used]
     excess = residual[used] ** 2 / (1.0 - leverage[used]) - floor
@@ -246,8 +254,39 @@ def measure_noise(
         weight = 1.0 / expected**2
         # Residuals beyond 5 standard deviations are ignored, because they are neighbours or hot pixels.
         weight = np.where(excess < 25.0 * expected, weight, 0.0) if square or photon else weight
-        photon, square = _non_negative(m, excess, weight)
-    return NoiseModel(photon, float(np.sqrt(square)))
+        of_square, of_both, of_light = (float(np.sum(weight * m**power)) for power in (4, 3, 2))
+        along, across = float(np.sum(weight * excess * m)), float(np.sum(weight * excess * m * m))
+        photon, square = _non_negative(of_light, of_both, of_square, along, across)
+    return photon, square
+
+
+@compiled_form_of(_noise_terms_numpy)
+def _noise_terms(
+    residual: FloatArray, leverage: FloatArray, light: FloatArray, noise: FloatArray, used: BoolArray
+) -> tuple[float, float]:
+    """See `_noise_terms_numpy`."""
+    stars, rows, columns = light.shape
+    photon, square = 0.0, 0.0
+    for _ in range(_ROUNDS):
+        of_light, of_both, of_square, along, across = 0.0, 0.0, 0.0, 0.0, 0.0
+        for star in range(stars):
+            floor = noise[star] ** 2
+            for row in range(rows):
+                for column in range(columns):
+                    if not used[star, row, column]:
+                        continue
+                    m, free = light[star, row, column], 1.0 - leverage[star, row, column]
+                    excess = residual[star, row, column] ** 2 / free - floor
+                    expected = floor + photon * m + square * m * m
+                    if (square == photon == 0.0) or excess < 25.0 * expected:
+                        weight = m / expected**2
+                        along += weight * excess
+                        across += weight * excess * m
+                        of_light += weight * m
+                        of_both += weight * m * m
+                        of_square += weight * m * m * m
+        photon, square = _non_negative(of_light, of_both, of_square, along, across)
+    return photon, square
 
 
 def _shared_mismatch(
@@ -278,21 +317,22 @@ def _shared_mismatch(
     return float(np.sqrt(square))
 
 
-def _non_negative(m: FloatArray, excess: FloatArray, weight: FloatArray) -> tuple[float, float]:
-    """Return the non-negative coefficients a, b of the weighted least-squares fit excess = a m + b m^2."""
-    first, second, third = (float(np.sum(weight * m**power)) for power in (2, 3, 4))
-    along, square = float(np.sum(weight * excess * m)), float(np.sum(weight * excess * m * m))
-    determinant = first * third - second**2
-    if determinant > 1e-12 * first * third:
-        both = (
-            (third * along - second * square) / determinant,
-            (first * square - second * along) / determinant,
-        )
-        if min(both) >= 0.0:
-            return both
-    alone = max(0.0, along / first), max(0.0, square / third)
-    gains = alone[0] * along, alone[1] * square
-    return (alone[0], 0.0) if gains[0] >= gains[1] else (0.0, alone[1])
+@loop_helper
+def _non_negative(
+    of_light: float, of_both: float, of_square: float, along: float, across: float
+) -> tuple[float, float]:
+    """Return the non-negative solution a, b of two normal equations of a fit of light and light^2.
+
+    The equations are of_light a + of_both b = along and of_both a + of_square b = across.
+    """
+    determinant = of_light * of_square - of_both**2
+    if determinant > 1e-12 * of_light * of_square:
+        first = (of_square * along - of_both * across) / determinant
+        second = (of_light * across - of_both * along) / determinant
+        if first >= 0.0 and second >= 0.0:
+            return first, second
+    first, second = max(0.0, along / of_light), max(0.0, across / of_square)
+    return (first, 0.0) if first * along >= second * across else (0.0, second)
 
 
 X, Y, FLUX, SKY, WIDTH = range(5)

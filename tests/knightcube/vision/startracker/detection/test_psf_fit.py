@@ -7,6 +7,7 @@ import pytest
 
 from knightcube.vision.startracker.detection.psf_fit import (
     NoiseModel,
+    _noise_terms,
     _solve,
     cut,
     light,
@@ -119,4 +120,16 @@ def test_the_compiled_fit_equals_the_fit_in_numpy(count: int, length: float) -> 
         count,
         4,
         relative=1e-7,
+    )
+
+
+@pytest.mark.parametrize(("photon", "mismatch"), [(0.5, 0.0), (0.0, 0.05), (0.5, 0.03), (0.0, 0.0)])
+def test_the_compiled_noise_model_equals_that_in_numpy(photon: float, mismatch: float) -> None:
+    draw = np.random.default_rng(2)
+    noise, light = draw.uniform(2.0, 4.0, 30), draw.uniform(1.0, 3_000.0, (30, 7, 7))
+    true = (noise**2)[:, None, None] + photon * light + (mismatch * light) ** 2
+    residual = draw.normal(size=light.shape) * np.sqrt(true)
+    residual[:, 3, 3] += 1e4
+    assert_forms_agree(
+        _noise_terms, residual, np.full(light.shape, 0.2), light, noise, draw.random(light.shape) < 0.8
     )
