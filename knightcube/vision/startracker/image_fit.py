@@ -27,6 +27,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_matrices
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.startracker.attitude_fit import (
     inflation,
@@ -209,9 +210,7 @@ class _Seen:
         for _ in range(_MOST_STEPS):
             pose = self._pose(matrix, scale, held)
             seen, predicted = self.directions(pose), self.reference @ matrix.T
-            residual = np.einsum("nij,nj->ni", whitener, seen - predicted).ravel()
-            flat = self._slope(whitener, seen, predicted)
-            normal, gradient = flat.T @ flat, flat.T @ residual
+            normal, gradient = _normal(whitener, seen, predicted, self.late, self.unknowns.scale, bends)
             normal[self.camera, self.camera] += known
             gradient[self.camera] += known * held
             try:
@@ -233,21 +232,6 @@ class _Seen:
         bends = len(self.unknowns.bend)
         return _FittedPose(matrix, scale, np.pad(held[:bends], (0, BENDS - bends)), float(held[bends:].sum()))
 
-    def _slope(self, whitener: FloatArray, seen: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the derivatives of the residuals, scaled to unit variance, by the parameters, (2n, 3 to 13).
-
-        The parameters are the rotation, ln scale, the lens errors (bend) and the delay, as far as they are
-        fitted.
-        """
-        slopes = [-whitener @ cross_matrices(predicted)]
-        if self.unknowns.scale:
-            slopes.append(whitener @ scale_slope(seen)[:, :, None])
-        if len(self.unknowns.bend):
-            slopes.append(whitener @ bend_slope(seen)[:, :, : len(self.unknowns.bend)])
-        if len(self.late):
-            slopes.append(-whitener @ self.late[:, :, None])
-        return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
-
     def directions(self, pose: _FittedPose) -> FloatArray:
         """Return observed unit vectors (n, 3) at mid-exposure, corrected for the lens errors of a pose."""
         seen = bent(stretched(self.observed, pose.scale), pose.bend)
@@ -260,6 +244,72 @@ class _Seen:
     def missed(self, pose: _FittedPose) -> FloatArray:
         """Return the difference between observed and predicted unit vector of each star (n, 3)."""
         return self.directions(pose) - self.reference @ pose.matrix.T
+
+
+def _normal_numpy(
+    whitener: FloatArray, seen: FloatArray, predicted: FloatArray, late: FloatArray, scale: bool, bends: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return normal matrix (p, p) and gradient (p,) of the residuals, scaled to unit variance.
+
+    The p parameters are the rotation, ln scale if `scale`, the first `bends` lens errors, and the delay
+    unless `late` is empty.
+    """
+    slopes = [-whitener @ cross_matrices(predicted)]
+    if scale:
+        slopes.append(whitener @ scale_slope(seen)[:, :, None])
+    if bends:
+        slopes.append(whitener @ bend_slope(seen)[:, :, :bends])
+    if len(late):
+        slopes.append(-whitener @ late[:, :, None])
+    flat = np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
+    residual = np.einsum("nij,nj->ni", whitener, seen - predicted).ravel()
+    return flat.T @ flat, flat.T @ residual
+
+
+@compiled_form_of(_normal_numpy)
+def _normal(
+    whitener: FloatArray, seen: FloatArray, predicted: FloatArray, late: FloatArray, scale: bool, bends: int
+) -> tuple[FloatArray, FloatArray]:
+    """See `_normal_numpy`."""
+    count = 3 + scale + bends + (len(late) > 0)
+    normal, gradient = np.zeros((count, count)), np.zeros(count)
+    slope, flat = np.empty((3, count)), np.empty(count)
+    for star in range(len(seen)):
+        (x, y, z), (px, py, pz) = seen[star], predicted[star]
+        slope[0, 0], slope[0, 1], slope[0, 2] = 0.0, pz, -py
+        slope[1, 0], slope[1, 1], slope[1, 2] = -pz, 0.0, px
+        slope[2, 0], slope[2, 1], slope[2, 2] = py, -px, 0.0
+        tx, ty = x / z, y / z
+        square, last = tx * tx + ty * ty, 3
+        if scale:
+            slope[0, 3], slope[1, 3], slope[2, 3] = x * z * z, y * z * z, z * z * z - z
+            last = 4
+        for k in range(bends):  # in the order of `bend_slope`
+            if k in (0, 1, 4, 5):
+                along = (tx, ty, 0.0, 0.0, square, square * square)[k]
+                slope[0, last] = along * x * z * z
+                slope[1, last] = along * y * z * z
+                slope[2, last] = along * (z * z * z - z)
+            else:
+                dx = z * (0.0, 0.0, square, 0.0, 0.0, 0.0, tx, ty)[k]
+                dy = z * (0.0, 0.0, 0.0, square, 0.0, 0.0, -ty, tx)[k]
+                inward = x * dx + y * dy
+                slope[0, last], slope[1, last], slope[2, last] = dx - x * inward, dy - y * inward, -z * inward
+            last += 1
+        if len(late):
+            slope[0, last], slope[1, last], slope[2, last] = -late[star, 0], -late[star, 1], -late[star, 2]
+        for row in range(2):
+            wx, wy, wz = whitener[star, row]
+            off = wx * (x - px) + wy * (y - py) + wz * (z - pz)
+            for i in range(count):
+                flat[i] = wx * slope[0, i] + wy * slope[1, i] + wz * slope[2, i]
+                gradient[i] += flat[i] * off
+                for j in range(i + 1):
+                    normal[i, j] += flat[i] * flat[j]
+    for i in range(count):
+        for j in range(i):
+            normal[j, i] = normal[i, j]
+    return normal, gradient
 
 
 def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tuple[_FittedPose, BoolArray]:

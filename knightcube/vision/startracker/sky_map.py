@@ -15,6 +15,7 @@ aspect p and shear q. The vector (a, b, k, l, p, q) of the eight lens errors is 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +23,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel
 from knightcube.vision.startracker.attitude_fit import scale_slope
 
@@ -86,10 +88,32 @@ def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
 
 def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
     """Return unit vectors (n, 3) corrected for the lens errors `bend` (8,)."""
-    if not bend.any():
-        return direction
+    return _bent(np.ascontiguousarray(direction), bend) if bend.any() else direction
+
+
+def _bent_numpy(direction: FloatArray, bend: FloatArray) -> FloatArray:
     out = direction + bend_slope(direction) @ bend
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+
+
+@compiled_form_of(_bent_numpy)
+def _bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
+    out = np.empty_like(direction)
+    for k in range(len(direction)):
+        x, y, z = direction[k]
+        tx, ty = x / z, y / z
+        square = tx * tx + ty * ty
+        along = bend[0] * tx + bend[1] * ty + (bend[4] + bend[5] * square) * square
+        # Displacement of the tangents by decentring and by pixels that are not square, times z.
+        dx = z * (square * bend[2] + tx * bend[6] + ty * bend[7])
+        dy = z * (square * bend[3] - ty * bend[6] + tx * bend[7])
+        inward = x * dx + y * dy
+        ox = x + along * x * z * z + dx - x * inward
+        oy = y + along * y * z * z + dy - y * inward
+        oz = z - along * z * (x * x + y * y) - z * inward
+        size = math.sqrt(ox * ox + oy * oy + oz * oz)
+        out[k, 0], out[k, 1], out[k, 2] = ox / size, oy / size, oz / size
+    return out
 
 
 def bend_slope(seen: FloatArray) -> FloatArray:

@@ -16,8 +16,9 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, attitude_by, fit_in_image
+from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, _normal, attitude_by, fit_in_image
 from tests.knightcube.vision.startracker.unknown_lenses import drawn
+from tests.support.compiled_forms import assert_forms_agree
 
 _CAMERA = Pinhole.from_field_of_view(1024, 1024, float(np.deg2rad(12.0)))
 _ATTITUDE = np.array([0.5, -0.5, 0.5, 0.5])
@@ -230,3 +231,14 @@ def test_fitting_the_scatter_costs_little_accuracy_with_correct_noise() -> None:
     assert _LOW < known / (3.0 * _TRIALS) < _HIGH
     assert np.median(ratio) < 1.05
     assert np.mean(ratio) < 1.7
+
+
+@pytest.mark.parametrize("scale", [False, True])
+@pytest.mark.parametrize("bends", [0, 6, 8])
+@pytest.mark.parametrize("delayed", [False, True])
+def test_the_compiled_normal_equations_equal_those_in_numpy(scale: bool, bends: int, delayed: bool) -> None:
+    draw = np.random.default_rng([scale, bends, delayed])
+    seen = _CAMERA.unit_vectors(draw.uniform(0.0, 1_023.0, (30, 2)))
+    predicted = _CAMERA.unit_vectors(draw.uniform(0.0, 1_023.0, (30, 2)))
+    late = draw.normal(size=(30 if delayed else 0, 3))
+    assert_forms_agree(_normal, draw.normal(size=(30, 2, 3)), seen, predicted, late, scale, bends)

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, SPEED_OF_LIGHT, earth_from_sun, earth_velocity
 from knightcube.astro.quaternion import IDENTITY, angle_between, attitude_matrix
-from knightcube.vision.startracker.sky_map import Pointing, apparent
+from knightcube.vision.startracker.sky_map import Pointing, _bent, apparent
 from sim_hal.worlds.orbit import sun_position
+from tests.support.compiled_forms import assert_forms_agree
 
 
 def test_the_identity_looks_at_the_north_celestial_pole() -> None:
@@ -89,3 +90,12 @@ def test_the_earth_is_opposite_the_sun() -> None:
     published = np.array([-0.93739691, -0.31316824, -0.13577924])
     place, _ = earth_from_sun(2_448_908.5)
     np.testing.assert_allclose(-place / ASTRONOMICAL_UNIT, published, atol=1e-6)
+
+
+def test_the_compiled_lens_errors_equal_those_in_numpy() -> None:
+    draw = np.random.default_rng(1)
+    seen = np.column_stack([draw.uniform(-0.5, 0.5, (50, 2)), np.ones(50)])
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    for k in range(8):
+        assert_forms_agree(_bent, seen, 0.1 * np.eye(8)[k])
+    assert_forms_agree(_bent, seen, draw.normal(0.0, 0.1, 8))

@@ -5,6 +5,8 @@ Tests on star frames with foregrounds and defects.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -189,7 +191,9 @@ def test_lines_along_the_flow_of_a_rotation_share_it_and_other_lines_do_not(
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 @pytest.mark.parametrize("shape", [(16, 16), (70, 131)])
-def test_the_compiled_smoothing_equals_that_in_numpy(dtype: type, shape: tuple[int, int]) -> None:
+def test_the_compiled_smoothing_equals_that_in_numpy(
+    dtype: type[np.number[Any]], shape: tuple[int, int]
+) -> None:
     draw = np.random.default_rng(shape)
     pixels = draw.integers(0, 200, shape).astype(dtype)
     limit = Surface(draw.uniform(1_500.0, 1_900.0, (shape[0] // 16, shape[1] // 16)), shape)
