@@ -28,6 +28,7 @@ import numpy.typing as npt
 from knightcube.astro.arrays import FloatArray, IntArray, cross_matrices
 from knightcube.astro.attitude.wahba import AttitudeFix
 from knightcube.astro.quaternion import from_matrix
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 
 
@@ -211,11 +212,35 @@ def refine(
         scale: initial scale, or the fixed scale.
         free_scale: whether the scale is fitted.
     """
+    settled, matrix, scale, covariance, squares = _refined(
+        np.ascontiguousarray(observed),
+        np.ascontiguousarray(reference),
+        np.ascontiguousarray(sigma),
+        np.ascontiguousarray(matrix),
+        float(scale),
+        free_scale,
+    )
+    return Refinement(matrix, scale, covariance, squares) if settled else None
+
+
+_Refined = tuple[bool, FloatArray, float, FloatArray, FloatArray]
+
+
+def _refined_numpy(
+    observed: FloatArray,
+    reference: FloatArray,
+    sigma: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    free_scale: bool,
+) -> _Refined:
+    """Return whether the fit converged, matrix, scale, covariance and squares of the `Refinement`."""
     parameters = 4 if free_scale else 3
     weight = (1.0 / (sigma * scale))[:, None]
     # Weighted predictions, residuals and scale slopes; their 9 x 9 Gram matrix holds all normal equations.
     rows = np.zeros((len(observed), 9))
     normal = np.zeros((parameters, parameters))
+    failed = False, matrix, scale, normal, np.zeros(len(observed))
     for _ in range(_MOST_STEPS):
         b = stretched(observed, scale)
         predicted = reference @ matrix.T
@@ -237,13 +262,13 @@ def refine(
         try:
             covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         except np.linalg.LinAlgError:
-            return None
+            return failed
         step = -(covariance @ gradient)
         longest = float(np.abs(step).max())
         # The largest element of a matrix times the largest of its inverse approximates the condition number.
         condition = float(normal.max()) * float(covariance.max()) * _LEAST_INFORMATION
         if not 0.0 < condition < 1.0 or not longest < 1.0:
-            return None
+            return failed
         matrix = turned(matrix, step[:3])
         if free_scale:
             scale *= math.exp(float(step[3]))
@@ -253,7 +278,152 @@ def refine(
     left = rows[:, 3:6] + rows[:, :3] @ _cross_matrix(step[:3]).T
     if free_scale:
         left += step[3] * rows[:, 6:]
-    return Refinement(matrix, scale, covariance, np.einsum("ij,ij->i", left, left))
+    return True, matrix, scale, covariance, np.einsum("ij,ij->i", left, left)
+
+
+@compiled_form_of(_refined_numpy)
+def _refined(
+    observed: FloatArray,
+    reference: FloatArray,
+    sigma: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    free_scale: bool,
+) -> _Refined:
+    parameters = 4 if free_scale else 3
+    weight = 1.0 / (sigma * scale)
+    matrix = matrix.copy()
+    rows = np.zeros((len(observed), 9))
+    step, squares = np.zeros(4), np.zeros(len(observed))
+    covariance = np.zeros((parameters, parameters))
+    for _ in range(_MOST_STEPS):
+        _fill_rows(observed, reference, weight, matrix, scale, rows)
+        normal, gradient = _normal_equations(rows)
+        information = 0.0
+        for i in range(parameters):
+            for j in range(parameters):
+                information = max(information, normal[i, j])
+        if not _inverted(normal, covariance):
+            return False, matrix, scale, covariance, squares
+        largest, longest = 0.0, 0.0
+        for i in range(parameters):
+            step[i] = 0.0
+            for j in range(parameters):
+                step[i] -= covariance[i, j] * gradient[j]
+                largest = max(largest, covariance[i, j])
+            longest = max(longest, abs(step[i]))
+        if not 0.0 < information * largest * _LEAST_INFORMATION < 1.0 or not longest < 1.0:
+            return False, matrix, scale, covariance, squares
+        _turn(matrix, step)
+        if free_scale:
+            scale *= math.exp(step[3])
+        if longest < _SETTLED:
+            break
+    for k in range(len(observed)):
+        px, py, pz, ex, ey, ez, sx, sy, sz = rows[k]
+        ex += step[1] * pz - step[2] * py + step[3] * sx
+        ey += step[2] * px - step[0] * pz + step[3] * sy
+        ez += step[0] * py - step[1] * px + step[3] * sz
+        squares[k] = ex * ex + ey * ey + ez * ez
+    return True, matrix, scale, covariance, squares
+
+
+@loop_helper
+def _fill_rows(
+    observed: FloatArray,
+    reference: FloatArray,
+    weight: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    rows: FloatArray,
+) -> None:
+    """Write weighted predictions, residuals and slopes by ln scale to `rows` (n, 9)."""
+    squared = scale * scale
+    for k in range(len(observed)):
+        z, w = observed[k, 2], weight[k]
+        shrink = 1.0 / math.sqrt(squared + (1.0 - squared) * z * z)
+        bx, by, bz = observed[k, 0] * scale * shrink, observed[k, 1] * scale * shrink, z * shrink
+        for i in range(3):
+            rows[k, i] = w * (
+                matrix[i, 0] * reference[k, 0]
+                + matrix[i, 1] * reference[k, 1]
+                + matrix[i, 2] * reference[k, 2]
+            )
+        rows[k, 3], rows[k, 4], rows[k, 5] = (
+            w * bx - rows[k, 0],
+            w * by - rows[k, 1],
+            w * bz - rows[k, 2],
+        )
+        rows[k, 6], rows[k, 7], rows[k, 8] = w * bx * bz * bz, w * by * bz * bz, w * (bz * bz * bz - bz)
+
+
+@loop_helper
+def _normal_equations(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the normal matrix (4, 4) and the gradient (4,) of rotation and ln scale."""
+    normal, gradient = np.zeros((4, 4)), np.zeros(4)
+    for k in range(len(rows)):
+        px, py, pz, ex, ey, ez, sx, sy, sz = rows[k]
+        normal[0, 0] += py * py + pz * pz
+        normal[1, 1] += px * px + pz * pz
+        normal[2, 2] += px * px + py * py
+        normal[0, 1] -= px * py
+        normal[0, 2] -= px * pz
+        normal[1, 2] -= py * pz
+        normal[0, 3] += py * sz - pz * sy
+        normal[1, 3] += pz * sx - px * sz
+        normal[2, 3] += px * sy - py * sx
+        normal[3, 3] += sx * sx + sy * sy + sz * sz
+        gradient[0] += py * ez - pz * ey
+        gradient[1] += pz * ex - px * ez
+        gradient[2] += px * ey - py * ex
+        gradient[3] += ex * sx + ey * sy + ez * sz
+    for i in range(4):
+        for j in range(i):
+            normal[i, j] = normal[j, i]
+    return normal, gradient
+
+
+@loop_helper
+def _inverted(normal: FloatArray, inverse: FloatArray) -> bool:
+    """Write the inverse (p, p) of the first p rows and columns of `normal`, which is overwritten.
+
+    Returns whether the matrix is regular. Gauss-Jordan elimination without pivoting is stable, because the
+    matrix is positive definite.
+    """
+    count = len(inverse)
+    inverse[:] = 0.0
+    for i in range(count):
+        inverse[i, i] = 1.0
+    for i in range(count):
+        pivot = normal[i, i]
+        if not pivot > 0.0:
+            return False
+        for j in range(count):
+            normal[i, j] /= pivot
+            inverse[i, j] /= pivot
+        for k in range(count):
+            if k != i:
+                factor = normal[k, i]
+                for j in range(count):
+                    normal[k, j] -= factor * normal[i, j]
+                    inverse[k, j] -= factor * inverse[i, j]
+    return True
+
+
+@loop_helper
+def _turn(matrix: FloatArray, turn: FloatArray) -> None:
+    """Rotate an attitude matrix (3, 3) in place, as `turned` does."""
+    x, y, z = turn[0], turn[1], turn[2]
+    angle = math.sqrt(x * x + y * y + z * z)
+    first, second = 1.0, 0.5
+    if angle > 0.0:
+        first, second = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    for j in range(3):
+        a, b, c = matrix[0, j], matrix[1, j], matrix[2, j]
+        ca, cb, cc = y * c - z * b, z * a - x * c, x * b - y * a
+        matrix[0, j] = a - first * ca + second * (y * cc - z * cb)
+        matrix[1, j] = b - first * cb + second * (z * ca - x * cc)
+        matrix[2, j] = c - first * cc + second * (x * cb - y * ca)
 
 
 def _summed_cross(gram: list[list[float]], at: int) -> list[float]:

@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.startracker.attitude_fit import (
     MatchStatus,
     StarField,
@@ -43,7 +44,7 @@ from knightcube.vision.startracker.index.sky_index import (
 from knightcube.vision.startracker.verification import (
     VerificationSettings,
     nothing,
-    verify,
+    verify_first,
 )
 
 _BRIGHTEST = 12
@@ -188,22 +189,26 @@ class TriangleMatches:
             np.concatenate([part.scale for part in parts]),
         )
 
-    def votes(self) -> IntArray:
-        """Return the votes (k, 3) for each pair of an observed star and a guide star in each match.
-
-        The votes of a pair are the number of matches of similar scale that contain the pair.
-        """
-        bins = np.log(self.scale) * _BINS_PER_LN_SCALE
-        bins -= bins.min()
-        bits = max(13, self.star.size.bit_length())
-        # With this multiplicative hash, two pairs rarely share a slot, which would only add wrong votes.
-        code = (self.star * np.uint32(1021) + self.observed) * np.uint32(257)
-        code += bins.astype(np.uint32)[:, None]
-        slot = (code * np.uint32(2654435761)) >> np.uint32(32 - bits)
-        return np.asarray(np.bincount(slot.ravel(), minlength=1 << bits)[slot])
-
 
 _BINS_PER_LN_SCALE = 15.0
+
+
+def _votes(
+    observed: npt.NDArray[np.uint32], star: npt.NDArray[np.uint32], scale: FloatArray
+) -> npt.NDArray[np.intp]:
+    """Return the votes (k,) for each of k matches of triangles.
+
+    The votes of a pair of an observed star and a guide star are the number of matches of similar scale that
+    contain the pair. The votes of a match are the sum of the votes of its three pairs.
+    """
+    bins = np.log(scale) * _BINS_PER_LN_SCALE
+    bins -= bins.min()
+    bits = max(13, star.size.bit_length())
+    # With this multiplicative hash, two pairs rarely share a slot, which would only add wrong votes.
+    code = (star * np.uint32(1021) + observed) * np.uint32(257)
+    code += bins.astype(np.uint32)[:, None]
+    slot = (code * np.uint32(2654435761)) >> np.uint32(32 - bits)
+    return np.asarray(np.bincount(slot.ravel(), minlength=1 << bits)[slot].sum(axis=1))
 
 
 def look_up(
@@ -226,19 +231,50 @@ def look_up(
         distortion: additional error of a side ratio due to distortion of the lens.
         most: maximum number of index entries to read, in the order of the observed triangles.
     """
-    corners, sides, left = _forms(field, triangles, steps)
+    observed, star, scale, read = _look_up(
+        np.ascontiguousarray(field.direction),
+        np.ascontiguousarray(field.sigma),
+        np.stack([steps.middle, steps.lowest, steps.highest]),
+        np.ascontiguousarray(triangles),
+        tolerance,
+        distortion,
+        most,
+        *sky.triangles.table,
+    )
+    return TriangleMatches(observed, star, scale), read
+
+
+_Found = tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint32], FloatArray, int]
+
+
+def _look_up_numpy(
+    direction: FloatArray,
+    sigma: FloatArray,
+    steps: FloatArray,
+    triangles: IntArray,
+    tolerance: float,
+    distortion: float,
+    most: int,
+    key: npt.NDArray[np.uint32],
+    star_of: npt.NDArray[np.uint16],
+    shape: npt.NDArray[np.uint8],
+    below: npt.NDArray[np.int32],
+) -> _Found:
+    """Return observed stars, guide stars and scales of the matches, and the number of entries read."""
+    scales = steps[0]
+    corners, sides, left = _forms(direction, triangles, scales)
     size = np.maximum(sides[:, 2], SIZE_UNIT)
-    sigma = np.sqrt(np.mean(field.sigma[corners] ** 2, axis=1))
-    step = np.tile(np.arange(len(steps)), len(triangles))
+    spread = np.sqrt(np.mean(sigma[corners] ** 2, axis=1))
+    step = np.tile(np.arange(len(scales)), len(triangles))
     # The error of a side ratio follows from the errors of two directions and of the longest side.
-    slack = (1.6 * tolerance) * sigma * steps.middle[step] / size + distortion
+    slack = (1.6 * tolerance) * spread * scales[step] / size + distortion
     ratio = sides[:, :2] / size[:, None]
     usable = np.flatnonzero((slack <= CELL) & (ratio[:, 0] + slack >= LEAST_RATIO))
     corners, size, left = corners[usable], size[usable], left[usable]
     slack, ratio, step = slack[usable], ratio[usable], step[usable]
-    lowest = size * (steps.lowest / steps.middle)[step] * (1.0 - slack)
-    highest = size * (steps.highest / steps.middle)[step] * (1.0 + slack)
-    query, short, middle, begin, end = _runs(sky, ratio, slack, left, lowest, highest)
+    lowest = size * (steps[1] / scales)[step] * (1.0 - slack)
+    highest = size * (steps[2] / scales)[step] * (1.0 + slack)
+    query, short, middle, begin, end = _runs(below, ratio, slack, left, lowest, highest)
     # Only the first ranges of index entries are read, with at most `most` entries in total.
     count = end - begin
     kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
@@ -250,20 +286,169 @@ def look_up(
     near = np.ones(len(entry), dtype=np.bool_)
     for column, cells in enumerate((short, middle)):
         lowest_place, width = _places(ratio[query, column], slack[query], cells)
-        place = sky.triangles.shape[:, column][entry]
+        place = shape[:, column][entry]
         # Differences of unsigned bytes wrap around, so that positions below the lowest one fail the test.
         near &= place - np.repeat(lowest_place, count) <= np.repeat(width, count)
     chosen = np.flatnonzero(near)
     total = len(entry)
     entry = entry[chosen]
     query = query[np.searchsorted(np.cumsum(count), chosen, side="right")]
-    longest = (sky.triangles.key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
+    longest = (key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
     # The ranges of entries also contain some triangles that are too small or too large for the step of scale.
     fits = np.flatnonzero((longest >= lowest[query]) & (longest <= highest[query]))
     entry, query, longest = entry[fits], query[fits], longest[fits]
-    scale = longest / size[query] * steps.middle[step[query]]
-    star = sky.triangles.corners[entry].astype(np.uint32)
-    return TriangleMatches(corners[query].astype(np.uint32), star, scale), total
+    scale = longest / size[query] * scales[step[query]]
+    return corners[query].astype(np.uint32), star_of[entry].astype(np.uint32), scale, total
+
+
+@compiled_form_of(_look_up_numpy)
+def _look_up(
+    direction: FloatArray,
+    sigma: FloatArray,
+    steps: FloatArray,
+    triangles: IntArray,
+    tolerance: float,
+    distortion: float,
+    most: int,
+    key: npt.NDArray[np.uint32],
+    star_of: npt.NDArray[np.uint16],
+    shape: npt.NDArray[np.uint8],
+    below: npt.NDArray[np.int32],
+) -> _Found:
+    seen = _at_scales(direction, steps[0])
+    # At most three cells of each of the two side ratios agree with a triangle of sufficient accuracy.
+    runs = np.empty((9 * len(triangles) * len(seen), 7), dtype=np.int64)
+    limits = np.empty((len(triangles) * len(seen), 3))
+    corners = np.empty((len(triangles) * len(seen), 3), dtype=np.int64)
+    side = np.empty(3)
+    queries, count, total = 0, 0, 0
+    for t in range(len(triangles)):
+        for s in range(len(seen)):
+            left = _sorted_sides(seen[s], triangles[t], side, corners[queries])
+            a, b, c = sigma[corners[queries, 0]], sigma[corners[queries, 1]], sigma[corners[queries, 2]]
+            size = max(side[2], SIZE_UNIT)
+            spread = math.sqrt((a * a + b * b + c * c) / 3.0)
+            slack = 1.6 * tolerance * spread * steps[0, s] / size + distortion
+            if not (slack <= CELL and side[0] / size + slack >= LEAST_RATIO):
+                continue
+            limits[queries, 0] = size * (steps[1, s] / steps[0, s]) * (1.0 - slack)
+            limits[queries, 1] = size * (steps[2, s] / steps[0, s]) * (1.0 + slack)
+            limits[queries, 2] = steps[0, s] / size
+            added = _add_runs(
+                left, side[0] / size, side[1] / size, slack, limits[queries], below, runs[count:]
+            )
+            for run in range(count, count + added):
+                if total + runs[run, 1] - runs[run, 0] > most:
+                    return *_matching_entries(runs[:run], limits, corners, key, star_of, shape), total
+                total += runs[run, 1] - runs[run, 0]
+                runs[run, 6] = queries
+            queries, count = queries + 1, count + added
+    return *_matching_entries(runs[:count], limits, corners, key, star_of, shape), total
+
+
+@loop_helper
+def _add_runs(
+    left: int,
+    short: float,
+    middle: float,
+    slack: float,
+    limits: FloatArray,
+    below: npt.NDArray[np.int32],
+    runs: IntArray,
+) -> int:
+    """Write the ranges of keys that may contain triangles similar to an observed triangle to `runs`.
+
+    A range is the first and the last + 1 index, and the lowest and highest positions of both side ratios in
+    their cells. Returns the number of ranges.
+    """
+    first = int(min(limits[0] / SIZE_UNIT, float(_LARGEST_SIZE)))
+    last = int(min(limits[1] / SIZE_UNIT, float(_LARGEST_SIZE)))
+    count = 0
+    for i in range(max(int((short - slack) * CELLS), 0), min(int((short + slack) * CELLS), CELLS - 1) + 1):
+        low, high = _place_limits(short, slack, i)
+        from_cell, to_cell = int((middle - slack) * CELLS), int((middle + slack) * CELLS)
+        for j in range(max(from_cell, 0), min(to_cell, CELLS - 1) + 1):
+            form = ((left * CELLS + i) * CELLS + j) << SIZE_BITS
+            lower, upper = _place_limits(middle, slack, j)
+            runs[count, 0] = below[(form | first) >> RUN_BITS]
+            runs[count, 1] = below[((form | last) >> RUN_BITS) + 1]
+            runs[count, 2], runs[count, 3], runs[count, 4], runs[count, 5] = low, high, lower, upper
+            count += 1
+    return count
+
+
+@loop_helper
+def _matching_entries(
+    runs: IntArray,
+    limits: FloatArray,
+    corners: IntArray,
+    key: npt.NDArray[np.uint32],
+    star_of: npt.NDArray[np.uint16],
+    shape: npt.NDArray[np.uint8],
+) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint32], FloatArray]:
+    """Return observed stars, guide stars and scales of the entries in `runs` that match their triangle."""
+    observed, star = np.empty((256, 3), dtype=np.uint32), np.empty((256, 3), dtype=np.uint32)
+    scale, found = np.empty(256), 0
+    for run in range(len(runs)):
+        begin, end, low, high, lower, upper, query = runs[run]
+        for k in range(begin, end):
+            if shape[k, 0] < low or shape[k, 0] > high or shape[k, 1] < lower or shape[k, 1] > upper:
+                continue
+            longest = np.int64(key[k] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
+            if not limits[query, 0] <= longest <= limits[query, 1]:
+                continue
+            if found == len(scale):
+                observed = np.concatenate((observed, np.empty_like(observed)))
+                star = np.concatenate((star, np.empty_like(star)))
+                scale = np.concatenate((scale, np.empty_like(scale)))
+            for c in range(3):
+                observed[found, c], star[found, c] = corners[query, c], star_of[k, c]
+            scale[found] = longest * limits[query, 2]
+            found += 1
+    return observed[:found].copy(), star[:found].copy(), scale[:found].copy()
+
+
+@loop_helper
+def _at_scales(direction: FloatArray, scales: FloatArray) -> FloatArray:
+    """Return unit vectors (s, n, 3) at s scales."""
+    seen = np.empty((len(scales), len(direction), 3))
+    for s in range(len(scales)):
+        for i in range(len(direction)):
+            x, y, z = scales[s] * direction[i, 0], scales[s] * direction[i, 1], direction[i, 2]
+            norm = math.sqrt(x * x + y * y + z * z)
+            seen[s, i, 0], seen[s, i, 1], seen[s, i, 2] = x / norm, y / norm, z / norm
+    return seen
+
+
+@loop_helper
+def _sorted_sides(seen: FloatArray, triangle: IntArray, side: FloatArray, corner: IntArray) -> int:
+    """Write the sides of a triangle in ascending order, and the corners opposite to them.
+
+    Returns 1 if the corners run to the left in the image, otherwise 0.
+    """
+    for c in range(3):
+        one, two = triangle[(c + 1) % 3], triangle[(c + 2) % 3]
+        cosine = seen[one, 0] * seen[two, 0] + seen[one, 1] * seen[two, 1] + seen[one, 2] * seen[two, 2]
+        length = math.sqrt(max(2.0 - 2.0 * cosine, 0.0))
+        at = c
+        while at > 0 and side[at - 1] > length:
+            side[at], corner[at] = side[at - 1], corner[at - 1]
+            at -= 1
+        side[at], corner[at] = length, triangle[c]
+    a, b, c = corner[0], corner[1], corner[2]
+    au, av = seen[a, 0] / seen[a, 2], seen[a, 1] / seen[a, 2]
+    bu, bv = seen[b, 0] / seen[b, 2], seen[b, 1] / seen[b, 2]
+    cu, cv = seen[c, 0] / seen[c, 2], seen[c, 1] / seen[c, 2]
+    return 1 if (bu - au) * (cv - av) > (cu - au) * (bv - av) else 0
+
+
+@loop_helper
+def _place_limits(ratio: float, slack: float, cell: int) -> tuple[int, int]:
+    """Return the lowest and the highest position within a cell that agree with a side ratio."""
+    wanted = ratio * (CELLS * FINE) - 0.5 - cell * FINE
+    reach = slack * (CELLS * FINE) + 0.5
+    lowest = min(max(math.ceil(wanted - reach), 0), FINE - 1)
+    return lowest, min(max(math.floor(wanted + reach), lowest), FINE - 1)
 
 
 def _places(
@@ -282,16 +467,16 @@ def _places(
 
 
 def _forms(
-    field: StarField, triangles: IntArray, steps: ScaleSteps
+    seen: FloatArray, triangles: IntArray, scales: FloatArray
 ) -> tuple[IntArray, FloatArray, BoolArray]:
     """Return corners and sides (t s, 3) of t triangles at s scales, sorted by side length.
 
     The third returned value is the orientation of the corners in the image (t s,).
     """
-    x, y, z = field.direction.T
-    direction = np.empty((len(steps), len(field), 3))
-    direction[:, :, 0] = steps.middle[:, None] * x
-    direction[:, :, 1] = steps.middle[:, None] * y
+    x, y, z = seen.T
+    direction = np.empty((len(scales), len(seen), 3))
+    direction[:, :, 0] = scales[:, None] * x
+    direction[:, :, 1] = scales[:, None] * y
     direction[:, :, 2] = z
     direction /= np.sqrt(np.einsum("sij,sij->si", direction, direction))[:, :, None]
     first, second, third = triangles.T
@@ -301,7 +486,7 @@ def _forms(
     sides = np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)).transpose(1, 0, 2).reshape(-1, 3)
     order = np.argsort(sides, axis=1)
     rows = np.arange(len(sides))[:, None]
-    corners = np.repeat(triangles, len(steps), axis=0)[rows, order]
+    corners = np.repeat(triangles, len(scales), axis=0)[rows, order]
     a, b, c = corners.T
     u, v = x / z, y / z
     left = (u[b] - u[a]) * (v[c] - v[a]) > (u[c] - u[a]) * (v[b] - v[a])
@@ -309,7 +494,7 @@ def _forms(
 
 
 def _runs(
-    sky: SkyIndex,
+    below: npt.NDArray[np.int32],
     ratio: FloatArray,
     slack: FloatArray,
     left: BoolArray,
@@ -334,7 +519,6 @@ def _runs(
     form = ((left[query] * CELLS + short) * CELLS + middle) << SIZE_BITS
     first = np.minimum(lowest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
     last = np.minimum(highest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
-    below = sky.triangles.below
     begin, end = below[(form | first) >> RUN_BITS], below[((form | last) >> RUN_BITS) + 1]
     return query, short, middle, begin, end
 
@@ -368,6 +552,8 @@ class IdentificationSettings:
 # Factor on the tolerance and on the number of verified candidates, for batches of triangles of many stars.
 # The factor is below 1, because many true triangles vote for the same stars.
 _OF_SPREAD = 0.6
+# Number of matches with the most votes that are considered for each candidate to be verified.
+_RANKED = 8
 # Factor by which chance matches must be less likely in the mirrored field or outside the range of scales.
 _RARE = 10.0
 DEFAULT = IdentificationSettings()
@@ -394,7 +580,7 @@ def _search(
     """Return the identification of a field, without trying the mirrored field or other scales."""
     steps = ScaleSteps.of(observed, settings.distortion)
     found: list[TriangleMatches] = []
-    tried: set[tuple[int, int]] = set()
+    tried = np.empty((0, 2), dtype=np.int64)
     work = 0
     for triangles, spread in batches_of(observed, settings.batches, len(steps)):
         share = _OF_SPREAD if spread else 1.0
@@ -407,10 +593,12 @@ def _search(
             settings.distortion,
             settings.work - work,
         )
-        found.append(finds)
+        if len(finds):
+            found.append(finds)
         most = round(share * settings.verified)
-        for matrix, scale in _candidates(observed, sky, TriangleMatches.of(found), tried, most):
-            answer = verify(observed, sky, matrix, scale, searched, settings.verification)
+        if found:
+            matrices, scales, tried = _candidates(observed, sky, TriangleMatches.of(found), tried, most)
+            answer = verify_first(observed, sky, matrices, scales, searched, settings.verification)
             if answer.status is MatchStatus.IDENTIFIED:
                 return answer
         work += read
@@ -419,30 +607,185 @@ def _search(
     return nothing(observed)
 
 
+_Chosen = tuple[FloatArray, FloatArray, IntArray]
+
+
 def _candidates(
-    observed: StarField, sky: SkyIndex, finds: TriangleMatches, tried: set[tuple[int, int]], most: int
-) -> Iterator[tuple[FloatArray, float]]:
-    """Yield attitude matrices (3, 3) and scales of the matches with the most votes, each only once."""
-    if not len(finds):
-        return
-    votes = finds.votes().sum(axis=1)
+    observed: StarField, sky: SkyIndex, finds: TriangleMatches, tried: IntArray, most: int
+) -> _Chosen:
+    """Return attitude matrices (c, 3, 3) and scales (c,) of the matches with the most votes.
+
+    A match that shares two pairs of an observed star and a guide star with the pairs `tried` (k, 2) is left
+    out. The third returned value is `tried` with the pairs of the new candidates.
+    """
+    return _choose(
+        np.ascontiguousarray(observed.direction),
+        sky.stars.direction,
+        finds.observed,
+        finds.star,
+        finds.scale,
+        tried,
+        most,
+        *observed.scale,
+    )
+
+
+def _choose_numpy(
+    direction: FloatArray,
+    guide: FloatArray,
+    observed: npt.NDArray[np.uint32],
+    star: npt.NDArray[np.uint32],
+    scale: FloatArray,
+    tried: IntArray,
+    most: int,
+    lowest: float,
+    highest: float,
+) -> _Chosen:
+    """Return matrices and scales of the candidates, and the extended list of tried pairs."""
+    votes = _votes(observed, star, scale)
     # There may be a hundred thousand matches, so only the matches with the most votes are sorted.
-    first = np.argpartition(-votes, min(8 * most, len(votes) - 1))[: 8 * most]
-    order = first[np.lexsort((first, -votes[first]))]
-    yielded = 0
-    for find in order.tolist():
-        pairs = list(zip(finds.observed[find].tolist(), finds.star[find].tolist(), strict=True))
-        if sum(pair in tried for pair in pairs) >= 2:
+    count = min(_RANKED * most, len(votes))
+    least = np.partition(votes, len(votes) - count)[len(votes) - count]
+    more, equal = np.flatnonzero(votes > least), np.flatnonzero(votes == least)
+    first = np.concatenate([more, equal[: count - len(more)]])
+    pairs_tried = set(map(tuple, tried.tolist()))
+    matrices, scales = [], []
+    for find in first[np.lexsort((first, -votes[first]))].tolist():
+        pairs = list(zip(observed[find].tolist(), star[find].tolist(), strict=True))
+        if sum(pair in pairs_tried for pair in pairs) >= 2:
             continue
-        tried.update(pairs)
-        # The scale from one triangle is inaccurate, so it is limited to the range of possible scales.
-        scale = min(max(float(finds.scale[find]), observed.scale[0]), observed.scale[1])
+        pairs_tried.update(pairs)
+        tried = np.concatenate([tried, pairs])
         # The attitude transforms the guide stars of the match into the observed stars.
-        seen = stretched(observed.direction[finds.observed[find]], float(finds.scale[find]))
-        yield np.asarray(_frame(seen).T @ _frame(sky.stars.direction[finds.star[find]])), scale
-        yielded += 1
-        if yielded == most:
-            return
+        seen = stretched(direction[observed[find]], float(scale[find]))
+        matrices.append(_frame(seen).T @ _frame(guide[star[find]]))
+        # The scale from one triangle is inaccurate, so it is limited to the range of possible scales.
+        scales.append(min(max(float(scale[find]), lowest), highest))
+        if len(scales) == most:
+            break
+    return np.array(matrices).reshape(-1, 3, 3), np.array(scales), tried
+
+
+@compiled_form_of(_choose_numpy)
+def _choose(
+    direction: FloatArray,
+    guide: FloatArray,
+    observed: npt.NDArray[np.uint32],
+    star: npt.NDArray[np.uint32],
+    scale: FloatArray,
+    tried: IntArray,
+    most: int,
+    lowest: float,
+    highest: float,
+) -> _Chosen:
+    votes = _counted_votes(observed, star, scale)
+    order = _most_voted(votes, min(_RANKED * most, len(votes)))
+    pairs = np.empty((len(tried) + 3 * most, 2), dtype=np.int64)
+    pairs[: len(tried)] = tried
+    matrices, scales = np.empty((most, 3, 3)), np.empty(most)
+    seen, wanted = np.empty((3, 3)), np.empty((3, 3))
+    known, count = len(tried), 0
+    for find in order:
+        shared = 0
+        for c in range(3):
+            for k in range(known):
+                if pairs[k, 0] == observed[find, c] and pairs[k, 1] == star[find, c]:
+                    shared += 1
+                    break
+        if shared >= 2:
+            continue
+        squared = scale[find] * scale[find]
+        for c in range(3):
+            one, two = np.int64(observed[find, c]), np.int64(star[find, c])
+            pairs[known, 0], pairs[known, 1] = one, two
+            known += 1
+            z = direction[one, 2]
+            shrink = 1.0 / math.sqrt(squared + (1.0 - squared) * z * z)
+            seen[0, c] = direction[one, 0] * scale[find] * shrink
+            seen[1, c] = direction[one, 1] * scale[find] * shrink
+            seen[2, c] = z * shrink
+            for axis in range(3):
+                wanted[axis, c] = guide[two, axis]
+        _into_frame(seen)
+        _into_frame(wanted)
+        for row in range(3):
+            for column in range(3):
+                total = 0.0
+                for axis in range(3):
+                    total += seen[row, axis] * wanted[column, axis]
+                matrices[count, row, column] = total
+        scales[count] = min(max(scale[find], lowest), highest)
+        count += 1
+        if count == most:
+            break
+    return matrices[:count].copy(), scales[:count].copy(), pairs[:known].copy()
+
+
+@loop_helper
+def _counted_votes(
+    observed: npt.NDArray[np.uint32], star: npt.NDArray[np.uint32], scale: FloatArray
+) -> IntArray:
+    """Return the votes (k,) that `_votes` returns."""
+    least = scale[0]
+    for k in range(len(scale)):
+        least = min(least, scale[k])
+    least = math.log(least) * _BINS_PER_LN_SCALE
+    bits, size = 0, 3 * len(scale)
+    while size:
+        size >>= 1
+        bits += 1
+    bits = max(13, bits)
+    count = np.zeros(1 << bits, dtype=np.int32)
+    slot = np.empty((len(scale), 3), dtype=np.int32)
+    for k in range(len(scale)):
+        part = int(math.log(scale[k]) * _BINS_PER_LN_SCALE - least)
+        for c in range(3):
+            code = (np.int64(star[k, c]) * 1021 + np.int64(observed[k, c])) * 257 + part
+            # The product of 64-bit integers wraps around, but its lower 32 bits are those of uint32.
+            slot[k, c] = (((code & 0xFFFFFFFF) * 0x9E3779B1) & 0xFFFFFFFF) >> (32 - bits)
+            count[slot[k, c]] += 1
+    votes = np.empty(len(scale), dtype=np.int64)
+    for k in range(len(scale)):
+        votes[k] = np.int64(count[slot[k, 0]]) + count[slot[k, 1]] + count[slot[k, 2]]
+    return votes
+
+
+@loop_helper
+def _most_voted(votes: IntArray, wanted: int) -> IntArray:
+    """Return the indices (`wanted`,) of the matches with the most votes, of equal ones the first."""
+    highest = 0
+    for k in range(len(votes)):
+        highest = max(highest, votes[k])
+    # The place of the first match with v votes among the sorted matches is `begin[v]`.
+    begin = np.zeros(highest + 2, dtype=np.int64)
+    for k in range(len(votes)):
+        begin[votes[k]] += 1
+    above = 0
+    for v in range(highest, -1, -1):
+        here = begin[v]
+        begin[v] = above
+        above += here
+    order = np.empty(wanted, dtype=np.int64)
+    for k in range(len(votes)):
+        at = begin[votes[k]]
+        if at < wanted:
+            order[at] = k
+            begin[votes[k]] += 1
+    return order
+
+
+@loop_helper
+def _into_frame(corners: FloatArray) -> None:
+    """Replace unit vectors, as columns (3, 3), by the axes of the frame that `_frame` returns as rows."""
+    a, b, c = corners[:, 0].copy(), corners[:, 1].copy(), corners[:, 2].copy()
+    m, d = a + b + c, a - b
+    m /= math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    d -= (m[0] * d[0] + m[1] * d[1] + m[2] * d[2]) * m
+    d /= math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    corners[:, 0], corners[:, 1] = m, d
+    corners[0, 2] = m[1] * d[2] - m[2] * d[1]
+    corners[1, 2] = m[2] * d[0] - m[0] * d[2]
+    corners[2, 2] = m[0] * d[1] - m[1] * d[0]
 
 
 def _frame(corners: FloatArray) -> FloatArray:

@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.quaternion import attitude_matrix
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.startracker.attitude_fit import (
     DistortedFit,
     MatchStatus,
@@ -39,7 +40,7 @@ from knightcube.vision.startracker.attitude_fit import (
     refine,
     stretched,
 )
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index.sky_index import BOXES, SkyIndex
 
 _MOST_ORDERED = 12
 
@@ -155,11 +156,20 @@ class VerificationSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matching:
-    """Indices (k,) of matched observed stars and of their guide stars, and log10 of the chance matches."""
+    """Stars that match at the first candidate attitude with few enough chance matches.
 
+    Attributes:
+        candidate: index of the candidate attitude.
+        observed, star: indices of the matched observed stars and of their guide stars (k,).
+        log10_chance: log10 of the bound of chance matches.
+        expected: indices of the guide stars that are expected in the field, the brightest first.
+    """
+
+    candidate: int
     observed: IntArray
     star: IntArray
     log10_chance: float
+    expected: IntArray
 
 
 # Fraction of bright expected stars that match, below which the distortion of the lens is also fitted.
@@ -191,28 +201,71 @@ def verify(
             space.
         settings: settings of the verification.
     """
-    expected = _expected_in(field, sky, matrix, scale)
+    return verify_first(field, sky, matrix[None], np.array([scale]), searched, settings)
+
+
+def verify_first(
+    field: StarField,
+    sky: SkyIndex,
+    matrices: FloatArray,
+    scales: FloatArray,
+    searched: float = 1.0,
+    settings: VerificationSettings = VerificationSettings(),
+) -> StarMatch:
+    """Return the identification by the first candidate that `verify` accepts, or NO_MATCH.
+
+    Args:
+        field: observed points of the frame.
+        sky: index of the guide stars.
+        matrices: attitude matrices of the candidates (c, 3, 3).
+        scales: image scales of the candidates (c,).
+        searched: fraction of all attitudes covered by the search that found the candidates.
+        settings: settings of the verification.
+    """
     deciding = field if len(field) <= settings.most else field.subset(np.arange(settings.most))
-    start = Refinement(matrix, scale, np.empty((0, 0)), np.empty(0))
-    decided = _settle(deciding, sky, expected, start, searched, settings)
-    if decided is None:
+    matching = _Matcher(deciding, sky, searched, settings)
+    limit = settings.log10_false_alarm + _HOPELESS
+    begin = 0
+    while begin < len(scales):
+        found = matching.first(matrices[begin:], scales[begin:], limit)
+        if found is None:
+            break
+        begin += found.candidate
+        answer = _verified(
+            field, matching, found, Refinement(matrices[begin], float(scales[begin]), *_UNFITTED)
+        )
+        if answer.status is MatchStatus.IDENTIFIED:
+            return answer
+        begin += 1
+    return nothing(field)
+
+
+_UNFITTED = np.empty((0, 0)), np.empty(0)
+
+
+def _verified(field: StarField, matching: _Matcher, first: _Matching, start: Refinement) -> StarMatch:
+    """Return the identification of the whole field by one candidate, or NO_MATCH."""
+    sky, settings = matching.sky, matching.settings
+    decided = _settle(matching, first, start)
+    if decided is None or decided[0].log10_chance > settings.log10_false_alarm:
         return nothing(field)
-    matching, refined = decided
-    if matching.log10_chance > settings.log10_false_alarm:
-        return nothing(field)
-    if deciding is not field:
-        expected = _expected_in(field, sky, refined.matrix, refined.scale)
-        decided = _settle(field, sky, expected, refined, searched, settings)
+    if matching.field is not field:
+        refined = decided[1]
+        everything = _Matcher(field, sky, matching.searched, settings)
+        limit = settings.log10_false_alarm + _HOPELESS
+        grown = everything.first(refined.matrix[None], np.array([refined.scale]), limit)
+        decided = None if grown is None else _settle(everything, grown, refined)
         if decided is None:
             return nothing(field)
-        matching, refined = decided
+    found, refined = decided
+    expected = found.expected
     # Distortion of an uncalibrated lens is fitted if bright stars do not match or residuals are too large.
-    bright = _bright_matched(expected, matching.star)
+    bright = _bright_matched(expected, found.star)
     missed = not len(bright) or float(np.mean(bright)) < _FEW_MISSED
     scattered = inflation(refined.squares, len(refined.covariance)) > 1.0
     if field.scale[1] > field.scale[0] and (missed or scattered):
-        return _distorted(field, sky, matching, refined)
-    return _identified(field, matching, refined.widened())
+        return _distorted(field, sky, found, refined)
+    return _identified(field, found, refined.widened())
 
 
 def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> StarMatch:
@@ -221,7 +274,7 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
     found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
     if found is None or _share_displaced(field, sky, expected, found) > _MOST_DISPLACED:
         return nothing(field)
-    grown = _Matching(found.observed, found.star, matching.log10_chance)
+    grown = replace(matching, observed=found.observed, star=found.star)
     answer = _identified(field, grown, found.refined)
     return replace(answer, distortion=found.distortion, from_lens=found.from_lens)
 
@@ -264,13 +317,23 @@ def expected_stars(
     sky: SkyIndex, matrix: FloatArray, half_width: tuple[float, float], count: int
 ) -> npt.NDArray[np.intp]:
     """Return the indices of the `count` brightest guide stars in the field, the brightest first."""
+    return _expected_numpy(sky.stars.direction, sky.coarse, matrix, half_width, count)
+
+
+def _expected_numpy(
+    guide: FloatArray,
+    coarse: npt.NDArray[np.float32],
+    matrix: FloatArray,
+    half_width: tuple[float, float],
+    count: int,
+) -> npt.NDArray[np.intp]:
     across, down = half_width
     cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
     # The search covers twice as many stars of the sky as needed for `count` stars in an average field.
     # The factor of two is needed because stars are less dense near the galactic poles.
     brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
-    near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse[:, :brightest] > cosine)
-    x, y, z = matrix @ sky.stars.direction[near].T
+    near = np.flatnonzero(matrix[2].astype(np.float32) @ coarse[:, :brightest] > cosine)
+    x, y, z = matrix @ guide[near].T
     inside = (np.abs(x) <= across * z) & (np.abs(y) <= down * z)
     return np.asarray(near[inside][:count])
 
@@ -278,32 +341,30 @@ def expected_stars(
 def _expected_in(field: StarField, sky: SkyIndex, matrix: FloatArray, scale: float) -> npt.NDArray[np.intp]:
     """Return the indices of the guide stars that are expected in the field, the brightest first."""
     across, down = field.half_width
-    return expected_stars(sky, matrix, (across * scale, down * scale), int(1.3 * len(field)) + 8)
+    return expected_stars(sky, matrix, (across * scale, down * scale), _most_expected(len(field)))
 
 
-def _settle(
-    field: StarField,
-    sky: SkyIndex,
-    expected: npt.NDArray[np.intp],
-    start: Refinement,
-    searched: float,
-    settings: VerificationSettings,
-) -> tuple[_Matching, Refinement] | None:
+def _most_expected(observed: int) -> int:
+    """Return the maximum number of expected stars for a number of observed stars."""
+    return int(1.3 * observed) + 8
+
+
+def _settle(matcher: _Matcher, first: _Matching, start: Refinement) -> tuple[_Matching, Refinement] | None:
     """Return the matched stars and the attitude after repeated matching and refinement.
 
-    Matching and refinement of the attitude alternate until the matched stars no longer change. Returns None
-    if the refinement diverges.
+    Refinement of the attitude and matching alternate until the matched stars no longer change. `first` is the
+    matching at the attitude `start`. Returns None if the refinement diverges.
     """
-    refined, previous = start, None
-    for _ in range(settings.rounds):
-        matching = _match(field, sky, expected, refined, searched, settings)
-        if matching is None or (
-            previous is None and matching.log10_chance > settings.log10_false_alarm + _HOPELESS
-        ):
-            return None
-        if previous is not None and np.array_equal(previous.observed, matching.observed):
-            return matching, refined
-        previous = matching
+    field, sky = matcher.field, matcher.sky
+    matching, refined = first, start
+    for rounds in range(matcher.settings.rounds):
+        if rounds > 0:
+            following = matcher.again(refined, matching.expected)
+            if following is None:
+                return None
+            if np.array_equal(following.observed, matching.observed):
+                return following, refined
+            matching = following
         found = refine(
             field.direction[matching.observed],
             sky.stars.direction[matching.star],
@@ -320,48 +381,348 @@ def _settle(
         if lowest != highest and not lowest / slack <= found.scale <= highest * slack:
             return None
         refined = found
-    return (previous, refined) if previous is not None else None
+    return matching, refined
 
 
-def _match(
-    field: StarField,
-    sky: SkyIndex,
-    expected: npt.NDArray[np.intp],
-    at: Refinement,
+class _Matcher:
+    """The comparison of a field with the guide stars that are expected at candidate attitudes.
+
+    Attributes:
+        field: observed points of the frame.
+        sky: index of the guide stars.
+        searched: fraction of all attitudes covered by the search.
+        settings: settings of the verification.
+    """
+
+    def __init__(
+        self, field: StarField, sky: SkyIndex, searched: float, settings: VerificationSettings
+    ) -> None:
+        self.field, self.sky, self.searched, self.settings = field, sky, searched, settings
+        self._seen = np.ascontiguousarray(field.direction), np.ascontiguousarray(field.sigma)
+        self._facts = (
+            float(field.half_width[0]),
+            float(field.half_width[1]),
+            math.log(field.scale[1] / field.scale[0]),
+            float(searched),
+            np.array(settings.gates),
+            settings.least_matches,
+            settings.log10_false_alarm,
+        )
+
+    def first(self, matrices: FloatArray, scales: FloatArray, limit: float) -> _Matching | None:
+        """Return the matching at the first candidate with at most 10^`limit` chance matches, or None."""
+        return self._matching(matrices, scales, limit, np.empty(0, dtype=np.int64))
+
+    def again(self, at: Refinement, expected: IntArray) -> _Matching | None:
+        """Return the matching of `expected` stars at one attitude, or None if too few stars match."""
+        return self._matching(at.matrix[None], np.array([at.scale]), math.inf, expected)
+
+    def _matching(
+        self, matrices: FloatArray, scales: FloatArray, limit: float, expected: IntArray
+    ) -> _Matching | None:
+        candidate, observed, star, chance, expected = _first_match(
+            *self._seen,
+            np.ascontiguousarray(matrices),
+            scales,
+            *self._facts,
+            limit,
+            expected,
+            self.sky.stars.direction,
+            self.sky.coarse,
+            *self.sky.boxes,
+        )
+        return None if candidate < 0 else _Matching(candidate, observed, star, chance, expected)
+
+
+_Found = tuple[int, IntArray, IntArray, float, IntArray]
+
+
+def _first_match_numpy(
+    direction: FloatArray,
+    sigma: FloatArray,
+    matrices: FloatArray,
+    scales: FloatArray,
+    across: float,
+    down: float,
+    ln_scales: float,
     searched: float,
-    settings: VerificationSettings,
-) -> _Matching | None:
-    """Return the observed stars that match an expected star within a gate, for the most significant gate."""
-    if len(expected) < settings.least_matches:
-        return None
-    cosines = stretched(field.direction, at.scale) @ (at.matrix @ sky.stars.direction[expected].T)
-    nearest = cosines.argmax(axis=1)
-    rows = np.arange(len(nearest))
-    variance = (field.sigma * at.scale) ** 2
-    squared = 2.0 * (1.0 - cosines[rows, nearest]) / variance
-    squared[cosines.argmax(axis=0)[nearest] != rows] = np.inf
-    area = 4.0 * field.half_width[0] * field.half_width[1] * at.scale**2
-    chance = Chance(
-        len(field),
-        float(variance.mean()) / area,
-        4.0 * math.pi / area * searched,
-        math.log(field.scale[1] / field.scale[0]),
-        len(settings.gates),
-        settings.least_matches,
-        settings.log10_false_alarm,
-    )
-    best: _Matching | None = None
-    matched = settings.least_matches - 1
-    for gate in settings.gates:
+    gates: FloatArray,
+    least: int,
+    enough: float,
+    limit: float,
+    expected: IntArray,
+    guide: FloatArray,
+    coarse: npt.NDArray[np.float32],
+    by_box: npt.NDArray[np.int32],
+    begin_of_box: npt.NDArray[np.int32],
+) -> _Found:
+    """Return the parts of the `_Matching`, with the candidate -1 if no candidate matches well enough.
+
+    The guide stars at the first candidate are computed for each candidate if `expected` is empty.
+    """
+    given = len(expected) > 0
+    for number in range(len(scales)):
+        matrix, scale = matrices[number], float(scales[number])
+        if not given:
+            widths = across * scale, down * scale
+            expected = _expected_numpy(guide, coarse, matrix, widths, _most_expected(len(direction)))
+        if len(expected) < least:
+            continue
+        cosines = stretched(direction, scale) @ (matrix @ guide[expected].T)
+        nearest = cosines.argmax(axis=1)
+        rows = np.arange(len(nearest))
+        variance = (sigma * scale) ** 2
+        squared = 2.0 * (1.0 - cosines[rows, nearest]) / variance
+        squared[cosines.argmax(axis=0)[nearest] != rows] = np.inf
+        area = 4.0 * across * down * scale**2
+        chance = Chance(
+            len(direction),
+            float(variance.mean()) / area,
+            4.0 * math.pi / area * searched,
+            ln_scales,
+            len(gates),
+            least,
+            enough,
+        )
+        best, matched, bound = np.empty(0, dtype=np.int64), least - 1, math.inf
+        for gate in gates.tolist():
+            within = np.flatnonzero(squared <= gate * gate)
+            # A match within a wider gate is less significant unless it contains more stars.
+            if len(within) <= matched:
+                continue
+            matched = len(within)
+            value = chance.log10(gate, within.tolist(), nearest[within].tolist())
+            if not len(best) or value < bound:
+                best, bound = within, value
+        if len(best) and bound <= limit:
+            return number, best, expected[nearest[best]], bound, expected
+    nothing_found = np.empty(0, dtype=np.int64)
+    return -1, nothing_found, nothing_found, math.inf, nothing_found
+
+
+@compiled_form_of(_first_match_numpy)
+def _first_match(
+    direction: FloatArray,
+    sigma: FloatArray,
+    matrices: FloatArray,
+    scales: FloatArray,
+    across: float,
+    down: float,
+    ln_scales: float,
+    searched: float,
+    gates: FloatArray,
+    least: int,
+    enough: float,
+    limit: float,
+    expected: IntArray,
+    guide: FloatArray,
+    coarse: npt.NDArray[np.float32],
+    by_box: npt.NDArray[np.int32],
+    begin_of_box: npt.NDArray[np.int32],
+) -> _Found:
+    given, observed = len(expected) > 0, len(direction)
+    seen, nearest, squared = np.empty((observed, 3)), np.empty(observed, dtype=np.int64), np.empty(observed)
+    most = _most_stars(observed)
+    for number in range(len(scales)):
+        scale = scales[number]
+        if not given:
+            expected = _inside(
+                matrices[number], across * scale, down * scale, most, guide, by_box, begin_of_box
+            )
+        if len(expected) < least:
+            continue
+        _stretch(direction, scale, seen)
+        _pair(seen, sigma, scale, matrices[number], guide, expected, nearest, squared)
+        mean = 0.0
+        for k in range(observed):
+            mean += (sigma[k] * scale) ** 2 / observed
+        area = 4.0 * across * down * scale * scale
+        gate, bound = _best_gate(
+            squared, nearest, gates, least, enough, mean / area, 4.0 * math.pi / area * searched, ln_scales
+        )
+        if gate > 0.0 and bound <= limit:
+            best = np.flatnonzero(squared <= gate * gate)
+            return number, best, expected[nearest[best]], bound, expected
+    nothing_found = np.empty(0, dtype=np.int64)
+    return -1, nothing_found, nothing_found, math.inf, nothing_found
+
+
+@loop_helper
+def _most_stars(observed: int) -> int:
+    return int(1.3 * observed) + 8
+
+
+@loop_helper
+def _stretch(direction: FloatArray, scale: float, seen: FloatArray) -> None:
+    """Write unit vectors with their tangents multiplied by `scale` to `seen` (n, 3)."""
+    squared = scale * scale
+    for k in range(len(direction)):
+        z = direction[k, 2]
+        shrink = 1.0 / math.sqrt(squared + (1.0 - squared) * z * z)
+        seen[k, 0] = direction[k, 0] * scale * shrink
+        seen[k, 1] = direction[k, 1] * scale * shrink
+        seen[k, 2] = z * shrink
+
+
+@loop_helper
+def _inside(
+    matrix: FloatArray,
+    across: float,
+    down: float,
+    count: int,
+    guide: FloatArray,
+    by_box: npt.NDArray[np.int32],
+    begin_of_box: npt.NDArray[np.int32],
+) -> IntArray:
+    """Return the indices of the `count` brightest guide stars in the field, as `expected_stars` does."""
+    cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
+    chord = math.sqrt(2.0 - 2.0 * cosine)
+    brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
+    lowest, highest = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
+    for axis in range(3):
+        lowest[axis] = max(int((matrix[2, axis] - chord + 1.0) * (0.5 * BOXES)), 0)
+        highest[axis] = min(int((matrix[2, axis] + chord + 1.0) * (0.5 * BOXES)), BOXES - 1)
+    found, stars = 0, np.empty(256, dtype=np.int64)
+    for i in range(lowest[0], highest[0] + 1):
+        for j in range(lowest[1], highest[1] + 1):
+            for k in range(lowest[2], highest[2] + 1):
+                box = (i * BOXES + j) * BOXES + k
+                for at in range(begin_of_box[box], begin_of_box[box + 1]):
+                    star = by_box[at]
+                    if star >= brightest:
+                        break
+                    gx, gy, gz = guide[star, 0], guide[star, 1], guide[star, 2]
+                    z = matrix[2, 0] * gx + matrix[2, 1] * gy + matrix[2, 2] * gz
+                    if z <= cosine:
+                        continue
+                    if abs(matrix[0, 0] * gx + matrix[0, 1] * gy + matrix[0, 2] * gz) > across * z:
+                        continue
+                    if abs(matrix[1, 0] * gx + matrix[1, 1] * gy + matrix[1, 2] * gz) > down * z:
+                        continue
+                    if found == len(stars):
+                        stars = np.concatenate((stars, np.empty_like(stars)))
+                    stars[found] = star
+                    found += 1
+    return np.sort(stars[:found])[:count].copy()
+
+
+@loop_helper
+def _pair(
+    seen: FloatArray,
+    sigma: FloatArray,
+    scale: float,
+    matrix: FloatArray,
+    guide: FloatArray,
+    expected: IntArray,
+    nearest: IntArray,
+    squared: FloatArray,
+) -> None:
+    """Write the nearest expected star of each observed star and its squared distance in standard deviations.
+
+    The distance is infinite for an observed star that is not the nearest one of its nearest expected star.
+    """
+    closest, owner = np.full(len(seen), -2.0), np.zeros(len(expected), dtype=np.int64)
+    for e in range(len(expected)):
+        gx, gy, gz = guide[expected[e], 0], guide[expected[e], 1], guide[expected[e], 2]
+        x = matrix[0, 0] * gx + matrix[0, 1] * gy + matrix[0, 2] * gz
+        y = matrix[1, 0] * gx + matrix[1, 1] * gy + matrix[1, 2] * gz
+        z = matrix[2, 0] * gx + matrix[2, 1] * gy + matrix[2, 2] * gz
+        best = -2.0
+        for k in range(len(seen)):
+            cosine = seen[k, 0] * x + seen[k, 1] * y + seen[k, 2] * z
+            if cosine > closest[k]:
+                closest[k], nearest[k] = cosine, e
+            if cosine > best:
+                best, owner[e] = cosine, k
+    for k in range(len(seen)):
+        squared[k] = 2.0 * (1.0 - closest[k]) / (sigma[k] * scale) ** 2
+        if owner[nearest[k]] != k:
+            squared[k] = math.inf
+
+
+@loop_helper
+def _best_gate(
+    squared: FloatArray,
+    nearest: IntArray,
+    gates: FloatArray,
+    least: int,
+    enough: float,
+    spread: float,
+    fields: float,
+    scales: float,
+) -> tuple[float, float]:
+    """Return the most significant gate and log10 of its chance matches; the gate is 0 if too few match."""
+    best, bound, matched = 0.0, math.inf, least - 1
+    for gate in gates:
         within = np.flatnonzero(squared <= gate * gate)
-        # A match within a wider gate is less significant unless it contains more stars.
         if len(within) <= matched:
             continue
         matched = len(within)
-        value = chance.log10(gate, within.tolist(), nearest[within].tolist())
-        if best is None or value < best.log10_chance:
-            best = _Matching(within, expected[nearest[within]], value)
+        ranked = np.argsort(nearest[within])
+        value = _log10_chance(
+            gate, within[ranked], nearest[within[ranked]], len(squared), spread, fields, scales, len(gates),
+            least, enough,
+        )  # fmt: skip
+        if best == 0.0 or value < bound:
+            best, bound = gate, value
+    return best, bound
+
+
+@loop_helper
+def _log10_chance(
+    gate: float,
+    stars: IntArray,
+    ranks: IntArray,
+    observed: int,
+    spread: float,
+    fields: float,
+    scales: float,
+    choices: int,
+    least: int,
+    enough: float,
+) -> float:
+    """Return what `Chance.log10` returns, for matched stars (k,) in ascending order of their `ranks`."""
+    best = math.inf
+    for matched in range(len(stars), least - 1, -1):
+        expected = ranks[matched - 1] + 1
+        leverage = 2.0 / matched if matched > 2 else 0.5
+        chance = min(expected * math.pi * gate * gate * spread / (1.0 - leverage) ** 2, 0.5)
+        if matched <= observed * chance:
+            value = math.log10(fields * expected)
+        else:
+            ring = 2.0 * math.pi / 3.0 * expected * (scales + 2.0 * gate * math.sqrt(3.0 * spread))
+            lost = observed - matched
+            value = math.lgamma(observed + 1.0) - math.lgamma(matched + 1.0) - math.lgamma(lost + 1.0)
+            value += (matched - 2) * math.log(chance) + lost * math.log1p(-chance)
+            value -= math.log1p(-lost / (matched + 1.0) * chance / (1.0 - chance))
+            value = (value + math.log(fields * expected * ring)) / math.log(10.0)
+        value += math.log10(choices * math.pi**2 / 6.0 * (expected - matched + 1.0) ** 2)
+        if enough < value < enough + 8.0 and matched <= _MOST_ORDERED:
+            value += min(0.0, math.log10(2.0 * _share_ordered(stars[:matched])))
+        best = min(best, value)
+        if best < enough - 2.0:
+            break
     return best
+
+
+@loop_helper
+def _share_ordered(sequence: IntArray) -> float:
+    """Return what `order_probability` returns."""
+    length, inversions = len(sequence), 0
+    for place in range(length):
+        for other in range(place + 1, length):
+            if sequence[place] > sequence[other]:
+                inversions += 1
+    # Each further item multiplies the number of permutations, and adds 0 to `more` inversions.
+    share = np.zeros(length * (length - 1) // 2 + 1)
+    share[0] = 1.0
+    for more in range(1, length):
+        for total in range(more * (more + 1) // 2, -1, -1):
+            value = 0.0
+            for part in range(max(0, total - more), total + 1):
+                value += share[part]
+            share[total] = value / (more + 1.0)
+    return float(share[: inversions + 1].sum())
 
 
 def _identified(field: StarField, matching: _Matching, refined: Refinement) -> StarMatch:

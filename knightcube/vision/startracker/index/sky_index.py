@@ -214,6 +214,8 @@ SIZE_UNIT = 2.0**-SIZE_BITS
 """Resolution with which a triangle's key stores the longest side, a chord below 1."""
 RUN_BITS = 12
 """Binary logarithm of the interval of key values between two entries of `TriangleIndex.below`."""
+BOXES = 32
+"""Number of boxes along each axis of the cube in which guide stars are found by their direction."""
 TIE = 1e-9
 """Relative tolerance in comparisons of a triangle's side with a limit, which the side may exactly equal."""
 LEAST_RATIO = 0.1
@@ -253,6 +255,14 @@ class TriangleIndex:
         run = self.key >> np.uint32(RUN_BITS)
         count = np.bincount(run, minlength=2 * CELLS * CELLS << (SIZE_BITS - RUN_BITS))
         return np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
+
+    @cached_property
+    def table(self) -> tuple[npt.NDArray[Any], ...]:
+        """The arrays `key`, `corners`, `shape` and `below` as contiguous, read-only arrays."""
+        arrays = [np.ascontiguousarray(a).view() for a in (self.key, self.corners, self.shape, self.below)]
+        for array in arrays:
+            array.flags.writeable = False
+        return tuple(arrays)
 
 
 def reach(direction: FloatArray, rank: int, farthest: float, least: float = 0.0) -> FloatArray:
@@ -457,6 +467,19 @@ class SkyIndex:
     def coarse(self) -> npt.NDArray[np.float32]:
         """The unit vectors to the guide stars as (3, n), float32, for a fast search near a boresight."""
         return np.ascontiguousarray(self.stars.direction.T, dtype=np.float32)
+
+    @cached_property
+    def boxes(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+        """The guide stars (n,) sorted by box, and the number of stars before each box.
+
+        The cube around the unit sphere is divided into `BOXES` boxes along each axis. The stars of a box are
+        in order of brightness, the brightest first.
+        """
+        x, y, z = np.minimum(((self.stars.direction + 1.0) * (0.5 * BOXES)).astype(np.int64), BOXES - 1).T
+        box = (x * BOXES + y) * BOXES + z
+        count = np.bincount(box, minlength=BOXES**3)
+        begin = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
+        return np.argsort(box, kind="stable").astype(np.int32), begin
 
     def at(self, epoch: float) -> SkyIndex:
         """Return the index with the directions of the stars at the Julian year `epoch`.
