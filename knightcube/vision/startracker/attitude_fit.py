@@ -240,7 +240,7 @@ def _refined_numpy(
     # Weighted predictions, residuals and scale slopes; their 9 x 9 Gram matrix holds all normal equations.
     rows = np.zeros((len(observed), 9))
     normal = np.zeros((parameters, parameters))
-    failed = False, matrix, scale, normal, np.zeros(len(observed))
+    failed = False, matrix, scale, np.zeros((parameters, parameters)), np.zeros(len(observed))
     for _ in range(_MOST_STEPS):
         b = stretched(observed, scale)
         predicted = reference @ matrix.T
@@ -292,6 +292,7 @@ def _refined(
 ) -> _Refined:
     parameters = 4 if free_scale else 3
     weight = 1.0 / (sigma * scale)
+    failed = False, matrix, scale, np.zeros((parameters, parameters)), np.zeros(len(observed))
     matrix = matrix.copy()
     rows = np.zeros((len(observed), 9))
     step, squares = np.zeros(4), np.zeros(len(observed))
@@ -304,7 +305,7 @@ def _refined(
             for j in range(parameters):
                 information = max(information, normal[i, j])
         if not _inverted(normal, covariance):
-            return False, matrix, scale, covariance, squares
+            return failed
         largest, longest = 0.0, 0.0
         for i in range(parameters):
             step[i] = 0.0
@@ -313,7 +314,7 @@ def _refined(
                 largest = max(largest, covariance[i, j])
             longest = max(longest, abs(step[i]))
         if not 0.0 < information * largest * _LEAST_INFORMATION < 1.0 or not longest < 1.0:
-            return False, matrix, scale, covariance, squares
+            return failed
         _turn(matrix, step)
         if free_scale:
             scale *= math.exp(step[3])

@@ -16,9 +16,9 @@ is divided into steps that are so narrow that the side ratios stay within the to
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -71,12 +71,13 @@ class BatchSizes:
     spread: tuple[int, ...] = (300, 1000)
 
 
-def batches_of(field: StarField, sizes: BatchSizes, steps: int) -> Iterator[tuple[IntArray, bool]]:
+def batches_of(
+    field: StarField, sizes: BatchSizes, steps: int, spread: Callable[[], list[IntArray]]
+) -> Iterator[tuple[IntArray, bool]]:
     """Yield batches of triangles (t, 3), and whether each batch includes faint stars.
 
     The size of a batch of the brightest stars is divided by the square root of the number of `steps` of
-    scale. The last batch includes triangles of neighbouring stars, for points that are not sorted by
-    brightness.
+    scale. The batches of many stars are those that `spread` returns; most frames need none of them.
     """
     brightest = triples(min(len(field), _BRIGHTEST))
     begin = 0
@@ -85,12 +86,20 @@ def batches_of(field: StarField, sizes: BatchSizes, steps: int) -> Iterator[tupl
         if end > begin:
             yield brightest[begin:end], False
         begin = end
-    if len(field) <= _BRIGHTEST and begin == len(brightest):
-        return
-    spread = np.split(middle_sized(field)[: sum(sizes.spread)], np.cumsum(sizes.spread)[:-1])
+    if len(field) > _BRIGHTEST or begin < len(brightest):
+        yield from ((triangles, True) for triangles in spread() if len(triangles))
+
+
+def spread_batches(field: StarField, sizes: BatchSizes) -> list[IntArray]:
+    """Return batches of triangles (t, 3) of many stars.
+
+    The last batch includes triangles of neighbouring stars, for points that are not sorted by brightness. The
+    mirrored field has the same batches.
+    """
+    batches = np.split(middle_sized(field)[: sum(sizes.spread)], np.cumsum(sizes.spread)[:-1])
     if len(field) > _BRIGHTEST:
-        spread[-1] = np.concatenate([spread[-1], neighbours(field)])
-    yield from ((triangles, True) for triangles in spread if len(triangles))
+        batches[-1] = np.concatenate([batches[-1], neighbours(field)])
+    return batches
 
 
 def middle_sized(field: StarField) -> IntArray:
@@ -123,7 +132,10 @@ def neighbours(field: StarField) -> IntArray:
     corners = np.stack(
         np.broadcast_arrays(np.arange(len(near))[:, None], near[:, one], near[:, two]), axis=-1
     ).reshape(-1, 3)
-    return np.unique(np.sort(corners, axis=1), axis=0)
+    one, two, three = np.sort(corners, axis=1).T
+    packed = np.unique((one * len(field) + two) * len(field) + three)
+    pair, three = np.divmod(packed, len(field))
+    return np.stack([*np.divmod(pair, len(field)), three], axis=-1)
 
 
 _LARGEST_SIZE = (1 << SIZE_BITS) - 1
@@ -389,11 +401,20 @@ def _matching_entries(
     """Return observed stars, guide stars and scales of the entries in `runs` that match their triangle."""
     observed, star = np.empty((256, 3), dtype=np.uint32), np.empty((256, 3), dtype=np.uint32)
     scale, found = np.empty(256), 0
+    longest_run = 0
+    for run in range(len(runs)):
+        longest_run = max(longest_run, runs[run, 1] - runs[run, 0])
+    near = np.empty(longest_run + 1, dtype=np.int64)
     for run in range(len(runs)):
         begin, end, low, high, lower, upper, query = runs[run]
+        count = 0
+        # Without branches, which the processor cannot predict here, the loop takes a fraction of the time.
         for k in range(begin, end):
-            if shape[k, 0] < low or shape[k, 0] > high or shape[k, 1] < lower or shape[k, 1] > upper:
-                continue
+            one, two = np.int64(shape[k, 0]), np.int64(shape[k, 1])
+            near[count] = k
+            count += int((one >= low) & (one <= high) & (two >= lower) & (two <= upper))
+        for at in range(count):
+            k = near[at]
             longest = np.int64(key[k] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
             if not limits[query, 0] <= longest <= limits[query, 1]:
                 continue
@@ -563,26 +584,31 @@ def identify(observed: StarField, sky: SkyIndex, settings: IdentificationSetting
     """Return the identified stars and the attitude of a frame, or a status that states why there are none."""
     if len(observed) < settings.verification.least_matches:
         return nothing(observed, MatchStatus.TOO_FEW_STARS)
-    answer = _search(observed, sky, settings, 1.0)
+    spread = cache(lambda: spread_batches(observed, settings.batches))
+    answer = _search(observed, sky, settings, 1.0, spread)
     if answer.status is not MatchStatus.IDENTIFIED and settings.mirror:
-        answer = _search(observed.mirrored(), sky, settings, _RARE)
+        answer = _search(observed.mirrored(), sky, settings, _RARE, spread)
         answer = replace(answer, mirrored=answer.status is MatchStatus.IDENTIFIED)
     lowest, highest = observed.scale
     if answer.status is not MatchStatus.IDENTIFIED and 1.0 < highest / lowest < settings.hint_error**2:
         wider = lowest / settings.hint_error, highest * settings.hint_error
-        answer = _search(replace(observed, scale=wider), sky, settings, _RARE)
+        answer = _search(replace(observed, scale=wider), sky, settings, _RARE, spread)
     return answer
 
 
 def _search(
-    observed: StarField, sky: SkyIndex, settings: IdentificationSettings, searched: float
+    observed: StarField,
+    sky: SkyIndex,
+    settings: IdentificationSettings,
+    searched: float,
+    spread_triangles: Callable[[], list[IntArray]],
 ) -> StarMatch:
     """Return the identification of a field, without trying the mirrored field or other scales."""
     steps = ScaleSteps.of(observed, settings.distortion)
     found: list[TriangleMatches] = []
     tried = np.empty((0, 2), dtype=np.int64)
     work = 0
-    for triangles, spread in batches_of(observed, settings.batches, len(steps)):
+    for triangles, spread in batches_of(observed, settings.batches, len(steps), spread_triangles):
         share = _OF_SPREAD if spread else 1.0
         finds, read = look_up(
             observed,
@@ -741,8 +767,9 @@ def _counted_votes(
         part = int(math.log(scale[k]) * _BINS_PER_LN_SCALE - least)
         for c in range(3):
             code = (np.int64(star[k, c]) * 1021 + np.int64(observed[k, c])) * 257 + part
-            # The product of 64-bit integers wraps around, but its lower 32 bits are those of uint32.
-            slot[k, c] = (((code & 0xFFFFFFFF) * 0x9E3779B1) & 0xFFFFFFFF) >> (32 - bits)
+            # The product modulo 2^32, computed in two parts that 64-bit integers can hold.
+            high = ((code >> 16) & 0xFFFF) * 2654435761 & 0xFFFF
+            slot[k, c] = ((code & 0xFFFF) * 2654435761 + (high << 16) & 0xFFFFFFFF) >> (32 - bits)
             count[slot[k, c]] += 1
     votes = np.empty(len(scale), dtype=np.int64)
     for k in range(len(scale)):

@@ -40,7 +40,7 @@ from knightcube.vision.startracker.attitude_fit import (
     refine,
     stretched,
 )
-from knightcube.vision.startracker.index.sky_index import BOXES, SkyIndex
+from knightcube.vision.startracker.index.sky_index import SkyIndex
 
 _MOST_ORDERED = 12
 
@@ -399,7 +399,8 @@ class _Matcher:
     ) -> None:
         self.field, self.sky, self.searched, self.settings = field, sky, searched, settings
         self._seen = np.ascontiguousarray(field.direction), np.ascontiguousarray(field.sigma)
-        self._facts = (
+        self._guide: tuple[Any, ...] = (sky.stars.direction, sky.coarse, *sky.boxes)
+        self._facts: tuple[Any, ...] = (
             float(field.half_width[0]),
             float(field.half_width[1]),
             math.log(field.scale[1] / field.scale[0]),
@@ -420,17 +421,9 @@ class _Matcher:
     def _matching(
         self, matrices: FloatArray, scales: FloatArray, limit: float, expected: IntArray
     ) -> _Matching | None:
-        candidate, observed, star, chance, expected = _first_match(
-            *self._seen,
-            np.ascontiguousarray(matrices),
-            scales,
-            *self._facts,
-            limit,
-            expected,
-            self.sky.stars.direction,
-            self.sky.coarse,
-            *self.sky.boxes,
-        )
+        candidates = np.ascontiguousarray(matrices), scales
+        given: tuple[Any, ...] = (*self._seen, *candidates, *self._facts, limit, expected, *self._guide)
+        candidate, observed, star, chance, expected = _first_match(*given)
         return None if candidate < 0 else _Matching(candidate, observed, star, chance, expected)
 
 
@@ -454,6 +447,7 @@ def _first_match_numpy(
     guide: FloatArray,
     coarse: npt.NDArray[np.float32],
     by_box: npt.NDArray[np.int32],
+    placed: FloatArray,
     begin_of_box: npt.NDArray[np.int32],
 ) -> _Found:
     """Return the parts of the `_Matching`, with the candidate -1 if no candidate matches well enough.
@@ -518,6 +512,7 @@ def _first_match(
     guide: FloatArray,
     coarse: npt.NDArray[np.float32],
     by_box: npt.NDArray[np.int32],
+    placed: FloatArray,
     begin_of_box: npt.NDArray[np.int32],
 ) -> _Found:
     given, observed = len(expected) > 0, len(direction)
@@ -527,7 +522,7 @@ def _first_match(
         scale = scales[number]
         if not given:
             expected = _inside(
-                matrices[number], across * scale, down * scale, most, guide, by_box, begin_of_box
+                matrices[number], across * scale, down * scale, most, by_box, placed, begin_of_box
             )
         if len(expected) < least:
             continue
@@ -570,28 +565,29 @@ def _inside(
     across: float,
     down: float,
     count: int,
-    guide: FloatArray,
     by_box: npt.NDArray[np.int32],
+    placed: FloatArray,
     begin_of_box: npt.NDArray[np.int32],
 ) -> IntArray:
     """Return the indices of the `count` brightest guide stars in the field, as `expected_stars` does."""
     cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
     chord = math.sqrt(2.0 - 2.0 * cosine)
     brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
+    boxes = round((len(begin_of_box) - 1) ** (1.0 / 3.0))
     lowest, highest = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
     for axis in range(3):
-        lowest[axis] = max(int((matrix[2, axis] - chord + 1.0) * (0.5 * BOXES)), 0)
-        highest[axis] = min(int((matrix[2, axis] + chord + 1.0) * (0.5 * BOXES)), BOXES - 1)
+        lowest[axis] = max(int((matrix[2, axis] - chord + 1.0) * (0.5 * boxes)), 0)
+        highest[axis] = min(int((matrix[2, axis] + chord + 1.0) * (0.5 * boxes)), boxes - 1)
     found, stars = 0, np.empty(256, dtype=np.int64)
     for i in range(lowest[0], highest[0] + 1):
         for j in range(lowest[1], highest[1] + 1):
             for k in range(lowest[2], highest[2] + 1):
-                box = (i * BOXES + j) * BOXES + k
+                box = (i * boxes + j) * boxes + k
                 for at in range(begin_of_box[box], begin_of_box[box + 1]):
                     star = by_box[at]
                     if star >= brightest:
                         break
-                    gx, gy, gz = guide[star, 0], guide[star, 1], guide[star, 2]
+                    gx, gy, gz = placed[at, 0], placed[at, 1], placed[at, 2]
                     z = matrix[2, 0] * gx + matrix[2, 1] * gy + matrix[2, 2] * gz
                     if z <= cosine:
                         continue

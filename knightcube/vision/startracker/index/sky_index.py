@@ -214,8 +214,8 @@ SIZE_UNIT = 2.0**-SIZE_BITS
 """Resolution with which a triangle's key stores the longest side, a chord below 1."""
 RUN_BITS = 12
 """Binary logarithm of the interval of key values between two entries of `TriangleIndex.below`."""
-BOXES = 32
-"""Number of boxes along each axis of the cube in which guide stars are found by their direction."""
+# Number of boxes along each axis of the cube in which guide stars are found by their direction.
+_BOXES = 20
 TIE = 1e-9
 """Relative tolerance in comparisons of a triangle's side with a limit, which the side may exactly equal."""
 LEAST_RATIO = 0.1
@@ -469,17 +469,18 @@ class SkyIndex:
         return np.ascontiguousarray(self.stars.direction.T, dtype=np.float32)
 
     @cached_property
-    def boxes(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-        """The guide stars (n,) sorted by box, and the number of stars before each box.
+    def boxes(self) -> tuple[npt.NDArray[np.int32], FloatArray, npt.NDArray[np.int32]]:
+        """The guide stars (n,) sorted by box, their directions (n, 3), and the number before each box.
 
-        The cube around the unit sphere is divided into `BOXES` boxes along each axis. The stars of a box are
+        The cube around the unit sphere is divided into boxes, as many along each axis. The stars of a box are
         in order of brightness, the brightest first.
         """
-        x, y, z = np.minimum(((self.stars.direction + 1.0) * (0.5 * BOXES)).astype(np.int64), BOXES - 1).T
-        box = (x * BOXES + y) * BOXES + z
-        count = np.bincount(box, minlength=BOXES**3)
+        x, y, z = np.minimum(((self.stars.direction + 1.0) * (0.5 * _BOXES)).astype(np.int64), _BOXES - 1).T
+        box = (x * _BOXES + y) * _BOXES + z
+        count = np.bincount(box, minlength=_BOXES**3)
         begin = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
-        return np.argsort(box, kind="stable").astype(np.int32), begin
+        star = np.argsort(box, kind="stable").astype(np.int32)
+        return star, self.stars.direction[star], begin
 
     def at(self, epoch: float) -> SkyIndex:
         """Return the index with the directions of the stars at the Julian year `epoch`.

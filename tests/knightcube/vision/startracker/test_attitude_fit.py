@@ -22,6 +22,7 @@ from knightcube.vision.startracker.attitude_fit import (
     DistortedFit,
     Refinement,
     StarField,
+    _refined,
     fit_with_distortion,
     inflation,
     refine,
@@ -30,6 +31,7 @@ from knightcube.vision.startracker.attitude_fit import (
     turned,
 )
 from knightcube.vision.startracker.index.sky_index import SkyIndex
+from tests.support.compiled_forms import assert_forms_agree
 
 SIGMA = 1e-4
 
@@ -232,3 +234,16 @@ def test_scatter_beyond_the_sigmas_increases_all_but_the_prior() -> None:
     assert proud is not None
     ratio = np.sqrt(np.diag(proud.refined.covariance) / np.diag(honest.refined.covariance))
     assert ratio == pytest.approx(np.ones(4), rel=0.15)
+
+
+@pytest.mark.parametrize("free_scale", [True, False])
+def test_all_forms_of_the_fit_give_the_same_attitude(free_scale: bool) -> None:
+    rng = np.random.default_rng(11)
+    for count in (3, 4, 40):
+        seen = directions(count, seed=count)
+        turn = attitude_matrix(from_rotation_vector(rng.normal(0.0, 0.02, 3)))
+        noisy = np.asarray(normalise(seen + rng.normal(0.0, SIGMA, seen.shape)))
+        sigma = SIGMA * rng.uniform(0.5, 2.0, count)
+        assert_forms_agree(_refined, noisy, seen, sigma, turn, 1.01, free_scale, relative=1e-6)
+    same = np.repeat(directions(1), 4, axis=0)
+    assert_forms_agree(_refined, same, same, np.full(4, SIGMA), np.eye(3), 1.0, free_scale)

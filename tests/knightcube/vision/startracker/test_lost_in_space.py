@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from knightcube.astro.quaternion import angle_between, attitude_matrix
-from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch, _refined
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify, neighbours, triples
+from knightcube.vision.startracker.lost_in_space import (
+    IdentificationSettings,
+    ScaleSteps,
+    _choose,
+    _look_up,
+    identify,
+    neighbours,
+    triples,
+)
+from knightcube.vision.startracker.verification import _first_match
 from tests.pace import ordinary_seconds
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.star_lists import ListKind, StarList, configurations, draw, draw_random
 
 SKY = default_index()
@@ -245,3 +256,55 @@ def test_all_triangles_of_a_field_occur_once_the_brightest_first() -> None:
     assert len({tuple(row) for row in found.tolist()}) == len(found) == 20
     assert all(a < b < c for a, b, c in found.tolist())
     assert found[:, 2].tolist() == sorted(found[:, 2].tolist())
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "most"),
+    [(ListKind(false_stars=2), 1, 600_000), (ListKind(known_deg=None), 2, 600_000), (ListKind(), 3, 500)],
+)
+def test_all_forms_find_the_same_matches_and_candidates_in_the_same_order(
+    kind: ListKind, seed: int, most: int
+) -> None:
+    field = _drawn(kind, seed).field()
+    steps = ScaleSteps.of(field, 0.0015)
+    scales = np.stack([steps.middle, steps.lowest, steps.highest])
+    seen = field.direction, field.sigma
+    looked_up: tuple[Any, ...] = (
+        *seen,
+        scales,
+        triples(min(len(field), 12))[:60],
+        3.0,
+        0.0015,
+        most,
+        *SKY.triangles.table,
+    )
+    assert_forms_agree(_look_up, *looked_up)
+    observed, star, scale, read = _look_up.numpy_form(*looked_up)
+    assert 0 < read <= most
+    tried = np.stack([observed[0], star[0]], axis=1).astype(np.int64)
+    for known in (tried[:0], tried):
+        chosen = (field.direction, SKY.stars.direction, observed, star, scale, known, 12, *field.scale)
+        assert_forms_agree(_choose, *chosen)
+        assert len(_choose.numpy_form(*chosen)[1]) > 0
+
+
+@pytest.mark.parametrize("known_deg", [0.1, None])
+def test_identification_by_compiled_forms_gives_the_same_answers(
+    known_deg: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    kind = ListKind(noise_px=0.3, false_stars=3, known_deg=known_deg)
+    fields = [_drawn(kind, seed).field() for seed in range(4)]
+    fields += [draw_random(kind, count, np.random.default_rng([7, count])).field() for count in (8, 25)]
+    fields.append(_drawn(replace(kind, mirrored=True), 9).field())
+    expected = [identify(field, SKY) for field in fields]
+    for hot in (_look_up, _choose, _first_match, _refined):
+        monkeypatch.setattr(hot, "_chosen", hot.compiled_form())
+    for field, one in zip(fields, expected, strict=True):
+        other = identify(field, SKY)
+        assert (other.status, other.mirrored) == (one.status, one.mirrored)
+        np.testing.assert_array_equal(other.star, one.star)
+        if one.fix is not None and other.fix is not None:
+            np.testing.assert_allclose(other.fix.quaternion, one.fix.quaternion, atol=1e-12)
+            np.testing.assert_allclose(other.fix.covariance, one.fix.covariance, rtol=1e-6)
+    assert {one.status for one in expected} == {MatchStatus.IDENTIFIED, MatchStatus.NO_MATCH}

@@ -20,7 +20,14 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.vision.startracker.attitude_fit import MatchStatus
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.verification import Chance, order_probability, track, verify
+from knightcube.vision.startracker.verification import (
+    Chance,
+    _first_match,
+    order_probability,
+    track,
+    verify,
+)
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.star_lists import ListKind, StarList, draw
 
 
@@ -146,3 +153,18 @@ def test_few_stars_that_verify_near_a_prior_may_be_chance_in_the_whole_sky() -> 
             convinced[case] += found.status is MatchStatus.IDENTIFIED
     assert convinced["tracking"] >= 12
     assert convinced["lost"] <= 5
+
+
+@pytest.mark.parametrize("limit", [2.5, math.inf, -400.0])
+def test_all_forms_match_the_same_stars_of_the_same_candidate(limit: float) -> None:
+    drawn = draw(ListKind(noise_px=0.4, false_stars=4), SKY.stars, np.random.default_rng([41, 3]))
+    field, rng = drawn.field(), np.random.default_rng(8)
+    true = attitude_matrix(drawn.attitude)
+    strange = [attitude_matrix(normalise(rng.normal(size=4))) for _ in range(5)]
+    scales = np.array([*rng.uniform(0.7, 1.5, 5), 1.0])
+    facts = 0.1, 0.1, math.log(field.scale[1] / field.scale[0]), 1.0, np.array([3.5, 8.0, 20.0]), 4, -4.5
+    table = SKY.stars.direction, SKY.coarse, *SKY.boxes
+    for matrices in (np.array([*strange, true]), np.array([true, *strange])):
+        for expected in (np.empty(0, dtype=np.int64), np.unique(drawn.star[drawn.star >= 0])):
+            given = field.direction, field.sigma, matrices, scales, *facts, limit, expected, *table
+            assert_forms_agree(_first_match, *given, relative=1e-6)
