@@ -153,7 +153,7 @@ class Refinement:
     def widened(self) -> Refinement:
         """Return the fit with its covariance increased if the residuals exceed their standard deviations."""
         factor = inflation(self.squares, len(self.covariance))
-        return replace(self, covariance=self.covariance * factor)
+        return self if factor == 1.0 else replace(self, covariance=self.covariance * factor)
 
 
 def stretched(direction: FloatArray, scale: float | FloatArray) -> FloatArray:

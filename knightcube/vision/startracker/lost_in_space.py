@@ -168,7 +168,10 @@ class ScaleSteps:
         lowest, highest = field.scale
         half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
         count = max(1, math.ceil((highest**2 - lowest**2) * half_way / (4.0 * tolerance)))
-        edges = np.sqrt(np.linspace(lowest**2, highest**2, count + 1))
+        if count == 1:
+            edges = np.array([math.sqrt(lowest**2), math.sqrt(highest**2)])
+        else:
+            edges = np.sqrt(np.linspace(lowest**2, highest**2, count + 1))
         return cls(np.sqrt(edges[:-1] * edges[1:]), edges[:-1], edges[1:])
 
 
@@ -246,7 +249,7 @@ def look_up(
     observed, star, scale, read = _look_up(
         np.ascontiguousarray(field.direction),
         np.ascontiguousarray(field.sigma),
-        np.stack([steps.middle, steps.lowest, steps.highest]),
+        np.array([steps.middle, steps.lowest, steps.highest]),
         np.ascontiguousarray(triangles),
         tolerance,
         distortion,
@@ -409,9 +412,10 @@ def _matching_entries(
         begin, end, low, high, lower, upper, query = runs[run]
         count = 0
         # Without branches, which the processor cannot predict here, the loop takes a fraction of the time.
-        for k in range(begin, end):
-            one, two = np.int64(shape[k, 0]), np.int64(shape[k, 1])
-            near[count] = k
+        places = shape[begin:end]
+        for k in range(len(places)):
+            one, two = np.int64(places[k, 0]), np.int64(places[k, 1])
+            near[count] = begin + k
             count += int((one >= low) & (one <= high) & (two >= lower) & (two <= upper))
         for at in range(count):
             k = near[at]

@@ -36,7 +36,6 @@ from knightcube.vision.startracker.attitude_fit import (
     StarField,
     StarMatch,
     fit_with_distortion,
-    inflation,
     refine,
     stretched,
 )
@@ -261,11 +260,11 @@ def _verified(field: StarField, matching: _Matcher, first: _Matching, start: Ref
     expected = found.expected
     # Distortion of an uncalibrated lens is fitted if bright stars do not match or residuals are too large.
     bright = _bright_matched(expected, found.star)
-    missed = not len(bright) or float(np.mean(bright)) < _FEW_MISSED
-    scattered = inflation(refined.squares, len(refined.covariance)) > 1.0
-    if field.scale[1] > field.scale[0] and (missed or scattered):
+    missed = not bright or sum(bright) < _FEW_MISSED * len(bright)
+    widened = refined.widened()
+    if field.scale[1] > field.scale[0] and (missed or widened is not refined):
         return _distorted(field, sky, found, refined)
-    return _identified(field, found, refined.widened())
+    return _identified(field, found, widened)
 
 
 def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> StarMatch:
@@ -279,13 +278,12 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
     return replace(answer, distortion=found.distortion, from_lens=found.from_lens)
 
 
-def _bright_matched(
-    expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]
-) -> npt.NDArray[np.bool_]:
-    """Return a mask of the matched stars, for the expected stars brighter than the median matched star."""
-    matched = (expected[:, None] == star).any(axis=1)
-    places = np.flatnonzero(matched)
-    return np.asarray(matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0])
+def _bright_matched(expected: npt.NDArray[np.integer[Any]], star: npt.NDArray[np.integer[Any]]) -> list[bool]:
+    """Return whether each expected star matches, for those brighter than the median matched star."""
+    known = set(star.tolist())
+    matched = [number in known for number in expected.tolist()]
+    places = [place for place, found in enumerate(matched) if found]
+    return matched[: places[(len(places) - 1) // 2] + 1] if places else []
 
 
 def _share_displaced(
@@ -295,7 +293,7 @@ def _share_displaced(
 
     The fraction that is expected by chance is subtracted from the result.
     """
-    matched = _bright_matched(expected, found.star)
+    matched = np.array(_bright_matched(expected, found.star), dtype=np.bool_)
     missed = sky.stars.direction[expected[: len(matched)][~matched]]
     unmatched = np.delete(found.seen, found.observed, axis=0)
     if not len(missed) or not len(unmatched):
@@ -362,7 +360,7 @@ def _settle(matcher: _Matcher, first: _Matching, start: Refinement) -> tuple[_Ma
             following = matcher.again(refined, matching.expected)
             if following is None:
                 return None
-            if np.array_equal(following.observed, matching.observed):
+            if following.observed.tobytes() == matching.observed.tobytes():
                 return following, refined
             matching = following
         found = refine(
