@@ -410,25 +410,28 @@ def _matching_entries(
     near = np.empty(longest_run + 1, dtype=np.int64)
     for run in range(len(runs)):
         begin, end, low, high, lower, upper, query = runs[run]
-        count = 0
+        shortest, longest = math.ceil(limits[query, 0] / SIZE_UNIT), math.floor(limits[query, 1] / SIZE_UNIT)
+        # The entries of a range are in the same cells, and are sorted by the longest side.
+        form = np.int64(key[begin]) & ~_LARGEST_SIZE if begin < end else 0
+        while begin < end and key[begin] < form + shortest:
+            begin += 1
+        while begin < end and key[end - 1] > form + longest:
+            end -= 1
+        places, count = shape[begin:end], 0
         # Without branches, which the processor cannot predict here, the loop takes a fraction of the time.
-        places = shape[begin:end]
         for k in range(len(places)):
             one, two = np.int64(places[k, 0]), np.int64(places[k, 1])
             near[count] = begin + k
             count += int((one >= low) & (one <= high) & (two >= lower) & (two <= upper))
         for at in range(count):
             k = near[at]
-            longest = np.int64(key[k] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
-            if not limits[query, 0] <= longest <= limits[query, 1]:
-                continue
             if found == len(scale):
                 observed = np.concatenate((observed, np.empty_like(observed)))
                 star = np.concatenate((star, np.empty_like(star)))
                 scale = np.concatenate((scale, np.empty_like(scale)))
             for c in range(3):
                 observed[found, c], star[found, c] = corners[query, c], star_of[k, c]
-            scale[found] = longest * limits[query, 2]
+            scale[found] = float(key[k] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT * limits[query, 2]
             found += 1
     return observed[:found].copy(), star[:found].copy(), scale[:found].copy()
 
