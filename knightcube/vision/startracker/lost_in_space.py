@@ -253,6 +253,7 @@ def look_up(
         np.ascontiguousarray(triangles),
         tolerance,
         distortion,
+        LEAST_RATIO,
         most,
         *sky.triangles.table,
     )
@@ -269,11 +270,13 @@ def _look_up_numpy(
     triangles: IntArray,
     tolerance: float,
     distortion: float,
+    least_ratio: float,
     most: int,
     key: npt.NDArray[np.uint32],
     star_of: npt.NDArray[np.uint16],
     shape: npt.NDArray[np.uint8],
     below: npt.NDArray[np.int32],
+    layout: IntArray,
 ) -> _Found:
     """Return observed stars, guide stars and scales of the matches, and the number of entries read."""
     scales = steps[0]
@@ -284,7 +287,7 @@ def _look_up_numpy(
     # The error of a side ratio follows from the errors of two directions and of the longest side.
     slack = (1.6 * tolerance) * spread * scales[step] / size + distortion
     ratio = sides[:, :2] / size[:, None]
-    usable = np.flatnonzero((slack <= CELL) & (ratio[:, 0] + slack >= LEAST_RATIO))
+    usable = np.flatnonzero((slack <= CELL) & (ratio[:, 0] + slack >= least_ratio))
     corners, size, left = corners[usable], size[usable], left[usable]
     slack, ratio, step = slack[usable], ratio[usable], step[usable]
     lowest = size * (steps[1] / scales)[step] * (1.0 - slack)
@@ -324,12 +327,15 @@ def _look_up(
     triangles: IntArray,
     tolerance: float,
     distortion: float,
+    least_ratio: float,
     most: int,
     key: npt.NDArray[np.uint32],
     star_of: npt.NDArray[np.uint16],
     shape: npt.NDArray[np.uint8],
     below: npt.NDArray[np.int32],
+    layout: IntArray,
 ) -> _Found:
+    cells, unit = layout[0], 1.0 / (1 << layout[2])
     seen = _at_scales(direction, steps[0])
     # At most three cells of each of the two side ratios agree with a triangle of sufficient accuracy.
     runs = np.empty((9 * len(triangles) * len(seen), 7), dtype=np.int64)
@@ -341,24 +347,24 @@ def _look_up(
         for s in range(len(seen)):
             left = _sorted_sides(seen[s], triangles[t], side, corners[queries])
             a, b, c = sigma[corners[queries, 0]], sigma[corners[queries, 1]], sigma[corners[queries, 2]]
-            size = max(side[2], SIZE_UNIT)
+            size = max(side[2], unit)
             spread = math.sqrt((a * a + b * b + c * c) / 3.0)
             slack = 1.6 * tolerance * spread * steps[0, s] / size + distortion
-            if not (slack <= CELL and side[0] / size + slack >= LEAST_RATIO):
+            if not (slack <= 1.0 / cells and side[0] / size + slack >= least_ratio):
                 continue
             limits[queries, 0] = size * (steps[1, s] / steps[0, s]) * (1.0 - slack)
             limits[queries, 1] = size * (steps[2, s] / steps[0, s]) * (1.0 + slack)
             limits[queries, 2] = steps[0, s] / size
             added = _add_runs(
-                left, side[0] / size, side[1] / size, slack, limits[queries], below, runs[count:]
+                left, side[0] / size, side[1] / size, slack, limits[queries], below, layout, runs[count:]
             )
             for run in range(count, count + added):
                 if total + runs[run, 1] - runs[run, 0] > most:
-                    return *_matching_entries(runs[:run], limits, corners, key, star_of, shape), total
+                    return *_matching_entries(runs[:run], limits, corners, key, star_of, shape, layout), total
                 total += runs[run, 1] - runs[run, 0]
                 runs[run, 6] = queries
             queries, count = queries + 1, count + added
-    return *_matching_entries(runs[:count], limits, corners, key, star_of, shape), total
+    return *_matching_entries(runs[:count], limits, corners, key, star_of, shape, layout), total
 
 
 @loop_helper
@@ -369,6 +375,7 @@ def _add_runs(
     slack: float,
     limits: FloatArray,
     below: npt.NDArray[np.int32],
+    layout: IntArray,
     runs: IntArray,
 ) -> int:
     """Write the ranges of keys that may contain triangles similar to an observed triangle to `runs`.
@@ -376,17 +383,18 @@ def _add_runs(
     A range is the first and the last + 1 index, and the lowest and highest positions of both side ratios in
     their cells. Returns the number of ranges.
     """
-    first = int(min(limits[0] / SIZE_UNIT, float(_LARGEST_SIZE)))
-    last = int(min(limits[1] / SIZE_UNIT, float(_LARGEST_SIZE)))
+    cells, fine, size_bits, run_bits = layout
+    sizes = 1 << size_bits
+    first, last = int(min(limits[0] * sizes, sizes - 1.0)), int(min(limits[1] * sizes, sizes - 1.0))
     count = 0
-    for i in range(max(int((short - slack) * CELLS), 0), min(int((short + slack) * CELLS), CELLS - 1) + 1):
-        low, high = _place_limits(short, slack, i)
-        from_cell, to_cell = int((middle - slack) * CELLS), int((middle + slack) * CELLS)
-        for j in range(max(from_cell, 0), min(to_cell, CELLS - 1) + 1):
-            form = ((left * CELLS + i) * CELLS + j) << SIZE_BITS
-            lower, upper = _place_limits(middle, slack, j)
-            runs[count, 0] = below[(form | first) >> RUN_BITS]
-            runs[count, 1] = below[((form | last) >> RUN_BITS) + 1]
+    for i in range(max(int((short - slack) * cells), 0), min(int((short + slack) * cells), cells - 1) + 1):
+        low, high = _place_limits(short, slack, i, cells, fine)
+        from_cell, to_cell = int((middle - slack) * cells), int((middle + slack) * cells)
+        for j in range(max(from_cell, 0), min(to_cell, cells - 1) + 1):
+            form = ((left * cells + i) * cells + j) << size_bits
+            lower, upper = _place_limits(middle, slack, j, cells, fine)
+            runs[count, 0] = below[(form | first) >> run_bits]
+            runs[count, 1] = below[((form | last) >> run_bits) + 1]
             runs[count, 2], runs[count, 3], runs[count, 4], runs[count, 5] = low, high, lower, upper
             count += 1
     return count
@@ -400,19 +408,20 @@ def _matching_entries(
     key: npt.NDArray[np.uint32],
     star_of: npt.NDArray[np.uint16],
     shape: npt.NDArray[np.uint8],
+    layout: IntArray,
 ) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint32], FloatArray]:
     """Return observed stars, guide stars and scales of the entries in `runs` that match their triangle."""
     observed, star = np.empty((256, 3), dtype=np.uint32), np.empty((256, 3), dtype=np.uint32)
-    scale, found = np.empty(256), 0
+    scale, found, sizes = np.empty(256), 0, 1 << layout[2]
     longest_run = 0
     for run in range(len(runs)):
         longest_run = max(longest_run, runs[run, 1] - runs[run, 0])
     near = np.empty(longest_run + 1, dtype=np.int64)
     for run in range(len(runs)):
         begin, end, low, high, lower, upper, query = runs[run]
-        shortest, longest = math.ceil(limits[query, 0] / SIZE_UNIT), math.floor(limits[query, 1] / SIZE_UNIT)
+        shortest, longest = math.ceil(limits[query, 0] * sizes), math.floor(limits[query, 1] * sizes)
         # The entries of a range are in the same cells, and are sorted by the longest side.
-        form = np.int64(key[begin]) & ~_LARGEST_SIZE if begin < end else 0
+        form = np.int64(key[begin]) & ~(sizes - 1) if begin < end else 0
         while begin < end and key[begin] < form + shortest:
             begin += 1
         while begin < end and key[end - 1] > form + longest:
@@ -431,7 +440,7 @@ def _matching_entries(
                 scale = np.concatenate((scale, np.empty_like(scale)))
             for c in range(3):
                 observed[found, c], star[found, c] = corners[query, c], star_of[k, c]
-            scale[found] = float(key[k] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT * limits[query, 2]
+            scale[found] = float(np.int64(key[k]) & (sizes - 1)) / sizes * limits[query, 2]
             found += 1
     return observed[:found].copy(), star[:found].copy(), scale[:found].copy()
 
@@ -471,12 +480,12 @@ def _sorted_sides(seen: FloatArray, triangle: IntArray, side: FloatArray, corner
 
 
 @loop_helper
-def _place_limits(ratio: float, slack: float, cell: int) -> tuple[int, int]:
+def _place_limits(ratio: float, slack: float, cell: int, cells: int, fine: int) -> tuple[int, int]:
     """Return the lowest and the highest position within a cell that agree with a side ratio."""
-    wanted = ratio * (CELLS * FINE) - 0.5 - cell * FINE
-    reach = slack * (CELLS * FINE) + 0.5
-    lowest = min(max(math.ceil(wanted - reach), 0), FINE - 1)
-    return lowest, min(max(math.floor(wanted + reach), lowest), FINE - 1)
+    wanted = ratio * (cells * fine) - 0.5 - cell * fine
+    reach = slack * (cells * fine) + 0.5
+    lowest = min(max(math.ceil(wanted - reach), 0), fine - 1)
+    return lowest, min(max(math.floor(wanted + reach), lowest), fine - 1)
 
 
 def _places(

@@ -616,6 +616,7 @@ def _pair(
     The distance is infinite for an observed star that is not the nearest one of its nearest expected star.
     """
     closest, owner = np.full(len(seen), -2.0), np.zeros(len(expected), dtype=np.int64)
+    nearest[:] = 0
     for e in range(len(expected)):
         gx, gy, gz = guide[expected[e], 0], guide[expected[e], 1], guide[expected[e], 2]
         x = matrix[0, 0] * gx + matrix[0, 1] * gy + matrix[0, 2] * gz

@@ -258,8 +258,13 @@ class TriangleIndex:
 
     @cached_property
     def table(self) -> tuple[npt.NDArray[Any], ...]:
-        """The arrays `key`, `corners`, `shape` and `below` as contiguous, read-only arrays."""
-        arrays = [np.ascontiguousarray(a).view() for a in (self.key, self.corners, self.shape, self.below)]
+        """The arrays `key`, `corners`, `shape` and `below`, contiguous and read-only, and the layout of keys.
+
+        The layout (4,) is `CELLS`, `FINE`, `SIZE_BITS` and `RUN_BITS`.
+        """
+        layout = np.array([CELLS, FINE, SIZE_BITS, RUN_BITS])
+        given = self.key, self.corners, self.shape, self.below, layout
+        arrays = [np.ascontiguousarray(array).view() for array in given]
         for array in arrays:
             array.flags.writeable = False
         return tuple(arrays)

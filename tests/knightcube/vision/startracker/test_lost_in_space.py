@@ -275,6 +275,7 @@ def test_all_forms_find_the_same_matches_and_candidates_in_the_same_order(
         triples(min(len(field), 12))[:60],
         3.0,
         0.0015,
+        0.1,
         most,
         *SKY.triangles.table,
     )

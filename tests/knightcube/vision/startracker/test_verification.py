@@ -168,3 +168,15 @@ def test_all_forms_match_the_same_stars_of_the_same_candidate(limit: float) -> N
         for expected in (np.empty(0, dtype=np.int64), np.unique(drawn.star[drawn.star >= 0])):
             given = field.direction, field.sigma, matrices, scales, *facts, limit, expected, *table
             assert_forms_agree(_first_match, *given, relative=1e-6)
+
+
+def test_attitudes_that_are_not_numbers_match_no_star_in_any_form() -> None:
+    field = draw(ListKind(), SKY.stars, np.random.default_rng([41, 5])).field()
+    facts = 0.1, 0.1, 0.0, 1.0, np.array([3.5, 8.0, 20.0]), 4, -4.5, math.inf
+    matrices, scales = np.full((1, 3, 3), np.nan), np.ones(1)
+    for expected in (np.empty(0, dtype=np.int64), np.arange(30)):
+        table = SKY.stars.direction, SKY.coarse, *SKY.boxes
+        given = field.direction, field.sigma, matrices, scales, *facts, expected, *table
+        assert _first_match.numpy_form(*given)[0] == -1
+        # The interpreter cannot convert NaN to the index of a box.
+        assert_forms_agree(_first_match, *given, interpreted=len(expected) > 0)
