@@ -460,12 +460,8 @@ def _first_match_numpy(
             expected = _expected_numpy(guide, coarse, matrix, widths, _most_expected(len(direction)))
         if len(expected) < least:
             continue
-        cosines = stretched(direction, scale) @ (matrix @ guide[expected].T)
-        nearest = cosines.argmax(axis=1)
-        rows = np.arange(len(nearest))
         variance = (sigma * scale) ** 2
-        squared = 2.0 * (1.0 - cosines[rows, nearest]) / variance
-        squared[cosines.argmax(axis=0)[nearest] != rows] = np.inf
+        nearest, squared = _pair_numpy(stretched(direction, scale), variance, matrix, guide[expected])
         area = 4.0 * across * down * scale**2
         chance = Chance(
             len(direction),
@@ -490,6 +486,21 @@ def _first_match_numpy(
             return number, best, expected[nearest[best]], bound, expected
     nothing_found = np.empty(0, dtype=np.int64)
     return -1, nothing_found, nothing_found, math.inf, nothing_found
+
+
+def _pair_numpy(
+    seen: FloatArray, variance: FloatArray, matrix: FloatArray, guide: FloatArray
+) -> tuple[npt.NDArray[np.intp], FloatArray]:
+    """Return the nearest guide star (n,) of each of `seen` (n, 3), and the squared distance in variances.
+
+    The distance is infinite for an observed star that is not the nearest one of its nearest guide star.
+    """
+    cosines = seen @ (matrix @ guide.T)
+    nearest = cosines.argmax(axis=1)
+    rows = np.arange(len(nearest))
+    squared = 2.0 * (1.0 - cosines[rows, nearest]) / variance
+    squared[cosines.argmax(axis=0)[nearest] != rows] = np.inf
+    return nearest, squared
 
 
 @compiled_form_of(_first_match_numpy)
