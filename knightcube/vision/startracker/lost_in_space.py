@@ -820,15 +820,19 @@ def _most_voted(votes: IntArray, wanted: int) -> IntArray:
 @loop_helper
 def _into_frame(corners: FloatArray) -> None:
     """Replace unit vectors, as columns (3, 3), by the axes of the frame that `_frame` returns as rows."""
-    a, b, c = corners[:, 0].copy(), corners[:, 1].copy(), corners[:, 2].copy()
-    m, d = a + b + c, a - b
-    m /= math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
-    d -= (m[0] * d[0] + m[1] * d[1] + m[2] * d[2]) * m
-    d /= math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    corners[:, 0], corners[:, 1] = m, d
-    corners[0, 2] = m[1] * d[2] - m[2] * d[1]
-    corners[1, 2] = m[2] * d[0] - m[0] * d[2]
-    corners[2, 2] = m[0] * d[1] - m[1] * d[0]
+    mx = corners[0, 0] + corners[0, 1] + corners[0, 2]
+    my = corners[1, 0] + corners[1, 1] + corners[1, 2]
+    mz = corners[2, 0] + corners[2, 1] + corners[2, 2]
+    norm = math.sqrt(mx * mx + my * my + mz * mz)
+    mx, my, mz = mx / norm, my / norm, mz / norm
+    dx, dy, dz = corners[0, 0] - corners[0, 1], corners[1, 0] - corners[1, 1], corners[2, 0] - corners[2, 1]
+    along = mx * dx + my * dy + mz * dz
+    dx, dy, dz = dx - along * mx, dy - along * my, dz - along * mz
+    norm = math.sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx / norm, dy / norm, dz / norm
+    corners[0, 0], corners[1, 0], corners[2, 0] = mx, my, mz
+    corners[0, 1], corners[1, 1], corners[2, 1] = dx, dy, dz
+    corners[0, 2], corners[1, 2], corners[2, 2] = my * dz - mz * dy, mz * dx - mx * dz, mx * dy - my * dx
 
 
 def _frame(corners: FloatArray) -> FloatArray:

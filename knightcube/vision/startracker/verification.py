@@ -545,10 +545,27 @@ def _first_match(
             squared, nearest, gates, least, enough, mean / area, 4.0 * math.pi / area * searched, ln_scales
         )
         if gate > 0.0 and bound <= limit:
-            best = np.flatnonzero(squared <= gate * gate)
-            return number, best, expected[nearest[best]], bound, expected
+            best, star = _within(squared, nearest, gate)
+            for k in range(len(star)):
+                star[k] = expected[star[k]]
+            return number, best, star, bound, expected
     nothing_found = np.empty(0, dtype=np.int64)
     return -1, nothing_found, nothing_found, math.inf, nothing_found
+
+
+@loop_helper
+def _within(squared: FloatArray, nearest: IntArray, gate: float) -> tuple[IntArray, IntArray]:
+    """Return the indices (k,) of the observed stars within the gate, and of the expected stars they match."""
+    count = 0
+    for k in range(len(squared)):
+        count += int(squared[k] <= gate * gate)
+    best, star = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
+    count = 0
+    for k in range(len(squared)):
+        if squared[k] <= gate * gate:
+            best[count], star[count] = k, nearest[k]
+            count += 1
+    return best, star
 
 
 @loop_helper
@@ -587,7 +604,7 @@ def _inside(
     for axis in range(3):
         lowest[axis] = max(int((matrix[2, axis] - chord + 1.0) * (0.5 * boxes)), 0)
         highest[axis] = min(int((matrix[2, axis] + chord + 1.0) * (0.5 * boxes)), boxes - 1)
-    found, stars = 0, np.empty(256, dtype=np.int64)
+    found, stars = 0, np.empty(count, dtype=np.int64)
     for i in range(lowest[0], highest[0] + 1):
         for j in range(lowest[1], highest[1] + 1):
             for k in range(lowest[2], highest[2] + 1):
@@ -604,11 +621,19 @@ def _inside(
                         continue
                     if abs(matrix[1, 0] * gx + matrix[1, 1] * gy + matrix[1, 2] * gz) > down * z:
                         continue
-                    if found == len(stars):
-                        stars = np.concatenate((stars, np.empty_like(stars)))
-                    stars[found] = star
-                    found += 1
-    return np.sort(stars[:found])[:count].copy()
+                    # The stars found so far are sorted, and only the brightest are kept.
+                    if found == count and star > stars[found - 1]:
+                        continue
+                    place = min(found, count - 1)
+                    while place > 0 and stars[place - 1] > star:
+                        stars[place] = stars[place - 1]
+                        place -= 1
+                    stars[place] = star
+                    found = min(found + 1, count)
+    inside = np.empty(found, dtype=np.int64)
+    for k in range(found):
+        inside[k] = stars[k]
+    return inside
 
 
 @loop_helper
@@ -660,15 +685,19 @@ def _best_gate(
     """Return the most significant gate and log10 of its chance matches; the gate is 0 if too few match."""
     best, bound, matched = 0.0, math.inf, least - 1
     for gate in gates:
-        within = np.flatnonzero(squared <= gate * gate)
+        within, rank = _within(squared, nearest, gate)
         if len(within) <= matched:
             continue
         matched = len(within)
-        ranked = np.argsort(nearest[within])
+        for k in range(1, matched):
+            place, one, two = k, within[k], rank[k]
+            while place > 0 and rank[place - 1] > two:
+                within[place], rank[place] = within[place - 1], rank[place - 1]
+                place -= 1
+            within[place], rank[place] = one, two
         value = _log10_chance(
-            gate, within[ranked], nearest[within[ranked]], len(squared), spread, fields, scales, len(gates),
-            least, enough,
-        )  # fmt: skip
+            gate, within, rank, len(squared), spread, fields, scales, len(gates), least, enough
+        )
         if best == 0.0 or value < bound:
             best, bound = gate, value
     return best, bound
@@ -704,7 +733,7 @@ def _log10_chance(
             value = (value + math.log(fields * expected * ring)) / math.log(10.0)
         value += math.log10(choices * math.pi**2 / 6.0 * (expected - matched + 1.0) ** 2)
         if enough < value < enough + 8.0 and matched <= _MOST_ORDERED:
-            value += min(0.0, math.log10(2.0 * _share_ordered(stars[:matched])))
+            value += min(0.0, math.log10(2.0 * _share_ordered(stars, matched)))
         best = min(best, value)
         if best < enough - 2.0:
             break
@@ -712,9 +741,9 @@ def _log10_chance(
 
 
 @loop_helper
-def _share_ordered(sequence: IntArray) -> float:
-    """Return what `order_probability` returns."""
-    length, inversions = len(sequence), 0
+def _share_ordered(sequence: IntArray, length: int) -> float:
+    """Return what `order_probability` returns for the first `length` elements."""
+    inversions = 0
     for place in range(length):
         for other in range(place + 1, length):
             if sequence[place] > sequence[other]:
@@ -728,7 +757,10 @@ def _share_ordered(sequence: IntArray) -> float:
             for part in range(max(0, total - more), total + 1):
                 value += share[part]
             share[total] = value / (more + 1.0)
-    return float(share[: inversions + 1].sum())
+    total_share = 0.0
+    for fewer in range(inversions + 1):
+        total_share += share[fewer]
+    return total_share
 
 
 def _identified(field: StarField, matching: _Matching, refined: Refinement) -> StarMatch:
