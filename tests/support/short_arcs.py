@@ -19,6 +19,20 @@ def circular(rng: np.random.Generator, place: FloatArray, radius: float, speed: 
     return np.concatenate([radius * up, np.sqrt(EARTH / radius) * speed * ahead])
 
 
+def passing_object(rng: np.random.Generator, own: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+    """Return an object drawn 100 to 3,020 km from an observer with state `own` (6,), m and m/s.
+
+    The result is the unit vector (3,) to the object, its distance (m) and its state (6,). The orbit of the
+    object is nearly circular; its altitude is not limited.
+    """
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    away = 10.0 ** rng.uniform(5.0, 6.48)
+    place = own[:3] + away * direction
+    radius = float(np.linalg.norm(place))
+    return direction, away, circular(rng, place, radius, float(rng.uniform(0.985, 1.02)))
+
+
 def flown_states(state: FloatArray, times: FloatArray, middle: int) -> FloatArray:
     """Return states (n, 6) at times of the one at `times[middle]`."""
     parts = []

@@ -15,7 +15,7 @@ import numpy as np
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.first_orbit import ArcError, Bearings, first_orbit
-from tests.support.short_arcs import LIGHT, circular, flown_states
+from tests.support.short_arcs import LIGHT, circular, flown_states, passing_object
 
 SIGMA = float(0.1 * np.radians(20.0) / 1024)
 ARCS = (60.0, 120.0, 240.0)
@@ -89,15 +89,10 @@ def _pass(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Return the states (6,) of observer and object in the middle of a pass."""
     while True:
         own = circular(rng, rng.normal(size=3), float(rng.uniform(6.75e6, 7.6e6)), 1.0)
-        direction = rng.normal(size=3)
-        direction /= np.linalg.norm(direction)
-        away = 10.0 ** rng.uniform(5.0, 6.48)
-        place = own[:3] + away * direction
-        radius = float(np.linalg.norm(place))
-        other = circular(rng, place, radius, float(rng.uniform(0.985, 1.02)))
+        direction, away, other = passing_object(rng, own)
         relative = other[3:] - own[3:]
         rate = np.degrees(np.linalg.norm(np.cross(direction, relative))) / away
-        if 6.7e6 < radius < 9e6 and 0.05 < rate < 0.6:
+        if 6.7e6 < np.linalg.norm(other[:3]) < 9e6 and 0.05 < rate < 0.6:
             return own, other
 
 

@@ -27,7 +27,7 @@ from knightcube.gnc.tracker import FrameSightings, ObjectTracker, TrackSettings
 from sim_hal.settings import TipOff
 from tests.studies.campaigns.free_flight import FreeFlight
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, STAR_SIGMA, PointingFlight
-from tests.support.short_arcs import circular, flow
+from tests.support.short_arcs import flow, passing_object
 
 NEAREST, END = 120.0, 210.0
 """s: when the object turns the line of sight by the rate that was drawn, and when the flight ends."""
@@ -118,12 +118,8 @@ class ObjectChase(PointingFlight):
         """Return the state (6,) of an object at its nearest whose line of sight turns by the wanted rate."""
         rng, wanted = self._draw, self._wanted["rate_deg"]
         while True:
-            direction = rng.normal(size=3)
-            direction /= np.linalg.norm(direction)
-            away = 10.0 ** rng.uniform(5.0, 6.48)
-            place = own[:3] + away * direction
-            radius = float(np.linalg.norm(place))
-            other = circular(rng, place, radius, float(rng.uniform(0.985, 1.02)))
+            direction, away, other = passing_object(rng, own)
+            radius = np.linalg.norm(other[:3])
             relative = (other[3:] - own[3:]) / away
             rate, closing = np.linalg.norm(np.cross(direction, relative)), abs(direction @ relative)
             if 6.7e6 < radius < 9e6 and abs(np.degrees(rate) / wanted - 1.0) < 0.05 and closing < 0.2 * rate:
