@@ -6,10 +6,12 @@ import json
 import math
 import os
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
@@ -18,6 +20,10 @@ from flight.schema.document import (
     MODULES,
     ConfigError,
     Document,
+    _composed,
+    _FastLoader,
+    _lines_of,
+    _Loader,
     config_path,
     imported,
     join,
@@ -101,6 +107,44 @@ def test_both_readers_agree_about_every_shipped_file_and_its_lines(path: Path) -
 
     compare(YAML(typ="rt", pure=True).load(text), "")
     assert compared == len(document.lines) > 3
+
+
+def _loaded(compose: Callable[[], tuple[_Loader, Any]]) -> tuple[list[tuple[str, int]], Any] | None:
+    """Return lines and values of a composed text, or None if it is refused."""
+    try:
+        loader, node = compose()
+        return list(_lines_of(node, "")), node and loader.construct_document(node)
+    except (yaml.YAMLError, ValueError, LookupError):
+        return None
+
+
+def _plainly_composed(text: str) -> tuple[_Loader, Any]:
+    loader = _Loader(text)
+    return loader, loader.get_single_node()
+
+
+@given(st.data())
+def test_both_parsers_read_the_same_in_a_damaged_file(data: st.DataObject) -> None:
+    """Whatever libyaml alone would accept is left to PyYAML's parser, which refuses it."""
+    text = FILES[data.draw(st.integers(0, len(FILES) - 1))].read_text("utf-8")
+    begin = data.draw(st.integers(0, len(text) - 1))
+    text = text[begin : begin + 300].partition("\n")[2]
+    for _ in range(data.draw(st.integers(0, 3))):
+        at = data.draw(st.integers(0, len(text)))
+        text = (
+            text[:at]
+            + data.draw(st.sampled_from([*"abc:-[]{},#&*|>'\"%@`\n 01.~\t!?\ufeff\r\x85"]))
+            + text[at + 1 :]
+        )
+    assert _loaded(lambda: _composed(text)) == _loaded(lambda: _plainly_composed(text))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_shipped_file_is_read_by_the_fast_parser(path: Path) -> None:
+    text = path.read_text("utf-8")
+    if yaml.__with_libyaml__:
+        assert isinstance(_composed(text)[0], _FastLoader)
+    assert _loaded(lambda: _composed(text)) == _loaded(lambda: _plainly_composed(text))
 
 
 @given(_TREES, st.booleans())
