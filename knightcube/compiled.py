@@ -45,18 +45,34 @@ class HotFunction(Generic[Parameters, Result]):
         self.numpy_form = numpy_form
         self.loop_form = loop_form
         self._chosen: Callable[Parameters, Result] | None = None
+        self._not_compiled: tuple[type[Exception], ...] = ()
 
     def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        """Return the result of the compiled form, or of the numpy form where that is in use."""
-        chosen = self._chosen
-        if chosen is None:
-            chosen = self._chosen = self.compiled_form() if in_use() else self.numpy_form
-        return chosen(*args, **kwargs)
+        """Return the result of the compiled form, or of the numpy form where that is in use.
+
+        The numpy form is also used for arguments that numba does not know, such as big-endian arrays.
+        """
+        chosen = self._chosen or self._choose()
+        try:
+            return chosen(*args, **kwargs)
+        except self._not_compiled:  # raised before the machine code runs
+            return self.numpy_form(*args, **kwargs)
+
+    def _choose(self) -> Callable[Parameters, Result]:
+        self._chosen = self.numpy_form
+        if in_use():
+            try:
+                self._chosen = self.compiled_form()
+                unknown = importlib.import_module("numba.core.errors").NumbaError
+                self._not_compiled = (unknown, NotImplementedError)
+            except ImportError:  # for example a numba that does not fit the installed numpy
+                use_numpy_forms()
+        return self._chosen
 
     def compiled_form(self) -> Callable[Parameters, Result]:
         """Return the loop form as a function that numba compiles, and keeps in a file where it can write one.
 
-        Raises ImportError if numba is not installed.
+        Raises ImportError if numba is not installed, or does not fit the installed numpy.
         """
         numba = importlib.import_module("numba")
         while _helpers:
@@ -73,8 +89,8 @@ def compiled_form_of(
     """Return the decorator that joins a loop form to its numpy form.
 
     The loop form takes arrays and numbers by position. It calls only functions of numpy that numba knows, and
-    functions of its own module that `loop_helper` decorates: the kept machine code is made again when this
-    module changes, and not when another one does.
+    functions of its own module that `loop_helper` decorates, and uses no constants of other modules: the kept
+    machine code is made again when this module changes, and not when another one does.
     """
     return lambda loop_form: HotFunction(numpy_form, loop_form)
 

@@ -6,12 +6,13 @@ import importlib.util
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.compiled import compiled_form_of, in_use, loop_helper
+from knightcube.compiled import HotFunction, compiled_form_of, in_use, loop_helper
 from tests.support.compiled_forms import assert_forms_agree
 
 
@@ -55,6 +56,29 @@ def test_without_numba_the_numpy_form_is_used(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.delenv("KNIGHTCUBE_COMPILED", raising=False)
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     assert not in_use()
+
+
+def test_a_numba_that_cannot_be_imported_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Numba refuses to be imported beside a numpy that is too new for it."""
+    (tmp_path / "numba.py").write_text("raise ImportError('Numba needs NumPy 2.4 or less')", encoding="utf-8")
+    code = (
+        "import numpy as np\nfrom knightcube.vision.frame import estimate_background\n"
+        "estimate_background(np.zeros((64, 64)))"
+    )
+    environment = {**os.environ, "KNIGHTCUBE_COMPILED": "1", "PYTHONPATH": f"{tmp_path}:{os.getcwd()}"}
+    subprocess.run([sys.executable, "-c", code], env=environment, timeout=100, check=True)
+
+
+@pytest.mark.parametrize("dtype", [">f8", "f2"])
+def test_arrays_that_numba_does_not_know_are_left_to_numpy(
+    dtype: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    monkeypatch.setenv("KNIGHTCUBE_COMPILED", "1")
+    hot = HotFunction(_sum_of_squares_numpy, _sum_of_squares.loop_form)
+    values = VALUES.astype(dtype)
+    assert hot(values) == pytest.approx(_sum_of_squares_numpy(values))
+    assert hot(VALUES) == pytest.approx(_sum_of_squares_numpy(VALUES))
 
 
 @pytest.mark.parametrize("module", ["knightcube", "flight.__main__", "knightcube.vision.star_tracker"])
