@@ -66,7 +66,7 @@ def run_python(checkout: Path, *arguments: str, folder: Path | None = None) -> s
         done = subprocess.run(
             [sys.executable, *arguments],
             cwd=folder or checkout,
-            env={**os.environ, "PYTHONPATH": str(checkout)},
+            env={**os.environ, "PYTHONPATH": str(checkout), "KNIGHTCUBE_COMPILED": "0"},
             capture_output=True,
             text=True,
             timeout=_LIMIT,
