@@ -248,17 +248,7 @@ def _refined_numpy(
         np.multiply(b - predicted, weight, out=rows[:, 3:6])
         if free_scale:
             np.multiply(scale_slope(b), weight, out=rows[:, 6:])
-        # A rotation d changes a residual by d x p, so its gradient is the sum of the products p x r.
-        gram = (rows.T @ rows).tolist()
-        trace = gram[0][0] + gram[1][1] + gram[2][2]
-        gradient = _summed_cross(gram, 3)
-        for i in range(3):
-            for j in range(3):
-                normal[i, j] = (trace if i == j else 0.0) - gram[i][j]
-        if free_scale:
-            normal[3, :3] = normal[:3, 3] = _summed_cross(gram, 6)
-            normal[3, 3] = gram[6][6] + gram[7][7] + gram[8][8]
-            gradient.append(gram[3][6] + gram[4][7] + gram[5][8])
+        gradient = _write_normal((rows.T @ rows).tolist(), normal)
         try:
             covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         except np.linalg.LinAlgError:
@@ -279,6 +269,23 @@ def _refined_numpy(
     if free_scale:
         left += step[3] * rows[:, 6:]
     return True, matrix, scale, covariance, np.einsum("ij,ij->i", left, left)
+
+
+def _write_normal(gram: list[list[float]], normal: FloatArray) -> list[float]:
+    """Write the normal matrix (p, p) from the Gram matrix of the rows, and return the gradient (p,).
+
+    A rotation d changes a residual by d x p, so its gradient is the sum of the products p x r.
+    """
+    trace = gram[0][0] + gram[1][1] + gram[2][2]
+    gradient = _summed_cross(gram, 3)
+    for i in range(3):
+        for j in range(3):
+            normal[i, j] = (trace if i == j else 0.0) - gram[i][j]
+    if len(normal) == 4:
+        normal[3, :3] = normal[:3, 3] = _summed_cross(gram, 6)
+        normal[3, 3] = gram[6][6] + gram[7][7] + gram[8][8]
+        gradient.append(gram[3][6] + gram[4][7] + gram[5][8])
+    return gradient
 
 
 @compiled_form_of(_refined_numpy)

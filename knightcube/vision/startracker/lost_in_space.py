@@ -728,13 +728,7 @@ def _choose(
     seen, wanted = np.empty((3, 3)), np.empty((3, 3))
     known, count = len(tried), 0
     for find in order:
-        shared = 0
-        for c in range(3):
-            for k in range(known):
-                if pairs[k, 0] == observed[find, c] and pairs[k, 1] == star[find, c]:
-                    shared += 1
-                    break
-        if shared >= 2:
+        if _shared_pairs(pairs[:known], observed[find], star[find]) >= 2:
             continue
         squared = scale[find] * scale[find]
         for c in range(3):
@@ -761,6 +755,18 @@ def _choose(
         if count == most:
             break
     return matrices[:count].copy(), scales[:count].copy(), pairs[:known].copy()
+
+
+@loop_helper
+def _shared_pairs(pairs: IntArray, observed: npt.NDArray[np.uint32], star: npt.NDArray[np.uint32]) -> int:
+    """Return how many corners of a match, (3,) and (3,), are among the pairs (k, 2)."""
+    shared = 0
+    for c in range(3):
+        for k in range(len(pairs)):
+            if pairs[k, 0] == observed[c] and pairs[k, 1] == star[c]:
+                shared += 1
+                break
+    return shared
 
 
 @loop_helper
