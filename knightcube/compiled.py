@@ -13,15 +13,15 @@ call. `@compiled_form_of(numpy_form)` joins the two:
 
 `pip install knightcube[fast]` installs numba. The environment variable KNIGHTCUBE_COMPILED=0 selects the
 numpy forms although numba is installed; so does `use_numpy_forms()`, which the control loop of a flight in
-real time calls, because the first call of a compiled form takes up to some seconds.
+real time calls, because the first call of a compiled form takes some seconds.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 import os
+import pickle
 from collections.abc import Callable
 from typing import Any, Generic, ParamSpec, TypeVar
 
@@ -45,28 +45,26 @@ class HotFunction(Generic[Parameters, Result]):
         self.numpy_form = numpy_form
         self.loop_form = loop_form
         self._chosen: Callable[Parameters, Result] | None = None
-        self._not_compiled: tuple[type[Exception], ...] = ()
+        self._refusals: tuple[type[Exception], ...] = ()
 
     def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         """Return the result of the compiled form, or of the numpy form where that is in use.
 
-        The numpy form is also used for arguments that numba does not know, such as big-endian arrays.
+        The numpy form is also used for arguments that numba does not know, such as big-endian arrays, and if
+        the file of the machine code is damaged or cannot be written.
         """
         chosen = self._chosen or self._choose()
         try:
             return chosen(*args, **kwargs)
-        except self._not_compiled:  # raised before the machine code runs
+        except self._refusals:  # raised before the machine code runs
             return self.numpy_form(*args, **kwargs)
 
     def _choose(self) -> Callable[Parameters, Result]:
         self._chosen = self.numpy_form
         if in_use():
-            try:
-                self._chosen = self.compiled_form()
-                unknown = importlib.import_module("numba.core.errors").NumbaError
-                self._not_compiled = (unknown, NotImplementedError)
-            except ImportError:  # for example a numba that does not fit the installed numpy
-                use_numpy_forms()
+            self._chosen = self.compiled_form()
+            unknown = importlib.import_module("numba.core.errors").NumbaError
+            self._refusals = (unknown, NotImplementedError, OSError, EOFError, pickle.UnpicklingError)
         return self._chosen
 
     def compiled_form(self) -> Callable[Parameters, Result]:
@@ -96,17 +94,27 @@ def compiled_form_of(
 
 
 def loop_helper(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Decorate a function that loop forms of the same module call, and return it as it is.
+    """Decorate a function that loop forms of the same module call, and return it unchanged.
 
-    The machine code of a helper may add in any order.
+    The machine code of a helper may compute sums in any order.
     """
     _helpers.append(function)
     return function
 
 
 def in_use() -> bool:
-    """Return whether this process uses compiled forms from now on."""
-    return os.environ.get(_SWITCH, "1") != "0" and importlib.util.find_spec("numba") is not None
+    """Return whether functions that are called for the first time use their compiled form."""
+    return os.environ.get(_SWITCH, "1") != "0" and _numba_is_usable()
+
+
+@functools.cache
+def _numba_is_usable() -> bool:
+    """Import numba, and return False if it is not installed or does not fit the installed numpy."""
+    try:
+        importlib.import_module("numba")
+    except ImportError:
+        return False
+    return True
 
 
 def use_numpy_forms() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -12,61 +11,68 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.compiled import HotFunction, compiled_form_of, in_use, loop_helper
-from tests.support.compiled_forms import assert_forms_agree
+from knightcube.compiled import HotFunction, compiled_form_of, in_use
+from tests.support.compiled_forms import assert_forms_agree, sum_of_squares, sum_of_squares_numpy
 
-
-def _sum_of_squares_numpy(values: FloatArray) -> float:
-    return float(values @ values)
-
-
-@loop_helper
-def _square(value: float) -> float:
-    return value * value
-
-
-@compiled_form_of(_sum_of_squares_numpy)
-def _sum_of_squares(values: FloatArray) -> float:
-    total = 0.0
-    for value in values:
-        total += _square(value)
-    return total
-
-
+ROOT = Path(__file__).resolve().parents[2]
 VALUES = np.linspace(-1.0, 2.0, 1_000)
 
 
 def test_all_forms_return_the_same() -> None:
-    assert_forms_agree(_sum_of_squares, VALUES)
-    assert _sum_of_squares.numpy_form(VALUES) == pytest.approx(1001.5015015015, rel=1e-9)
+    assert_forms_agree(sum_of_squares, VALUES)
+    assert sum_of_squares.numpy_form(VALUES) == pytest.approx(1001.5015015015, rel=1e-9)
 
 
 def test_the_variable_selects_the_numpy_form(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KNIGHTCUBE_COMPILED", "0")
     assert not in_use()
 
-    @compiled_form_of(_sum_of_squares_numpy)
+    @compiled_form_of(sum_of_squares_numpy)
     def fails(values: FloatArray) -> float:
         raise AssertionError(f"called with {values.size} values")
 
-    assert fails(VALUES) == _sum_of_squares_numpy(VALUES)
+    assert fails(VALUES) == sum_of_squares_numpy(VALUES)
 
 
-def test_without_numba_the_numpy_form_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("KNIGHTCUBE_COMPILED", raising=False)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    assert not in_use()
-
-
-def test_a_numba_that_cannot_be_imported_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "numba", ["", "raise ImportError('Numba needs NumPy 2.4 or less')"], ids=["missing", "unfit"]
+)
+def test_without_a_usable_numba_the_numpy_form_is_used(numba: str, tmp_path: Path) -> None:
     """Numba refuses to be imported beside a numpy that is too new for it."""
-    (tmp_path / "numba.py").write_text("raise ImportError('Numba needs NumPy 2.4 or less')", encoding="utf-8")
+    (tmp_path / "numba.py").write_text(numba, encoding="utf-8")
+    hidden = "" if numba else "sys.modules['numba'] = None\n"
     code = (
-        "import numpy as np\nfrom knightcube.vision.frame import estimate_background\n"
-        "estimate_background(np.zeros((64, 64)))"
+        f"import sys\n{hidden}import numpy as np\nfrom knightcube import compiled\n"
+        "from knightcube.vision.frame import estimate_background\n"
+        "estimate_background(np.zeros((64, 64)))\nsys.exit(compiled.in_use())"
     )
-    environment = {**os.environ, "KNIGHTCUBE_COMPILED": "1", "PYTHONPATH": f"{tmp_path}:{os.getcwd()}"}
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    environment = {**os.environ, "KNIGHTCUBE_COMPILED": "1", "PYTHONPATH": path}
     subprocess.run([sys.executable, "-c", code], env=environment, timeout=100, check=True)
+
+
+def test_a_damaged_file_of_machine_code_is_left_aside(tmp_path: Path) -> None:
+    """The file is truncated in any way that a full disk or a lost supply may leave."""
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    environment = {
+        **os.environ,
+        "KNIGHTCUBE_COMPILED": "1",
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "PYTHONPATH": str(ROOT),
+    }
+    code = (
+        "import numpy as np\nfrom tests.support.compiled_forms import sum_of_squares as hot\n"
+        "assert hot(np.arange(5.0)) == 30.0"
+    )
+    for damage in ("", "index", "code", "folder"):
+        for file in tmp_path.rglob("*.nbi" if damage == "index" else "*.nbc"):
+            if damage:
+                file.write_bytes(file.read_bytes()[:40])
+            if damage == "folder":
+                file.unlink()
+                file.mkdir()
+        subprocess.run([sys.executable, "-c", code], env=environment, timeout=100, check=True)
+        assert list(tmp_path.rglob("*.nbc"))
 
 
 @pytest.mark.parametrize("dtype", [">f8", "f2"])
@@ -75,10 +81,10 @@ def test_arrays_that_numba_does_not_know_are_left_to_numpy(
 ) -> None:
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     monkeypatch.setenv("KNIGHTCUBE_COMPILED", "1")
-    hot = HotFunction(_sum_of_squares_numpy, _sum_of_squares.loop_form)
+    hot = HotFunction(sum_of_squares_numpy, sum_of_squares.loop_form)
     values = VALUES.astype(dtype)
-    assert hot(values) == pytest.approx(_sum_of_squares_numpy(values))
-    assert hot(VALUES) == pytest.approx(_sum_of_squares_numpy(VALUES))
+    assert hot(values) == pytest.approx(sum_of_squares_numpy(values))
+    assert hot(VALUES) == pytest.approx(sum_of_squares_numpy(VALUES))
 
 
 @pytest.mark.parametrize("module", ["knightcube", "flight.__main__", "knightcube.vision.star_tracker"])

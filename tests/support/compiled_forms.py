@@ -8,7 +8,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-from knightcube.compiled import HotFunction
+from knightcube.astro.arrays import FloatArray
+from knightcube.compiled import HotFunction, compiled_form_of, loop_helper
+
+
+def sum_of_squares_numpy(values: FloatArray) -> float:
+    """Return the sum of the squares of some values."""
+    return float(values @ values)
+
+
+@loop_helper
+def _square(value: float) -> float:
+    return value * value
+
+
+@compiled_form_of(sum_of_squares_numpy)
+def sum_of_squares(values: FloatArray) -> float:
+    """Return the sum of the squares of some values: the smallest function with two forms."""
+    total = 0.0
+    for value in values:
+        total += _square(value)
+    return total
 
 
 def assert_forms_agree(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -33,6 +36,44 @@ def test_an_image_gives_its_attitude_within_the_covariance(resting: SkyFrame) ->
     assert solution.field_of_view_deg == pytest.approx(12.0, abs=0.01)
     assert not solution.mirrored
     assert solution.rate is None
+
+
+_COMPILED = """
+import gc, sys
+import numpy as np
+import knightcube.vision.frame_job
+from knightcube import StarTracker
+from knightcube.compiled import HotFunction
+
+def refused(*_):
+    sys.exit("a numpy form was called")
+
+for one in gc.get_objects():
+    if isinstance(one, HotFunction):
+        one.numpy_form = refused
+found = StarTracker(fov_deg=12.0).solve(np.load(sys.argv[1]))
+print(*found.quaternion, *found.covariance.ravel(), len(found.stars))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_compiled_forms_alone_give_the_same_attitude(resting: SkyFrame, tmp_path: Path) -> None:
+    """A numpy form that replaces a compiled one unnoticed costs the gain; here it ends the program.
+
+    In a new clone the program first compiles for up to a minute of processor time.
+    """
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    np.save(tmp_path / "image.npy", resting.pixels)
+    environment = {**os.environ, "KNIGHTCUBE_COMPILED": "1"}
+    words = [sys.executable, "-c", _COMPILED, str(tmp_path / "image.npy")]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=590, check=False)
+    assert done.returncode == 0, done.stderr
+    found = np.array(done.stdout.split(), dtype=float)
+    expected = StarTracker(fov_deg=12.0).solve(resting.pixels)
+    assert found[:4] == pytest.approx(expected.quaternion, abs=1e-9)
+    assert found[4:13] == pytest.approx(expected.covariance.ravel(), rel=1e-5, abs=1e-14)
+    assert found[13] == len(expected.stars)
 
 
 def test_right_ascension_declination_and_roll_are_those_of_the_quaternion(resting: SkyFrame) -> None:
