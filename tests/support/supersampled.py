@@ -60,6 +60,16 @@ def disc(diameter: float) -> Spread:
     return density
 
 
+def ring(diameter: float, hole: float) -> Spread:
+    """Return a point defocused by a telescope with a central obstruction: a disc, px, with a hole, px."""
+    whole, dark = disc(diameter), disc(hole)
+
+    def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
+        return np.asarray(whole(dx, dy) - dark(dx, dy))
+
+    return density
+
+
 def halo(sigma: float, share: float, width: float) -> Spread:
     """Return a Gaussian core with `share` of the light in a Gaussian of `width` px."""
 

@@ -25,14 +25,14 @@ from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, LensError, Pinhole
-from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch, inflation
 from knightcube.vision.startracker.detection import (
     Detections,
     DetectionSettings,
     FrameKind,
     measure_near,
 )
-from knightcube.vision.startracker.image_fit import Unknowns, attitude_by, fit_in_image
+from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, attitude_by, fit_in_image
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
 from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, apparent, known_bend, usual_bend
@@ -194,6 +194,8 @@ _LEAST_SIGMA_PX = 0.005
 _COLOUR_PX = 0.002
 # Centroid error that all stars share, as a fraction of the excess PSF width (from campaign `resting`).
 _SHAPE_DOUBT = 0.05
+# Chi-square per degree of freedom above which the positions contradict their uncertainties, if significant.
+_CONTRADICTED = 1.5
 # Position error (px) assumed for an uncalibrated lens in the second attempt to identify the stars.
 # The first attempt to identify the stars assumes smaller errors, so that fewer stars agree by chance.
 _UNCALIBRATED_SIGMA_PX = 0.3
@@ -505,6 +507,8 @@ def _with_attitude(
             fix = attitude_by(settings.attitude, places, covariance, reference, camera, fit, late)
     except AttitudeError as error:
         return replace(seen, status=SolveStatus.AMBIGUOUS, reason=str(error))
+    if problem := _contradiction(seen, fit):
+        return replace(seen, status=SolveStatus.AMBIGUOUS, reason=problem)
     camera = camera.rescaled(1.0 / fit.scale)
     if found.from_lens is not None:
         fix = replace(fix, covariance=fix.covariance + found.from_lens)
@@ -528,6 +532,23 @@ def _with_attitude(
         scale_sigma=fit.scale_sigma,
         bend=fit.bend,
         log10_false_alarm=found.log10_false_alarm,
+    )
+
+
+def _contradiction(seen: FrameSolution, fit: ImageFit) -> str:
+    """Return why the points contradict their own uncertainties too much for an attitude, or an empty text.
+
+    If the positions are wrong, as on the rings of a defocused lens, only those points match that happen to be
+    within the gate. If they are the smaller part of all points, they were selected by the candidate attitude,
+    and their scatter about it does not show its error.
+    """
+    squares = fit.squares[fit.agree]
+    excess = inflation(squares, 4)
+    if seen.kind is not FrameKind.POINTS or 2 * len(squares) >= len(seen.points) or excess < _CONTRADICTED:
+        return ""
+    return (
+        f"{len(seen.points) - len(squares)} of {len(seen.points)} points match no star, and the others are "
+        f"{math.sqrt(excess):.1f} times as far off as their uncertainty allows: check the focus"
     )
 
 

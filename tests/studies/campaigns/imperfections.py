@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge
-from tests.support.supersampled import Optics, coma, disc, gaussian, halo, moffat
+from tests.support.supersampled import Optics, coma, disc, gaussian, halo, moffat, ring
 
 Stage = Callable[[FloatArray, np.random.Generator], FloatArray]
 """Changes electrons or counts (rows, columns); the generator draws what differs from frame to frame."""
@@ -219,4 +219,6 @@ IMPERFECTIONS: dict[str, Imperfection] = {
     "rolling untold": Imperfection(line_time=20e-6, known={"knowledge": CameraKnowledge(line_time=UNSTATED)}),
     "rolling told": Imperfection(line_time=20e-6, known={"line_time": 20e-6}),
     "sigma 3 px told": Imperfection(Optics((gaussian(3.0),), radius=18.0), known={"psf_sigma": 3.0}),
+    "ring 8 px, hole 4 px": Imperfection(Optics((ring(8.0, 4.0),), radius=9.0)),
+    "ring 8 px, hole 6 px": Imperfection(Optics((ring(8.0, 6.0),), radius=9.0)),
 }

@@ -51,6 +51,7 @@ from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, S
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 from tests.support.attitude_errors import attitude_error
 from tests.support.photographs import ARCSECONDS, photograph
+from tests.support.star_lists import ListKind, draw
 
 _KNOWN_TO_A_PERCENT = 0.99, 1.01
 _PHOTOGRAPHS = Path(__file__).parents[5] / "shared" / "data" / "sky"
@@ -148,6 +149,31 @@ def test_an_attitude_far_from_its_prior_is_not_forced_to_the_prior() -> None:
         AttitudePrior(prior, sigma),
     )
     assert found.fix is None or angle_between(found.fix.quaternion, prior) < 6.0 * sigma
+
+
+@pytest.mark.parametrize(
+    ("claimed", "false_stars", "accepted"),
+    [(1.0, 45, True), (0.3, 100, False), (0.3, 3, True)],
+    ids=["true claims", "wrong claims of the smaller part", "wrong claims of most points"],
+)
+def test_points_that_contradict_their_uncertainties_give_no_attitude_unless_most_of_them_match(
+    claimed: float, false_stars: int, accepted: bool
+) -> None:
+    """About 20 to 80 stars have position errors of 1 px, of which the covariance states a share."""
+    kind = ListKind(field_deg=20.0, faintest=5.5, noise_px=1.0, false_stars=false_stars, known_deg=0.0)
+    answered = 0
+    for seed in range(8):
+        drawn = draw(kind, sky().stars, np.random.default_rng([23, seed]))
+        covariance = np.full(len(drawn.pixels), claimed**2)[:, None, None] * np.eye(2)
+        found = solve_places(
+            drawn.pixels, covariance, FrameKind.POINTS, drawn.camera, (1.0, 1.0), sky(), SolveSettings()
+        )
+        answered += found.fix is not None
+        if not accepted and found.fix is None:
+            assert "match no star" in found.reason or "beyond chance" in found.reason
+        if accepted and found.fix is not None:
+            assert _mismatch(found, drawn.attitude) < _CHI_SQUARE_3_DOF_1E_5
+    assert answered >= 6 if accepted else answered == 0
 
 
 def test_noise_alone_shows_no_star() -> None:
