@@ -22,6 +22,8 @@ _MODE_COLOURS = {
     "boot": "bold black on yellow",
     "detumble": "bold black on yellow",
 }
+_STREAM_COLOURS = {"good": "green", "no-reading-yet": "dim"}
+"""Colours of the states of a stream that raise no alarm."""
 _SEVERITY_COLOURS = ("dim", "yellow", "bold red")
 
 
@@ -73,7 +75,7 @@ def _facts(state: FlightState) -> list[tuple[str, RenderableType]]:
         for name in STREAMS:
             stream = named(STREAM_STATES, state.value("health", name))
             if stream != "not-fitted":
-                streams.append(f"{name} {stream}  ", "green" if stream == "good" else "bold red")
+                streams.append(f"{name} {stream}  ", _STREAM_COLOURS.get(stream, "bold red"))
         rows.append(("streams", streams))
         cpu, slips = state.value("health", "cpu_share"), int(state.value("health", "slips"))
         text = f"slips {slips}  processor {_figure(100.0 * cpu, 0)} %  faults {state.faults}"

@@ -274,7 +274,11 @@ _PERIODS = 5
 
 
 class StreamState(IntEnum):
-    """Quality of a stream; the values are the numbers in the health packet."""
+    """Quality of a stream; the values are the numbers in the health packet.
+
+    A stream without a reading is NO_READING_YET until its age limit has passed since the start, and NEVER
+    afterwards.
+    """
 
     NOT_FITTED = 0
     NEVER = 1
@@ -282,6 +286,7 @@ class StreamState(IntEnum):
     INVALID = 3
     SLOW = 4
     GOOD = 5
+    NO_READING_YET = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,13 +337,13 @@ class StreamWatch:
         self.stream = stream
         self._window_ns = round(max(_SPAN, _PERIODS / stream.rate_hz) * 1e9)
         self._times: deque[int] = deque(maxlen=max(int(2.0 * stream.rate_hz * self._window_ns * _SECOND), 2))
-        self._since_ns = time_ns
+        self._begin_ns = self._since_ns = time_ns
         self._valid = True
 
     def begin(self, time_ns: int) -> None:
-        """Discard earlier readings, and measure the rate from `time_ns` on."""
+        """Discard earlier readings, and measure the rate and the wait for a reading from `time_ns` on."""
         self._times.clear()
-        self._since_ns = time_ns
+        self._begin_ns = self._since_ns = time_ns
 
     def note(self, time_ns: int, value: float | None = None) -> None:
         """Record a reading made at `time_ns`, and the value that must be within the valid range."""
@@ -365,7 +370,8 @@ class StreamWatch:
     def state(self, now_ns: int) -> StreamState:
         """Return the present state of the stream."""
         if not self._times:
-            return StreamState.NEVER
+            waited = (now_ns - self._begin_ns) * _SECOND
+            return StreamState.NEVER if waited > self.stream.max_age else StreamState.NO_READING_YET
         if self.age(now_ns) > self.stream.max_age:
             return StreamState.STALE
         if not self._valid:
@@ -379,7 +385,8 @@ class StreamWatch:
         stream, state = self.stream, self.state(now_ns)
         if state is StreamState.GOOD:
             return False, f"{stream.name}: good again"
-        if state is StreamState.NEVER or (state is StreamState.STALE and stream.has_silence_alarm):
+        without_reading = state in (StreamState.NEVER, StreamState.NO_READING_YET)
+        if without_reading or (state is StreamState.STALE and stream.has_silence_alarm):
             return None, ""
         reason = {
             StreamState.STALE: f"{self.age(now_ns):.2f} s old, {stream.max_age:g} s allowed",
@@ -396,7 +403,7 @@ class Streams:
         self._watches = {row.name: StreamWatch(row, 0) for row in rows}
 
     def begin(self, time_ns: int) -> None:
-        """Discard earlier readings, and measure rates from `time_ns` on."""
+        """Discard earlier readings, and measure rates and the wait for readings from `time_ns` on."""
         for watch in self._watches.values():
             watch.begin(time_ns)
 

@@ -146,6 +146,22 @@ def test_the_states_of_the_table_are_those_of_the_code() -> None:
     assert {named[bit]: level == "fault" for bit, level in definitions.FACT_ALARMS} == grave
 
 
+@pytest.mark.parametrize("stream", ["imu", "field", "coils", "power", "camera"])
+def test_a_stream_without_a_reading_yet_raises_no_alarm_and_one_that_never_came_is_critical(
+    stream: str,
+) -> None:
+    types = found(fromstring(document()), "x:TelemetryMetaData/x:ParameterTypeSet")
+    kind = found(types, f"x:EnumeratedParameterType[@name='health_{stream}_Type']")
+    values = {item.get("label"): int(item.get("value", "")) for item in found(kind, "x:EnumerationList")}
+    assert values["no-reading-yet"] == StreamState.NO_READING_YET
+    levels = {
+        item.get("enumerationLabel"): item.get("alarmLevel")
+        for item in found(kind, "x:DefaultAlarm/x:EnumerationAlarmList")
+    }
+    assert "no-reading-yet" not in levels
+    assert levels["never"] == "critical"
+
+
 def test_each_stage_of_a_command_is_verified_by_identifier_sequence_and_stage() -> None:
     commands = found(fromstring(document(verified=True)), "x:CommandMetaData/x:MetaCommandSet")
     verifiers = found(commands, "x:MetaCommand[@name='ping']/x:VerifierSet")

@@ -59,7 +59,9 @@ MODES: States = tuple((int(mode), mode.label) for mode in Mode)
 SEVERITIES: States = tuple((int(severity), severity.name.lower()) for severity in Severity)
 STEERING: States = ((0, "off"), (1, "following"), (2, "holding"), (3, "braking"))
 """States of the use of the coils (`flight.loop.body.SteeringState`)."""
-STREAMS: States = ((0, "not-fitted"), (1, "never"), (2, "stale"), (3, "invalid"), (4, "slow"), (5, "good"))
+STREAMS: States = tuple(
+    enumerate(("not-fitted", "never", "stale", "invalid", "slow", "good", "no-reading-yet"))
+)
 """States of the quality of a stream of readings (`flight.loop.facts.StreamState`)."""
 KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
 """States of the quality of the attitude estimate (`flight.bodies.orbit.body`)."""

@@ -85,7 +85,7 @@ export class Health {
     };
     for (const [key, field] of health ? this.streams : []) {
       const state = label(value(key), field);
-      if (state !== "not-fitted") add(field.name, state, beyond(value(key), field) || "good", field);
+      if (state !== "not-fitted") add(field.name, state, beyond(value(key), field) || (state === "good" ? "good" : ""), field);
     }
     if (health) {
       const field = this.fields.get("health.facts");

@@ -229,9 +229,16 @@ def fed(
     return watch, (count - 1) * PERIOD
 
 
-def test_before_the_first_reading_it_never_came() -> None:
-    assert StreamWatch(ROW, 0).state(0) is StreamState.NEVER
-    assert StreamWatch(ROW, 0).age(0) == math.inf
+def test_a_stream_without_a_reading_is_awaited_for_its_age_limit_after_the_start() -> None:
+    watch = StreamWatch(ROW, 0)
+    watch.begin(5_000_000_000)
+    assert watch.age(5_000_000_000) == math.inf
+    for wait_ns, state in ((0, StreamState.NO_READING_YET), (100_000_000, StreamState.NO_READING_YET)):
+        assert watch.state(5_000_000_000 + wait_ns) is state
+    assert watch.state(5_100_000_001) is StreamState.NEVER
+    assert watch.poor(5_000_000_000) == watch.poor(5_100_000_001) == (None, "")
+    watch.note(5_200_000_000, 0.5)
+    assert watch.state(5_200_000_000) is StreamState.GOOD
 
 
 def test_it_is_good_while_it_comes_at_its_rate_and_stale_once_older_than_its_limit() -> None:
@@ -266,7 +273,7 @@ def test_what_is_not_fitted_takes_no_notes() -> None:
     streams = Streams((ROW,))
     streams.note("camera", 1)
     assert streams.state("camera", 2) is StreamState.NOT_FITTED
-    assert streams.state("imu", 2) is StreamState.NEVER
+    assert streams.state("imu", 2) is StreamState.NO_READING_YET
 
 
 def test_silence_that_another_alarm_reports_is_not_reported_twice_and_any_other_is() -> None:
