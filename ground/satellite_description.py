@@ -152,7 +152,7 @@ def derived(satellite: Satellite, julian_date: float) -> Derived:
     dipole = largest_dipole(satellite.coils)
     torque = dipole * field
     area = max(size[0] * size[1], size[1] * size[2], size[2] * size[0])
-    disturbance = area * _worst_pressure(orbit.altitude) * _OFFSET
+    disturbance = area * _worst_pressure(axis * (1.0 - orbit.eccentricity)) * _OFFSET
     momentum_time = max(inertia) * math.radians(satellite.release_deg) / torque
     slow_within = _rounded_up(0.3 * period + 1.3 * momentum_time, 100.0)
     start = elements(orbit, julian_date)
@@ -175,11 +175,15 @@ def derived(satellite: Satellite, julian_date: float) -> Derived:
     )
 
 
-def _worst_pressure(altitude: float) -> float:
-    """Return the pressure (Pa) of air and sunlight on a face at an altitude (m)."""
-    axis = EARTH_RADIUS + altitude
-    density = math.exp(float(log_density(np.array([[axis, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]]), 0.0)[0]))
-    return 0.5 * _DRAG_COEFFICIENT * density * GRAVITATIONAL_PARAMETER / axis + 2.0 * _SUN_PRESSURE
+def _worst_pressure(perigee: float) -> float:
+    """Return the largest pressure (Pa) of air and sunlight on a face in an orbit.
+
+    The argument `perigee` is the distance of the perigee from the Earth's centre, m. The air is densest at
+    the perigee.
+    """
+    place, sun = np.array([[perigee, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
+    density = math.exp(float(log_density(place, sun, 0.0)[0]))
+    return 0.5 * _DRAG_COEFFICIENT * density * GRAVITATIONAL_PARAMETER / perigee + 2.0 * _SUN_PRESSURE
 
 
 def _rounded_up(value: float, step: float) -> float:

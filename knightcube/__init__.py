@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from knightcube.gnc.guidance.three_axes.pointing_target import Goal as Goal
     from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget as PointingTarget
     from knightcube.gnc.guidance.three_axes.slew_plan import plan_slew as plan_slew
+    from knightcube.vision.camera.images import read_image as read_image
     from knightcube.vision.camera.lens import Lens as Lens
     from knightcube.vision.camera.lens import Pinhole as Pinhole
     from knightcube.vision.horizon.nadir import find_nadir as find_nadir
@@ -66,6 +67,7 @@ _MODULE_OF = {
     "plan_step": "knightcube.gnc.guidance.one_axis.vmc",
     "propagate_elements": "knightcube.astro.almanac",
     "propagate_orbit": "knightcube.astro.almanac",
+    "read_image": "knightcube.vision.camera.images",
     "sun_direction": "knightcube.astro.almanac",
     "sunlit_fraction": "knightcube.astro.almanac",
 }

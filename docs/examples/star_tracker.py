@@ -1,7 +1,4 @@
-"""Solve an image of the sky with the star tracker of the library.
-
-python star_tracker.py [IMAGE.npy] takes a NumPy file (rows, columns); without one, it draws a field in Orion.
-"""
+"""Draw a field in Orion, and solve it with the star tracker of the library."""
 
 from __future__ import annotations
 
@@ -35,8 +32,7 @@ def draw_orion(rows: int = 768, columns: int = 1024, fov_deg: float = 11.4) -> I
     return np.random.default_rng(1).poisson(image).clip(0, 65_535).astype(np.uint16)
 
 
-image = np.load(sys.argv[1]) if len(sys.argv) > 1 else draw_orion()
-solution = StarTracker(fov_deg=11.4).solve(image)
+solution = StarTracker(fov_deg=11.4).solve(draw_orion())
 if not solution:
     sys.exit(f"not solved: {solution.reason}")
 sigma = np.sqrt(np.diag(solution.covariance)) / ARCSECOND

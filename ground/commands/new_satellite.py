@@ -28,6 +28,7 @@ from ground.commands.satellite_questions import (
     COIL_EXAMPLE,
     COIL_QUESTIONS,
     QUESTIONS,
+    Apsides,
     Question,
     Values,
     check_values,
@@ -41,6 +42,7 @@ from ground.satellite_description import (
     derived,
     sun_synchronous_inclination,
 )
+from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.errors import UsageError
 from sim_hal.settings import OrbitSection
 from sim_hal.worlds.orbit import julian_date
@@ -241,13 +243,21 @@ class Answers:
     def _take(self, question: Question, texts: list[str]) -> None:
         """Read a value from its texts, and store it. Raises UsageError for an impossible value."""
         name = question.name
+        if name == "eccentricity" and name in self.values:
+            raise UsageError(f"--{name} {texts[-1]}: --altitude has perigee and apogee: omit this option")
+        found: Values = {}
         for text in texts:
             value = read_value(name, text)
-            self.values[name] = [*self.values.get(name, ()), *value] if name == "coil" else value
+            if isinstance(value, Apsides):
+                found = asdict(value)
+            else:
+                found[name] = [*found.get(name, ()), *value] if name == "coil" else value
         try:
+            self.values |= found
             check_values(name, self.values)
         except UsageError as error:
-            del self.values[name]
+            for one in found:
+                del self.values[one]
             raise UsageError(f"--{name} {' '.join(texts)}: {error}") from error
         self._texts[name] = texts
 
@@ -333,12 +343,17 @@ def _text(satellite: Satellite, values: Derived, path: Path) -> str:
     moments = ", ".join(f"{moment:.3g}" for moment in values.inertia)
     orbit, config = satellite.orbit, shlex.quote(str(path))
     ratio = values.coil_torque / values.disturbance
+    perigee, apogee = (
+        (EARTH_RADIUS + orbit.altitude) * (1.0 + sign * orbit.eccentricity) - EARTH_RADIUS
+        for sign in (-1.0, 1.0)
+    )
     lines = [
         ("written", str(path)),
         ("inertia", f"{moments} kg m^2, of a homogeneous cuboid"),
         (
             "orbit",
-            f"{1e-3 * orbit.altitude:g} km, {orbit.inclination_deg:.2f} deg, {values.period / 60.0:.1f} min",
+            f"{1e-3 * perigee:.0f} to {1e-3 * apogee:.0f} km, {orbit.inclination_deg:.2f} deg, "
+            f"{values.period / 60.0:.1f} min",
         ),
         (
             "coils",

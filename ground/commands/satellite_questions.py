@@ -30,6 +30,9 @@ _DENSITIES = (20.0, 20_000.0)
 """Range of the mean density, kg/m^3: from an empty box of thin sheet to solid tungsten."""
 _LOWEST_PERIGEE = 150.0
 """Lowest permitted perigee, km above the equatorial radius."""
+_ALTITUDES = (200.0, 2000.0)
+"""Range of the semi-major axis minus the Earth's radius, km."""
+_LARGEST_ECCENTRICITY = 0.1
 _HIGHEST_VOLTAGE = 36.0
 """Largest voltage across a coil, V."""
 _COIL_RANGES = {
@@ -144,6 +147,40 @@ def _read_size(text: str) -> Vector:
     return side(parts[0]), side(parts[1]), side(parts[2])
 
 
+@dataclass(frozen=True, slots=True)
+class Apsides:
+    """An elliptical orbit by its lowest and highest altitude.
+
+    Attributes:
+        altitude: semi-major axis minus the Earth's radius, km.
+        eccentricity: eccentricity of the orbit.
+    """
+
+    altitude: float
+    eccentricity: float
+
+
+def _read_altitude(text: str) -> float | Apsides:
+    """Return an altitude in km, or the orbit between two altitudes such as 450x900.
+
+    Raises ValueError with the permitted values.
+    """
+    mean = number(*_ALTITUDES, "km, or the altitudes of perigee and apogee such as 450x900")
+    ends = text.lower().split("x")
+    if len(ends) != 2:
+        return mean(text)
+    end = number(_LOWEST_PERIGEE, 4000.0, "km for perigee and apogee")
+    perigee, apogee = sorted((end(ends[0]), end(ends[1])))
+    altitude = 0.5 * (perigee + apogee)
+    eccentricity = 0.5 * (apogee - perigee) / (1e-3 * EARTH_RADIUS + altitude)
+    if eccentricity > _LARGEST_ECCENTRICITY:
+        raise ValueError(
+            f"the eccentricity is {eccentricity:.3g}: give a lower apogee, up to {_LARGEST_ECCENTRICITY:g}"
+        )
+    mean(f"{altitude}")
+    return Apsides(altitude, eccentricity)
+
+
 def _read_inclination(text: str) -> float | None:
     """Return an inclination in deg, or None for a Sun-synchronous orbit."""
     return None if text.lower() == "sso" else number(0.0, 180.0, "deg, or sso")(text)
@@ -181,11 +218,14 @@ QUESTIONS = (
     Question(
         "altitude",
         "KM",
-        "altitude of the orbit (semi-major axis minus 6378 km), km",
-        number(200.0, 2000.0, "km"),
+        "altitude of the orbit (semi-major axis minus 6378 km), km; or those of perigee and apogee, such as "
+        "450x900, without --eccentricity",
+        _read_altitude,
         "500",
     ),
-    Question("eccentricity", "E", "eccentricity of the orbit", number(0.0, 0.1, ""), "0.001"),
+    Question(
+        "eccentricity", "E", "eccentricity of the orbit", number(0.0, _LARGEST_ECCENTRICITY, ""), "0.001"
+    ),
     Question("inclination", "DEG", "inclination, deg, or sso for Sun-synchronous", _read_inclination, "sso"),
     Question(
         "local-time",

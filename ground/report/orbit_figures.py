@@ -29,7 +29,7 @@ from ground.report.orbit import (
     pointing_errors,
 )
 from ground.report.panels import RunSignals
-from ground.report.signals import seconds, true_rows
+from ground.report.signals import PowerHistory, seconds, true_rows
 from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
@@ -125,15 +125,18 @@ def knowledge_figure(signals: RunSignals) -> Figure | None:
 def pointing_figure(signals: RunSignals) -> Figure | None:
     """Return the picture of a flight in orbit, or None for a run without pointing.
 
-    The panels show the pointing error, rate, dipole, power and magnetic field, and modes with targets.
+    The panels show the pointing error, rate, dipole, power and magnetic field, and modes with targets. The
+    panel of the power is omitted if the power is not known.
     """
     run = signals.run
     found = pointing_errors(run)
     if not len(found.times):
         return None
-    figure = Figure(figsize=(10.9, 14.0), layout="constrained")
-    rows = figure.subplots(6, 1, sharex=True, height_ratios=(1.7, 1.0, 1.0, 1.0, 1.0, 0.8))
-    error, rate, dipole, power, field, mode = rows
+    spent = signals.power
+    heights = (1.7, 1.0, 1.0, *(() if spent is None else (1.0,)), 1.0, 0.8)
+    figure = Figure(figsize=(10.9, 14.0 / 6.5 * sum(heights)), layout="constrained")
+    rows = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+    error, rate, dipole, *powers, field, mode = rows
     _pointing_error(error, found)
     name = "truth" if len(run["truth"]) else "attitude"
     speed = np.degrees(np.linalg.norm(run[name]["rate"].astype(float), axis=1))
@@ -144,7 +147,8 @@ def pointing_figure(signals: RunSignals) -> Figure | None:
     panels.vectors(dipole, seconds(acting), 1e3 * acting["dipole"].astype(float))
     dipole.set_yscale("symlog", linthresh=1.0)
     panels.style(dipole, "dipole, mA m²", "Commanded dipole, pauses omitted", "")
-    _mean_power(power, signals)
+    if spent is not None:
+        _mean_power(powers[0], spent)
     _field(field, run)
     _modes(mode, run, signals.end)
     for ax in rows:
@@ -163,20 +167,18 @@ def _pointing_error(ax: Axes, found: AttitudeErrors) -> None:
     panels.style(ax, "error, deg", f"Pointing error about the body axes, {known} attitude", "")
 
 
-def _mean_power(ax: Axes, signals: RunSignals) -> None:
-    found = signals.power
-    if found is not None:
-        edges = np.arange(found.time[0], found.end + POWER_MEAN_S, POWER_MEAN_S)
-        place = np.digitize(found.time, edges) - 1
-        spans = np.bincount(place, found.spans, len(edges) - 1)
-        for name, power, colour in (
-            ("supply, V |I|", found.supply, panels.VERMILLION),
-            ("R I²", found.heat, panels.GREEN),
-        ):
-            spent = np.bincount(place, power * found.spans, len(edges) - 1)
-            mean = 1e3 * spent / np.where(spans > 0.0, spans, np.nan)
-            ax.stairs(np.maximum(mean, 1e-3), edges, color=colour, linewidth=1.0, label=name)
-        ax.set_yscale("log")
+def _mean_power(ax: Axes, found: PowerHistory) -> None:
+    edges = np.arange(found.time[0], found.end + POWER_MEAN_S, POWER_MEAN_S)
+    place = np.digitize(found.time, edges) - 1
+    spans = np.bincount(place, found.spans, len(edges) - 1)
+    for name, power, colour in (
+        ("supply, V |I|", found.supply, panels.VERMILLION),
+        ("R I²", found.heat, panels.GREEN),
+    ):
+        spent = np.bincount(place, power * found.spans, len(edges) - 1)
+        mean = 1e3 * spent / np.where(spans > 0.0, spans, np.nan)
+        ax.stairs(np.maximum(mean, 1e-3), edges, color=colour, linewidth=1.0, label=name)
+    ax.set_yscale("log")
     panels.style(ax, "power, mW", f"Coil power, mean over {POWER_MEAN_S:g} s", "")
 
 

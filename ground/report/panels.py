@@ -23,6 +23,7 @@ from ground.report.signals import (
     coil_power,
     covariance_matrices,
     estimated_attitude,
+    last_time,
     mean_rates,
     seconds,
     true_attitude,
@@ -72,8 +73,7 @@ class RunSignals:
     @cached_property
     def end(self) -> float:
         """Last time of the logs, s."""
-        ends = [seconds(self.run[name])[-1] for name in ("control", "truth") if len(self.run[name])]
-        return max(ends, default=0.0)
+        return last_time(self.run)
 
     @cached_property
     def current_limit(self) -> float:

@@ -90,6 +90,16 @@ def seconds(packets: PacketArray) -> FloatArray:
     return np.asarray(packets["time_ns"] / 1e9)
 
 
+def last_time(run: Run) -> float:
+    """Return the mission time (s) at which the logs of a run end, or 0 for empty logs.
+
+    A log that was downloaded from a satellite has no truth, and a satellite in orbit writes no control
+    packets, so the time is the newest one of five packet types.
+    """
+    names = ("control", "attitude", "health", "truth", "event")
+    return max((float(seconds(run[name])[-1]) for name in names if len(run[name])), default=0.0)
+
+
 def true_rows(truth: PacketArray, packets: PacketArray) -> IntArray:
     """Return for each packet (n,) the index of the truth at the same time, or -1 if there is none."""
     if not len(truth):
@@ -118,7 +128,7 @@ def estimated_attitude(run: Run) -> ThreadMotion:
 
 
 def coil_power(run: Run) -> PowerHistory | None:
-    """Return the coil power, or None if neither the truth nor the coil resistance is known.
+    """Return the coil power, or None if the log has neither the truth nor currents and resistances of coils.
 
     Without the truth, each written current is assumed to flow until the next control cycle.
     """

@@ -30,6 +30,7 @@ from ground.report.signals import (
     estimate_errors,
     estimated_attitude,
     failed_frames,
+    last_time,
     seconds,
     star_attitudes,
     streaks,
@@ -117,8 +118,7 @@ def _orbit_config(run: Run, notes: list[str]) -> OrbitConfig | None:
 
 def _identity(run: Run, attitude: ThreadMotion, notes: list[str]) -> Object:
     """Return configuration, software, seed and duration of a run."""
-    ends = [seconds(run[name])[-1] for name in ("control", "truth", "event") if len(run[name])]
-    identity: Object = {"folder": str(run.folder), "duration_s": max(ends, default=0.0), "cut_short": False}
+    identity: Object = {"folder": str(run.folder), "duration_s": last_time(run), "cut_short": False}
     if attitude.source == "estimate":
         notes.append("no truth log: judged on the estimate")
     if not len(run["run"]):
@@ -158,7 +158,7 @@ def _power(run: Run, power: PowerHistory | None, notes: list[str]) -> Object:
         **dict.fromkeys(sums, math.nan),
     }
     if power is None or power.spans.sum() <= 0.0:
-        notes.append("power not known: the log has neither truth nor coil resistance")
+        notes.append("power not known: the log has neither the truth nor the currents of the coils")
         return found
     supply = power.average(power.supply), float(power.supply.max()), power.energy(power.supply)
     heat = power.average(power.heat), power.energy(power.heat)

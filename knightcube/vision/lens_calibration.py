@@ -25,6 +25,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.attitude.solvers import solve
 from knightcube.astro.attitude.wahba import AttitudeError
 from knightcube.errors import UsageError
+from knightcube.vision.camera.images import grey_image
 from knightcube.vision.camera.lens import SHAPE_TERMS, CameraModel, Lens, LensError
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.lens_knowledge import (
@@ -507,7 +508,8 @@ def calibrate_lens(
     behind a mirror or with reversed rows, they are mirrored back for the calibration.
 
     Args:
-        images: arrays (rows, columns) of counts, all of one shape.
+        images: arrays (rows, columns) of counts, all of one shape. The luminance of colour images
+            (rows, columns, 3) is used.
         fov_deg: approximate field of view across the columns, deg. If `fov_deg` is None, fields from 4 to 60
             deg are tried.
         progress: function that is called before each image with the pass and the image number, both from 1.
@@ -517,6 +519,7 @@ def calibrate_lens(
         InputError: if the field of view is not between 1 and 120 deg.
         CalibrationError: if the solved images do not determine a lens.
     """
+    images = [grey_image(image) for image in images]
     if len({image.shape for image in images}) != 1:
         raise UsageError("a calibration needs images of one camera, all of one shape")
     sky = default_index()

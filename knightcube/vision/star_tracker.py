@@ -18,13 +18,20 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.earth.sun import J2000, earth_velocity, julian_date
 from knightcube.errors import InputError
+from knightcube.vision.camera.images import grey_image
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Pinhole
 from knightcube.vision.frame_job import found_in_image
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex, load_once
 from knightcube.vision.startracker.sky_map import ASPECT, Pointing, SkyMap
-from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, RatePrior, SolveSettings
+from knightcube.vision.startracker.solve import (
+    AttitudePrior,
+    FrameSolution,
+    RatePrior,
+    SolveSettings,
+    SolveStatus,
+)
 from knightcube.vision.streaks.streak_result import StreakStatus
 
 UNKNOWN_FOV_DEG = 4.0, 60.0
@@ -219,7 +226,8 @@ class StarTracker:
 
         Args:
             image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger.
-                Larger values are brighter. Colour images must be converted to grey values first.
+                Larger values are brighter. The luminance of a colour image (rows, columns, 3) is used; the
+                colours are red, green and blue, and a fourth channel of transparency is ignored.
             exposure: exposure time, s. The exposure time is only needed for the rate of streaked stars.
             utc: date of the image, which is UTC if it has no time zone. The date is used for proper motion
                 and for aberration by the Earth's velocity, which is at most 20.5". If `utc` is None, the
@@ -233,13 +241,11 @@ class StarTracker:
             rate_sigma: standard deviation of each component of the predicted rate, rad/s.
 
         Raises:
-            ValueError: if the image is not two-dimensional, is smaller than 16 x 16 pixels, or has non-finite
+            ValueError: if the image has another shape, is smaller than 16 x 16 pixels, or has non-finite
                 values.
             InputError: if the image does not have the size of the camera.
         """
-        image = np.asarray(image)
-        if image.ndim != 2:
-            raise ValueError(f"an image of shape {image.shape}: give (rows, columns)")
+        image = grey_image(image)
         camera, scale = self._camera_for(image.shape)
         sky, settings = self._index, self._settings
         if utc is not None:
@@ -254,6 +260,10 @@ class StarTracker:
         found = found_in_image(image, camera, scale, seconds, sky, settings, attitudes, rates, self.lens)
         self.lens, frame = found.lens, found.solution
         assert frame is not None  # the settings of the star tracker are given
+        if frame.status is SolveStatus.NO_MATCH and scale[0] < scale[1]:
+            low, high = (math.degrees(field_of_view(camera.rescaled(1.0 / limit))) for limit in scale)
+            searched = f"fields of view of {low:.3g} to {high:.3g} deg were searched"
+            frame = replace(frame, reason=f"{frame.reason}; {searched}")
         return _solution(frame, sky, settings.velocity, exposure is not None)
 
     def _described(self, camera: CameraModel, scale: tuple[float, float]) -> LensKnowledge:

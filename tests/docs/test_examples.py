@@ -14,7 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from knightcube.vision.startracker.sky_map import Pointing
 from tests.docs.blocks import ROOT
+from tests.knightcube.vision.startracker.frames import sky_frame
+from tests.support.fits_files import fits_file
 
 EXAMPLES = ROOT / "docs" / "examples"
 
@@ -59,16 +62,38 @@ def test_an_extension_changes_few_files(name: str, most: int) -> None:
     assert 1 <= len(files_of(name)) <= most
 
 
-def test_the_star_tracker_solves_the_image_of_its_example(tmp_path: Path) -> None:
+def test_the_star_tracker_solves_the_image_of_its_example() -> None:
     """Alnilam, HIP 26311, V 1.69, stands near the middle of the field that the script draws."""
     script = str(EXAMPLES / "star_tracker.py")
     printed = run([script], ROOT).stdout.splitlines()
     assert printed[0] == "right ascension  84.050 deg"
     assert printed[1] == "declination      -1.200 deg"
     assert "HIP 26311        V 1.69 at pixel 511" in printed[6]
-    dark = tmp_path / "dark.npy"
-    np.save(dark, np.random.default_rng(2).poisson(100.0, (64, 64)))
-    assert "not solved: " in run([script, str(dark)], ROOT, status=1).stderr
+
+
+def test_own_pictures_of_any_kind_are_solved_or_refused_with_a_reason(tmp_path: Path) -> None:
+    """The same stars in grey, in colour, mirrored and as FITS, a picture without stars, and a text file."""
+    pillow = pytest.importorskip("PIL.Image", reason="needs Pillow, the extra `images`")
+    frame = sky_frame(np.random.default_rng(31), 0.0, 0.2)
+    bright = (frame.pixels / frame.pixels.max() * 255.0).astype(np.uint8)
+    pillow.fromarray(frame.pixels).save(tmp_path / "grey.png")
+    pillow.fromarray(np.repeat(bright[..., None], 3, axis=2)).save(tmp_path / "colour.png")
+    pillow.fromarray(bright[:, ::-1]).save(tmp_path / "mirrored.tif")
+    (tmp_path / "stars.fits").write_bytes(fits_file(frame.pixels.astype(">i4"), 32))
+    pillow.fromarray(np.zeros((64, 64), dtype=np.uint8)).save(tmp_path / "dark.jpg")
+    (tmp_path / "notes.txt").write_text("not a picture")
+    names = ("grey.png", "colour.png", "mirrored.tif", "stars.fits", "dark.jpg", "notes.txt")
+    printed = run([str(EXAMPLES / "own_pictures.py"), *(str(tmp_path / name) for name in names)], ROOT).stdout
+    lines = [line.removeprefix(f"{tmp_path}/") for line in printed.splitlines()]
+    sky = Pointing.of(frame.attitude)
+    for name, line in zip(names[:4], lines, strict=False):
+        ascension, declination = (float(word) for word in line.split()[1:3])
+        assert line.startswith(f"{name}: ")
+        assert ascension == pytest.approx(math.degrees(sky.right_ascension), abs=0.03)
+        assert declination == pytest.approx(math.degrees(sky.declination), abs=0.01)
+        assert line.endswith(", mirrored") == (name == "mirrored.tif")
+    assert lines[4].startswith("dark.jpg: no-stars: ")
+    assert lines[5].startswith("notes.txt: is not a PNG, TIFF, JPEG, BMP or FITS image")
 
 
 def test_the_step_of_its_example_is_optimal_within_its_horizon() -> None:

@@ -1,6 +1,6 @@
 """Reads image files as arrays (PNG, TIFF, JPEG and BMP through Pillow, and FITS) and writes images.
 
-    pixels = read_image(Path("night.fits"))      # counts (rows, columns), unchanged from the file
+    pixels = read_image("night.fits")      # counts (rows, columns), unchanged from the file
     pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # pixels without a header
     write_picture(Path("found.png"), grey_stretch(pixels))
 
@@ -115,9 +115,33 @@ def _axes(header: dict[str, str], name: str) -> list[int]:
     return axes
 
 
+def grey_image(pixels: npt.ArrayLike) -> Image:
+    """Return an image (rows, columns) of grey values from an array of grey or colour pixels.
+
+    A grey image (rows, columns) is returned unchanged. Colours (rows, columns, 3) in the order red, green and
+    blue, with or without a fourth channel of transparency, are converted to luminance (ITU-R BT.601) of the
+    same type; transparency is ignored. A third axis of length 1, or of 2 for grey and transparency, is
+    removed. Raises ValueError for other shapes.
+    """
+    if isinstance(pixels, (str, Path)):
+        raise ValueError(f"{pixels}: give an array of pixels, such as read_image({str(pixels)!r})")
+    image = np.asarray(pixels)
+    if image.ndim == 2:
+        return image
+    if image.ndim == 3 and image.shape[2] in (1, 2):
+        return image[..., 0]
+    if image.ndim == 3 and image.shape[2] in (3, 4):
+        return _grey_of_planes(np.moveaxis(image[..., :3], -1, 0))
+    raise ValueError(
+        f"an image of shape {image.shape}: give (rows, columns), or (rows, columns, 3) for colours"
+    )
+
+
 def _grey_of_planes(planes: Image) -> Image:
     """Return the luminance (rows, columns) of three colour planes (3, rows, columns), in their type."""
-    grey = np.tensordot(_LUMINANCE, planes.astype(np.float64), 1)
+    grey = np.zeros(planes.shape[1:])
+    for weight, plane in zip(_LUMINANCE, planes, strict=True):
+        grey += weight * plane
     return np.asarray((np.rint(grey) if planes.dtype.kind in "iu" else grey).astype(planes.dtype))
 
 
@@ -207,7 +231,7 @@ def _real(header: dict[str, str], keyword: str, otherwise: float, name: str) -> 
 
 
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
-EXTRA = "pip install 'knightcube-flight[images]'"
+EXTRA = "pip install pillow"
 
 PHOTOMETRIC_INTERPRETATION, WHITE_IS_ZERO = 262, 0
 """The TIFF tag PhotometricInterpretation and its value WhiteIsZero (TIFF 6.0, section 8)."""
@@ -226,14 +250,16 @@ _OTHER_BYTES = {
 }
 
 
-def read_image(path: Path) -> Image:
+def read_image(path: Path | str) -> Image:
     """Return the image (rows, columns) of a FITS, PNG, TIFF, JPEG or BMP file.
 
     The format is recognised by the file's content, not by its name. Pixels are uint8 or uint16, and those of
     FITS files may also be signed, 32-bit or floating-point. Colour images are converted to luminance (ITU-R
-    BT.601). Raises UsageError if the file is missing, damaged or of another format, or if pixels are not
-    finite.
+    BT.601). Photographs are rotated as their EXIF data state. All formats but FITS need Pillow. Raises
+    UsageError if the file is missing, damaged or of another format, if pixels are not finite, or if Pillow
+    is missing.
     """
+    path = Path(path)
     content = _fits_content(path)
     return fits_image(content, str(path)) if content else _through_pillow(path)
 

@@ -341,10 +341,9 @@ def _reach(k1: float, k2: float) -> float:
 def check_image(image: Image, camera: CameraModel) -> None:
     """Raise ValueError unless an image has the size (rows, columns) of a camera and finite pixels."""
     if image.shape != (camera.rows, camera.columns):
-        size = " x ".join(str(number) for number in reversed(image.shape))
         raise ValueError(
-            f"an image of {size} pixels, but the camera has {camera.columns} x {camera.rows}: "
-            "give (rows, columns) of its size"
+            f"an image of shape {image.shape}, but the camera has {camera.columns} x {camera.rows} pixels: "
+            f"give ({camera.rows}, {camera.columns}) grey values"
         )
     if image.dtype.kind == "f" and not np.all(np.isfinite(image)):
         raise ValueError("an image with pixels that are not finite")

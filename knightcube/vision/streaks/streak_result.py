@@ -200,7 +200,7 @@ def validate(
     """Raise FlightError if the frame, exposure (s), prior rate (rad/s) or prior deviation is invalid."""
     expected = (pinhole.rows, pinhole.columns)
     if pixels.shape != expected:
-        raise FlightError(f"frame of shape {pixels.shape}, the camera has {expected}: set the camera's size")
+        raise FlightError(f"frame of shape {pixels.shape}: the camera needs grey values of shape {expected}")
     if not np.issubdtype(pixels.dtype, np.unsignedinteger):
         raise FlightError(f"frame of {pixels.dtype}: pass the raw counts as unsigned integers")
     if not (np.isfinite(exposure) and exposure > 0.0):

@@ -167,6 +167,13 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
             ("--altitude", "500", "--eccentricity", "0.1"),
             "the perigee is at -188 km, below 150 km: at 500 km give",
         ),
+        (
+            ("--altitude", "450x900", "--eccentricity", "0.03"),
+            "--eccentricity 0.03: --altitude has perigee and apogee: omit this option",
+        ),
+        (("--altitude", "100x900"), "--altitude 100x900: give a number from 150 to 4000 km for perigee"),
+        (("--altitude", "300x3000"), "--altitude 300x3000: the eccentricity is 0.168: give a lower apogee"),
+        (("--altitude", "150x200"), "--altitude 150x200: give a number from 200 to 2000 km, or the"),
         (("--inclination", "polar"), "--inclination polar: give a number from 0 to 180 deg, or sso"),
         (("--utc", "noon"), "--utc noon: give a time such as 2026-03-20T12:00:00"),
         (("--coil", "strong"), "--coil strong: 'strong' is unknown: give coils such as axis=xyz,dipole="),
@@ -224,6 +231,28 @@ def test_a_folder_is_not_replaced(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert "mine.yaml: cannot be written: Is a directory" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
+
+
+def test_an_ellipse_is_given_by_perigee_and_apogee(tmp_path: Path) -> None:
+    words = (*GIVEN, "--inclination", "63", "--json", "--out")
+    by_ends = command("new-satellite", *words, tmp_path / "a.yaml", "--altitude", "450x900")
+    given = ("--altitude", "675", "--eccentricity", "0.031901")
+    by_axis = command("new-satellite", *words, tmp_path / "b.yaml", *given)
+    assert by_ends.returncode == by_axis.returncode == 0, by_ends.stderr + by_axis.stderr
+    ends, axis = (json.loads(done.stdout) for done in (by_ends, by_axis))
+    assert "--altitude 450x900" in ends["command"]
+    assert "eccentricity" not in ends["command"]
+    for name, value in axis["derived"].items():
+        assert ends["derived"][name] == pytest.approx(value, rel=1e-4), name
+
+
+def test_the_worst_drag_is_that_at_the_perigee(tmp_path: Path) -> None:
+    worst = {}
+    for orbit in ("450x450", "450x900", "900x900"):
+        words = (*GIVEN, "--altitude", orbit, "--json", "--out", tmp_path / f"{orbit}.yaml")
+        worst[orbit] = json.loads(command("new-satellite", *words).stdout)["derived"]["disturbance"]
+    assert worst["450x900"] == pytest.approx(worst["450x450"], rel=0.01)
+    assert worst["450x900"] > 1.5 * worst["900x900"]
 
 
 def test_weak_coils_are_warned_of(tmp_path: Path) -> None:

@@ -117,6 +117,24 @@ def test_without_the_configuration_nothing_is_judged_and_the_report_says_so(
     assert any(note.startswith("pointing and requirements not judged") for note in summary["notes"])
 
 
+def test_a_downloaded_log_without_truth_is_reported_to_its_end(folder: Path, tmp_path: Path) -> None:
+    for name in ("flight-0001.ccsds", "config.yaml"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    run = read_run(tmp_path)
+    assert summarise(run)["run"]["duration_s"] == DURATION_S - PERIOD_S
+    pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
+    from ground.report.orbit_figures import pointing_figure  # noqa: PLC0415 - needs matplotlib
+    from ground.report.panels import RunSignals  # noqa: PLC0415 - needs matplotlib
+
+    signals = RunSignals(run)
+    assert signals.end == DURATION_S - PERIOD_S
+    figure, with_power = pointing_figure(signals), pointing_figure(RunSignals(read_run(folder)))
+    assert figure is not None
+    assert with_power is not None
+    titles = [[ax.get_title(loc="left") for ax in drawn.axes] for drawn in (figure, with_power)]
+    assert [sum(title.startswith("Coil power") for title in found) for found in titles] == [0, 1]
+
+
 def test_the_pictures_of_an_orbit_are_drawn(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
     names = {path.stem for path in draw(read_run(folder), tmp_path)}

@@ -203,7 +203,7 @@ def test_a_run_without_its_identity_is_still_reported(tmp_path: Path) -> None:
     assert coil_power(run) is None
     summary = summarise(run)
     assert "no run packet: the configuration of this run is not known" in summary["notes"]
-    assert "power not known: the log has neither truth nor coil resistance" in summary["notes"]
+    assert any(note.startswith("power not known") for note in summary["notes"])
     assert [step["complete"] for step in summary["steps"]] == [True, True, False]
     assert format_report(summary)
 

@@ -128,6 +128,22 @@ def test_streaks_give_the_rate_and_a_prediction_its_sign() -> None:
     assert tracker.solve(frame.pixels).rate is None
 
 
+def test_a_wrong_field_of_view_is_refused_with_the_searched_fields(resting: SkyFrame) -> None:
+    solution = StarTracker(fov_deg=30.0, fov_error_deg=3.0).solve(resting.pixels)
+    assert solution.status == "no-match"
+    assert solution.reason.endswith("; fields of view of 27 to 33 deg were searched")
+
+
+def test_a_colour_image_has_the_solution_of_its_luminance(resting: SkyFrame) -> None:
+    """Pixels of one brightness in all colours have this brightness as luminance."""
+    colours = np.repeat(resting.pixels[..., None], 4, axis=2)
+    colours[..., 3] = 7  # transparency
+    tracker = StarTracker(fov_deg=12.0)
+    grey = tracker.solve(resting.pixels)
+    for image in (colours, colours[..., :3], colours[..., :1]):
+        np.testing.assert_array_equal(tracker.solve(image).quaternion, grey.quaternion)
+
+
 def test_a_predicted_attitude_is_used_and_a_wrong_one_does_no_harm(resting: SkyFrame) -> None:
     tracker = StarTracker(camera=resting.camera.pinhole)
     near = tracker.solve(resting.pixels, attitude=resting.attitude, attitude_sigma=1e-3)
@@ -162,8 +178,10 @@ def test_wrong_arguments_are_refused_with_the_value(tmp_path: Path) -> None:
         StarTracker(index=tmp_path / "none.index")
     with pytest.raises(InputError, match="48 x 64 pixels, but the camera has 64 x 48"):
         StarTracker(camera=lens, index=sky()).solve(np.zeros((64, 48)))
-    with pytest.raises(ValueError, match=r"shape \(4, 4, 3\)"):
-        StarTracker().solve(np.zeros((4, 4, 3)))
+    with pytest.raises(ValueError, match=r"shape \(3, 64, 64\): give \(rows, columns\), or"):
+        StarTracker().solve(np.zeros((3, 64, 64)))
+    with pytest.raises(ValueError, match=r"night\.png: give an array of pixels, such as read_image\('night"):
+        StarTracker().solve("night.png")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="16 or more"):
         StarTracker().solve(np.zeros((8, 8)))
 

@@ -283,7 +283,7 @@ def test_a_photograph_from_orbit_is_fitted_to_less_than_half_a_pixel() -> None:
 
 
 def test_a_frame_of_another_size_than_the_camera_is_refused(day: tuple[EarthScene, Image]) -> None:
-    with pytest.raises(ValueError, match="256 x 512 pixels, but the camera has 512 x 512"):
+    with pytest.raises(ValueError, match=r"shape \(512, 256\), but the camera has 512 x 512"):
         find_nadir(day[1][:, :256], MODEL.lens)
     with pytest.raises(ValueError, match="not finite"):
         find_nadir(np.full((512, 512), np.nan), MODEL.lens)
