@@ -97,9 +97,13 @@ class I2cServer:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(str(path))
         self._listener.listen(16)
-        self._selector = selectors.DefaultSelector()
+        self._selector = selectors.EpollSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
         self._received: dict[socket.socket, bytearray] = {}
+
+    def fileno(self) -> int:
+        """Return the file descriptor that becomes readable when a request arrives, for `select`."""
+        return self._selector.fileno()
 
     def serve(self, wait: float) -> None:
         """Answer the requests that arrive during the next `wait` s."""
@@ -189,7 +193,7 @@ def emulate(options: argparse.Namespace) -> int:
         path = Path(folder) / "bus.sock"
         environment = {
             "LD_PRELOAD": str(library()),
-            "KNIGHTCUBE_I2C": str(path),
+            "KNIGHTCUBE_I2C_SOCKET": str(path),
             "KNIGHTCUBE_I2C_BUS": str(options.bus),
         }
         server = I2cServer(wires.i2c(), path)

@@ -4,7 +4,8 @@
  * and the ioctls of linux/i2c-dev.h on that descriptor become requests. All other files go to the C library.
  * Descriptors are recognised by their socket's inode, so copies by dup and fork work, and nothing is left behind
  * by a close. A program that looks for the device by stat or access finds it; a listing of /dev does not show it.
- * Environment: KNIGHTCUBE_I2C, the socket; KNIGHTCUBE_I2C_BUS, the bus's number.
+ * Environment: KNIGHTCUBE_I2C_SOCKET, the socket; KNIGHTCUBE_I2C_BUS, the bus's number, or its device file if that
+ * has another name, such as one made by udev.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -47,7 +48,11 @@ static int is_bus(const char *path)
 {
     const char *number = getenv("KNIGHTCUBE_I2C_BUS");
     char name[64];
-    if (path == NULL || number == NULL || getenv("KNIGHTCUBE_I2C") == NULL || strncmp(path, "/dev/i2c", 8) != 0)
+    if (path == NULL || number == NULL || getenv("KNIGHTCUBE_I2C_SOCKET") == NULL)
+        return 0;
+    if (number[0] == '/')
+        return strcmp(path, number) == 0;
+    if (strncmp(path, "/dev/i2c", 8) != 0)
         return 0;
     snprintf(name, sizeof name, "/dev/i2c-%s", number);
     if (strcmp(path, name) == 0)
@@ -76,7 +81,7 @@ static int open_bus(int flags)
     int fd = socket(AF_UNIX, SOCK_STREAM | (flags & O_CLOEXEC ? SOCK_CLOEXEC : 0), 0);
     if (fd < 0)
         return -1;
-    strncpy(place.sun_path, getenv("KNIGHTCUBE_I2C"), sizeof place.sun_path - 1);
+    strncpy(place.sun_path, getenv("KNIGHTCUBE_I2C_SOCKET"), sizeof place.sun_path - 1);
     if (connect(fd, (struct sockaddr *)&place, sizeof place) != 0 || fstat(fd, &status) != 0) {
         close(fd);
         errno = ENODEV; /* the server is gone */
@@ -293,7 +298,7 @@ OPENAT(__openat64_2)
     { \
         int bus = is_bus(path); \
         if (bus) \
-            path = getenv("KNIGHTCUBE_I2C"); \
+            path = getenv("KNIGHTCUBE_I2C_SOCKET"); \
         int done = ((int (*)(const char *, struct kind *))next(#name))(path, status); \
         if (bus && done == 0) { \
             status->st_mode = S_IFCHR | 0660; \
@@ -308,7 +313,7 @@ OPENAT(__openat64_2)
         int (*plain)(int, const char *, struct kind *, int) = next(#name); \
         if (!is_bus(path)) \
             return plain(folder, path, status, flags); \
-        int done = plain(AT_FDCWD, getenv("KNIGHTCUBE_I2C"), status, 0); \
+        int done = plain(AT_FDCWD, getenv("KNIGHTCUBE_I2C_SOCKET"), status, 0); \
         status->st_mode = S_IFCHR | 0660; \
         status->st_rdev = makedev(I2C_MAJOR, atoi(getenv("KNIGHTCUBE_I2C_BUS"))); \
         return done; \
@@ -323,11 +328,11 @@ STATAT(fstatat64, stat64)
 
 int access(const char *path, int mode)
 {
-    return ((int (*)(const char *, int))next("access"))(is_bus(path) ? getenv("KNIGHTCUBE_I2C") : path, mode);
+    return ((int (*)(const char *, int))next("access"))(is_bus(path) ? getenv("KNIGHTCUBE_I2C_SOCKET") : path, mode);
 }
 
 int faccessat(int folder, const char *path, int mode, int flags)
 {
     int (*plain)(int, const char *, int, int) = next("faccessat");
-    return is_bus(path) ? plain(AT_FDCWD, getenv("KNIGHTCUBE_I2C"), mode, 0) : plain(folder, path, mode, flags);
+    return is_bus(path) ? plain(AT_FDCWD, getenv("KNIGHTCUBE_I2C_SOCKET"), mode, 0) : plain(folder, path, mode, flags);
 }

@@ -138,6 +138,10 @@ class DeviceServer:
         """Stop serving the devices; this method is also a signal handler."""
         self._stopped = True
 
+    def attend(self, descriptor: int, answer: Callable[[], None]) -> None:
+        """Call `answer` whenever `descriptor` is readable, with the devices advanced to the present."""
+        self._selector.register(descriptor, selectors.EVENT_READ, answer)
+
     def serve(self, patience_ns: int | None = None) -> None:
         """Advance the devices and answer requests, until stopped or for `patience_ns` without clients."""
         left_ns: int | None = None
@@ -163,6 +167,9 @@ class DeviceServer:
                     self._accept()
                 elif key.fd in self._connections:
                     self._serve_client(self._connections[key.fd])
+                elif key.data is not None:
+                    self.hardware.simulation.advance_to(self._clock.now_ns())
+                    key.data()
 
     def close(self) -> None:
         """Release everything."""
@@ -243,12 +250,12 @@ class DeviceServer:
             "select": select,
             "exchange": exchange,
             "spi": spi,
-            "release": lambda _, *a: self._release(*a),
+            "release": lambda _, *a: self.release(*a),
             "currents": lambda _: self.hardware.circuit.currents().tolist(),
             "trigger": trigger,
         }
 
-    def _release(self, epoch_ns: int, faults: Sequence[str] = (), flight_process: int | None = None) -> None:
+    def release(self, epoch_ns: int, faults: Sequence[str] = (), flight_process: int | None = None) -> None:
         """Release the body and schedule the faults of a flight process."""
         self.hardware.release(epoch_ns)
         generator = self._faults_drawn

@@ -42,7 +42,7 @@ class Tools:
         shutil.copy(Path(smbus_byte.__file__), self.folder)
         self.put("i2cset", 1)
         (self.folder / "bin/python3").write_text(
-            f"#!/bin/sh\nexport LD_PRELOAD={library()} KNIGHTCUBE_I2C={bus} KNIGHTCUBE_I2C_BUS=7\n"
+            f"#!/bin/sh\nexport LD_PRELOAD={library()} KNIGHTCUBE_I2C_SOCKET={bus} KNIGHTCUBE_I2C_BUS=7\n"
             f'exec {sys.executable} "$@"\n',
             encoding="utf-8",
         )

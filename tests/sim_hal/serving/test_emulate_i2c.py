@@ -183,6 +183,17 @@ def test_the_flights_own_driver_reads_it(environment: Mapping[str, str]) -> None
     assert said == "[57, 159]\n"
 
 
+def test_a_bus_with_a_name_of_its_own_is_opened_by_this_name_only(environment: Mapping[str, str]) -> None:
+    """The unit's KNIGHTCUBE_I2C, which is the device for `coils-off`, does not disturb the emulation."""
+    named = {**environment, "KNIGHTCUBE_I2C_BUS": "/dev/knightcube-i2c", "KNIGHTCUBE_I2C": "/dev/i2c-1"}
+    script = """
+    import os
+    from hal.buses.i2c_bus import LinuxI2cBus
+    print(LinuxI2cBus("/dev/knightcube-i2c").read_i2c_block_data(0x45, 0, 2), os.path.exists("/dev/i2c-7"))
+    """
+    assert run(named, script) == "[57, 159] False\n"
+
+
 def test_a_program_runs_beside_the_server_and_gives_its_status() -> None:
     script = "import os; os.open('/dev/i2c-1', os.O_RDWR); os._exit(7)"
     done = subprocess.run([*COMMAND, "--", sys.executable, "-c", script], timeout=20, check=False)
@@ -190,7 +201,7 @@ def test_a_program_runs_beside_the_server_and_gives_its_status() -> None:
 
 
 def test_a_bus_whose_server_is_gone_does_not_answer(environment: Mapping[str, str]) -> None:
-    gone = {**environment, "KNIGHTCUBE_I2C": "/nonexistent/bus.sock"}
+    gone = {**environment, "KNIGHTCUBE_I2C_SOCKET": "/nonexistent/bus.sock"}
     script = """
     import os
     try:

@@ -1,0 +1,98 @@
+"""Checks and starts a flight with Video for Linux cameras whose frames are those of emulated cameras.
+
+`python -m tests.deploy.emulated_video CONFIG SOCKET WORDS...` runs `knightcube check CONFIG --json`, and then
+`knightcube WORDS...`. The cameras of CONFIG are those of the device server at SOCKET, numbered in the order
+of CONFIG. Only the kernel's side of /dev/videoN is replaced, which answers the ioctls of the driver; the
+memory maps of the driver are real.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.app.cli import main
+from flight.schema import reader
+from flight.schema.devices import Camera, V4l2Device, WideCamera
+from hal.buses.clock import SystemClock
+from hal.drivers import v4l2_camera as v4l2
+from sim_hal.rig import RemoteFrameSource
+from tests.hal.cameras.ioctl_camera import IoctlCamera, Knob
+
+STAR_INTERVAL_NS, WIDE_INTERVAL_NS = 500_000_000, 1_000_000_000
+"""Shortest intervals (ns) of the frames of a free-running star camera and wide camera.
+
+Each frame is rendered, also if the driver selects another one.
+"""
+PATIENCE_NS = 3_000_000_000
+"""Time (ns) after an exposure at which a frame that has not arrived is given up."""
+
+
+class ServedVideo(IoctlCamera):
+    """A free-running camera whose frames are rendered by a device server.
+
+    A frame is exposed after the previous frame has arrived, so that the interval of the frames depends on the
+    duration of the rendering.
+    """
+
+    def __init__(self, camera: Camera | WideCamera, source: RemoteFrameSource, clock: SystemClock) -> None:
+        """Appear at the device file of `camera`, in an existing folder."""
+        device = camera.device
+        assert isinstance(device, V4l2Device)
+        super().__init__(Path(device.path).parent, clock.now_ns)
+        assert str(self.path) == device.path
+        self.sizes = {device.pixel_format: (camera.columns, camera.rows)}
+        self.knobs[v4l2.EXPOSURE_ABSOLUTE] = Knob(1, 50_000, 157)
+        self._source = source
+        self._interval_ns = STAR_INTERVAL_NS if isinstance(camera, Camera) else WIDE_INTERVAL_NS
+        self._abandoned_ns = 0
+
+    @property
+    def inode(self) -> int:
+        """The number of the file that an opened device is."""
+        return os.fstat(self._memory).st_ino
+
+    def _streamon(self, argument: Any) -> None:
+        super()._streamon(argument)
+        self._abandoned_ns = 0
+
+    def _run(self) -> None:
+        """Finish the frame that has arrived, and begin the next exposure when it is due."""
+        if not self._streaming:
+            return
+        frame, now_ns = self._source.poll(), self._now_ns()
+        if frame is not None and self._abandoned_ns:
+            self.raw = np.ascontiguousarray(frame.pixels).tobytes()
+            end_ns = frame.exposure_start_ns + frame.exposure_ns + self.readout_ns
+            self._finish(frame.exposure_start_ns, end_ns, frame.exposure_ns)
+            self._next_ns = max(now_ns, frame.exposure_start_ns + self._interval_ns)
+            self._abandoned_ns = 0
+        if now_ns >= (self._abandoned_ns or self._next_ns):
+            exposure_ns = self.knobs[v4l2.EXPOSURE_ABSOLUTE].value * v4l2.EXPOSURE_UNIT_NS
+            self._source.trigger(exposure_ns)
+            self._abandoned_ns = now_ns + exposure_ns + PATIENCE_NS
+
+
+def plug(path: Path, socket: Path) -> None:
+    """Plug in the cameras of a configuration, so that the driver for Video for Linux finds them."""
+    config, clock = reader.load(path), SystemClock()
+    cameras = [camera for camera in (config.camera, *config.wide_cameras) if camera is not None]
+    videos = [
+        ServedVideo(camera, RemoteFrameSource(socket, clock, number), clock)
+        for number, camera in enumerate(cameras)
+    ]
+    by_inode = {video.inode: video for video in videos}
+
+    def ioctl(descriptor: int, request: int, argument: Any) -> int:
+        return by_inode[os.fstat(descriptor).st_ino](descriptor, request, argument)
+
+    vars(v4l2)["ioctl"] = ioctl  # the kernel's side
+
+
+if __name__ == "__main__":
+    plug(Path(sys.argv[1]), Path(sys.argv[2]))
+    raise SystemExit(main(["check", sys.argv[1], "--json"]) or main(sys.argv[3:]))

@@ -1,0 +1,246 @@
+"""The configurations of boards, checked and started as on a board, with every device of theirs emulated.
+
+The flight software uses its drivers of real devices: serial ports are pseudo-terminals, the I2C bus is
+/dev/i2c-N or a name made by udev, through the preload library, and cameras answer the ioctls of Video for
+Linux with rendered frames. No virtual camera of the kernel replaces the rendered frames: `vivid` and
+`v4l2loopback` have no control of the exposure time, and the driver refuses a camera without this control.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import select
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from flight.link.telemetry.packets import PacketArray
+from ground.telemetry import Run, read_run
+from hal.buses import smbus_byte
+from sim_hal.serving.device_link import RemoteI2cBus, open_bus
+from tests.deploy.scripts import DEPLOY, ROOT, dropin
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        not any(map(shutil.which, ("cc", "gcc", "clang"))),
+        reason="no C compiler builds the preload library",
+    ),
+    pytest.mark.timeout(300),
+]
+PATIENCE_S = 120.0
+"""Longest time (s) until every device has been read, on a busy machine."""
+WORLDS = {"board_testbed": "step_demo", "board_orbit": "orbit"}
+"""Configurations with the worlds in which the devices of the boards are emulated."""
+DEVICES = {
+    "board_testbed": {"inertial_unit", "coils", "power_monitor", "camera", "commands.socket"},
+    "board_orbit": {
+        "inertial_unit", "coils", "power_monitor", "camera", "wide_cameras[0]", "wide_cameras[1]", "gps",
+        "solar_strings", "commands.socket",
+    },
+}  # fmt: skip
+"""Devices that `knightcube check` must find."""
+GYRO_NOISE = 5e-4
+"""Standard deviation (rad/s) of the norm of a reading of the gyro, rounded up."""
+
+
+@dataclass(frozen=True)
+class Flown:
+    """A flight that the unit's commands started and SIGTERM ended.
+
+    Attributes:
+        found: devices that `knightcube check` found before the flight.
+        run: packets of the flight.
+        driven: whether the coils carried current during the flight.
+        currents: currents (A) of the coils after the flight process had ended.
+        statuses: exit statuses of the unit's commands before, of and after the flight.
+        said: what the flight wrote on standard output and standard error.
+    """
+
+    found: set[str]
+    run: Run
+    driven: bool
+    currents: list[float]
+    statuses: list[int]
+    said: str
+
+
+def board_text(name: str, folder: Path) -> str:
+    """Return a board's configuration for devices in `folder`, a busy machine and a short flight.
+
+    The inhibit after separation is shortened. The testbed turns to another angle every 10 s, so that the
+    frames have streaks.
+    """
+    text = (ROOT / "config" / f"{name}.yaml").read_text(encoding="utf-8")
+    text = re.sub(r"/dev/knightcube-(camera|wide-\d)", rf"{folder}/knightcube-\1/camera", text)
+    text = re.sub(r"/dev/knightcube-(imu|gps|i2c)", rf"{folder}/knightcube-\1", text)
+    tree = yaml.safe_load(text.replace("/run/knightcube/", f"{folder}/"))
+    tree["camera"] |= {"vision_slow_after": 10.0, "max_age": 60.0}
+    tree["executive"] = {"planner_timeout": 60.0, "vision_timeout": 60.0}
+    if "separation" in tree:
+        tree["separation"] = {"inhibit": 0.5}
+    if "steps" in tree:
+        tree["steps"] = [{"at": 10.0 * k, "q2": 0.3 * (-1) ** k} for k in range(60)]
+    return yaml.safe_dump(tree, sort_keys=False)
+
+
+def unit_words(config: Path, runs: Path) -> list[str]:
+    """Return the words after `fly` in the unit's ExecStart, for another configuration and archive."""
+    unit = (DEPLOY / "knightcube.service").read_text(encoding="utf-8")
+    (line,) = re.findall(r"' fly (run .*)$", unit, re.MULTILINE)
+    places = {"/etc/knightcube/flight.yaml": str(config), "/var/lib/knightcube/runs": str(runs)}
+    return [places.get(word, word) for word in shlex.split(line)]
+
+
+def unit_environment(config: Path, folder: Path, notifications: socket.socket) -> dict[str, str]:
+    """Return the environment that systemd gives the unit with the drop-in of the configuration."""
+    named = re.findall("^Environment=(KNIGHTCUBE_I2C.*)$", dropin(config), re.MULTILINE)
+    return {
+        **os.environ,
+        **dict(word.partition("=")[::2] for word in shlex.split(named[0])),
+        "NOTIFY_SOCKET": notifications.getsockname(),
+        "WATCHDOG_USEC": "2000000",
+        "STATE_DIRECTORY": str(folder),
+        "OPENBLAS_NUM_THREADS": "1",
+        "PYTHONPATH": str(ROOT),
+    }
+
+
+@contextmanager
+def emulated(config: Path, name: str, folder: Path) -> Iterator[dict[str, Any]]:
+    """Emulate the devices of a configuration; yield the facts that the program prints."""
+    words = ["tests.deploy.emulated_board", config, ROOT / "config" / f"{WORLDS[name]}.yaml", folder]
+    with subprocess.Popen(
+        [sys.executable, "-m", *map(str, words)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        try:
+            yield json.loads(process.stdout.readline())
+        finally:
+            process.terminate()
+
+
+def newest(archive: Path) -> Run:
+    """Return the packets of the run in an archive."""
+    (folder,) = (path for path in archive.iterdir() if path.is_dir())
+    return read_run(folder)
+
+
+def everything_arrived(run: Run, orbit: bool) -> bool:
+    """Return whether readings of every device have arrived, with a rate and an attitude from a frame."""
+    of_body = ("fix", "directions") if orbit else ("plan",)
+    every = all(len(run[name]) for name in ("imu", "housekeeping", *of_body))
+    return every and len(frames_with_rate(run)) > 0 and b"solved" in run["stars"]["status"]
+
+
+def frames_with_rate(run: Run) -> PacketArray:
+    """Return the packets of the frames whose streaks gave a rate, of which the sign may be unknown."""
+    frames = run["streak"]
+    found: PacketArray = frames[np.isfinite(frames["rate"]).all(axis=1)]
+    return found
+
+
+def fly(name: str, folder: Path) -> Flown:
+    """Start a board's configuration as the unit does, wait for its devices, and end the flight."""
+    devices, runs, config = folder / "d", folder / "runs", folder / "flight.yaml"
+    for video in ("camera", "wide-1", "wide-2"):
+        (devices / f"knightcube-{video}").mkdir(parents=True)
+    config.write_text(board_text(name, devices), encoding="utf-8")
+    coils_off = [shutil.copy(DEPLOY / "coils-off", folder)]
+    shutil.copy(str(smbus_byte.__file__), folder)
+    with ExitStack() as stack:
+        notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        notifications.bind(str(folder / "notify"))
+        environment = unit_environment(config, folder, notifications)
+        facts = stack.enter_context(emulated(config, name, devices))
+        environment |= facts["environment"]
+        bus = open_bus(facts["socket"])
+        stack.callback(bus.close)
+        before = subprocess.run(coils_off, env=environment, capture_output=True, check=False)
+        words = ["tests.deploy.emulated_video", str(config), facts["socket"], *unit_words(config, runs)]
+        flight = stack.enter_context(
+            subprocess.Popen(
+                [sys.executable, "-m", *words],
+                cwd=ROOT,
+                env=environment,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+        )
+        stack.callback(flight.kill)
+        driven = watch(flight, notifications, bus, runs, name == "board_orbit")
+        flight.send_signal(signal.SIGTERM)
+        said = flight.communicate(timeout=60.0)[0]
+        currents = bus.call("currents")
+        after = subprocess.run(coils_off, env=environment, capture_output=True, check=False)
+    checked = json.loads(said.partition("\n")[0])
+    found = {device["name"] for device in checked["devices"] if device["found"]}
+    statuses = [before.returncode, flight.returncode, after.returncode]
+    return Flown(found, newest(runs), driven, currents, statuses, said)
+
+
+def watch(
+    flight: subprocess.Popen[str], notifications: socket.socket, bus: RemoteI2cBus, runs: Path, orbit: bool
+) -> bool:
+    """Wait until the flight is ready and every device was read; return whether the coils were driven."""
+    ready = driven = False
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline and flight.poll() is None:
+        if select.select([notifications], [], [], 0.5)[0]:
+            ready |= "READY=1" in notifications.recv(4096).decode().split("\n")
+        driven |= any(bus.call("currents"))
+        if ready and driven and everything_arrived(newest(runs), orbit):
+            break
+    return driven
+
+
+@pytest.fixture(scope="module", params=list(WORLDS))
+def flown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    return fly(request.param, tmp_path_factory.mktemp("b"))
+
+
+def test_check_finds_every_device(flown: Flown, request: pytest.FixtureRequest) -> None:
+    name = request.node.callspec.params["flown"]
+    assert flown.found == DEVICES[name]
+
+
+def test_the_unit_flies_a_boards_configuration_and_ends_with_the_coils_at_zero(flown: Flown) -> None:
+    assert flown.statuses == [0, 0, 0], flown.said
+    assert "coils:    at zero" in flown.said
+    assert flown.driven
+    assert not any(flown.currents)
+
+
+def test_packets_of_every_device_arrive(flown: Flown) -> None:
+    imu, house = flown.run["imu"], flown.run["housekeeping"]
+    seconds = (int(imu["time_ns"][-1]) - int(imu["time_ns"][0])) * 1e-9
+    assert len(imu) > 20.0 * seconds, "on a busy machine, at least half of 40 readings a second"
+    assert not house["imu_bad_checksum"].any()
+    assert np.isfinite(house["coil_current"]).any(), "the current monitor is read"
+    assert everything_arrived(flown.run, len(flown.run["fix"]) > 0), flown.said
+
+
+def test_the_rates_of_the_frames_are_those_of_the_gyro(flown: Flown) -> None:
+    """Exposure time, time stamp and field of view decide the rate, whose sign may be unknown."""
+    imu, frames = flown.run["imu"], frames_with_rate(flown.run)
+    middle = frames["exposure_start_ns"] + 0.5e9 * frames["exposure"]
+    gyro = np.linalg.norm([np.interp(middle, imu["time_ns"], axis) for axis in imu["rate"].T], axis=0)
+    error = np.linalg.norm(frames["rate"], axis=1) - gyro
+    sigma = np.sqrt(frames["covariance"][:, :3].sum(axis=1))
+    assert (np.abs(error) < 4.0 * np.hypot(sigma, GYRO_NOISE) + 0.02 * gyro).all()
