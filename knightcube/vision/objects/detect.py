@@ -42,7 +42,6 @@ from knightcube.vision.objects.star_light import (
     PATHS_PER_LENGTH,
     Explanation,
     StarLight,
-    at_mid_exposure,
     brightest_left,
     cut_patch,
     fit_stars,
@@ -58,6 +57,7 @@ from knightcube.vision.objects.streak_ends import (
     near_border,
     segment_frame,
 )
+from knightcube.vision.objects.streak_images import at_mid_exposure
 
 INDICATORS = ("centre", "displacement", "residual")
 """Names of the three indicators that show that a streak is not a star."""
@@ -341,6 +341,8 @@ class Judge:
         if not fired:
             return Verdict.STAR, None
         try:
+            if self._few_stars_explain(ends, self.objects.improvement):
+                return Verdict.STARS, None
             light = self._light(ends)
             found = light.explain(ends)
         except FlightError:
@@ -358,8 +360,9 @@ class Judge:
         pairs = pairs[np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=-1) >= _LEAST_CROSSING_PX]
         lines = extend(pairs, chord_outward(pairs), self.settings.endpoint_bias) if len(pairs) else pairs
         try:
+            if self._few_stars_explain(corners, self.objects.improvement):
+                return Verdict.STARS, None
             light = self._light(corners)
-            # The possible decrease of chi-square is limited, because a good fit has about one unit per pixel.
             hopeless = light.chi_square - light.pixels < self.objects.improvement
             tried = [] if hopeless else [(ends, light.explain(ends)) for ends in lines]
         except FlightError:
@@ -417,9 +420,7 @@ class Judge:
             return None
         enough = self.objects.crossing_improvement
         try:
-            # If a few stars explain the pixels, more stars would explain them as well.
-            few = self._light(ends, stars, _FEW_PATHS)
-            if few.chi_square - few.pixels < enough:
+            if self._few_stars_explain(ends, enough, stars):
                 return None
             light = self._light(ends, stars)
             if light.chi_square - light.pixels < enough:
@@ -428,6 +429,19 @@ class Judge:
         except FlightError:
             return None
         return self._candidate(ends, (), light, found) if self._is_object(light, found, enough) else None
+
+    def _few_stars_explain(
+        self, corners: FloatArray, enough: float, known: Sequence[FloatArray] = ()
+    ) -> bool:
+        """Return whether few trial stars explain the pixels, as more trial stars then do as well.
+
+        Few stars explain the pixels if no object can decrease chi-square by `enough`. A good fit of stars and
+        an object has a chi-square of about one per pixel, which limits the decrease. The other arguments are
+        those of `StarLight`.
+        """
+        few = self._light(corners, known, _FEW_PATHS)
+        calm = few.chi_square <= self.objects.worst_fit * few.pixels
+        return few.chi_square - few.pixels < enough and calm
 
     def _light(
         self, corners: FloatArray, known: Sequence[FloatArray] = (), per_length: int = PATHS_PER_LENGTH

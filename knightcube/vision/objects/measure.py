@@ -30,7 +30,7 @@ from knightcube.vision.objects.settings import (
     MeasuredObjects,
     ObjectMeasurementSettings,
 )
-from knightcube.vision.objects.star_light import spread_over, spread_with_slopes
+from knightcube.vision.objects.streak_images import spread_over, spread_with_slopes
 from knightcube.vision.startracker.detection import DetectionSettings, FrameKind, survey
 from knightcube.vision.startracker.detection.survey import Areas, Survey
 from knightcube.vision.startracker.sky_map import SkyMap

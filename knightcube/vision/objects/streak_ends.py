@@ -22,6 +22,7 @@ import numpy as np
 from scipy import ndimage
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.frame import (
     Background,
     box_sum,
@@ -202,18 +203,22 @@ def measure_streaks(
     found: list[int] = []
     endpoints: list[FloatArray] = []
     crowded: list[tuple[int, FloatArray]] = []
+    usual = cornerness is None and settings.centre_of == "response" and settings.smoothing_sigma <= 0.0
     for index in range(len(segmented.candidates)):
-        image, mask, corner = cut_out(segmented, index)
-        response = respond(image, settings)
-        intensity = response if settings.centre_of == "response" else image
-        corners = find_corners(
-            response, mask, settings.peak_relative, settings.intensity_half_width, intensity
-        )
+        if usual:
+            corners = _harris_corners(segmented, index, settings)
+        else:
+            image, mask, corner = cut_out(segmented, index)
+            response = respond(image, settings)
+            intensity = response if settings.centre_of == "response" else image
+            corners = corner + find_corners(
+                response, mask, settings.peak_relative, settings.intensity_half_width, intensity
+            )
         if len(corners) == 2:
             found.append(index)
-            endpoints.append(corners + corner)
+            endpoints.append(corners)
         elif len(corners) > 2:
-            crowded.append((index, corners + corner))
+            crowded.append((index, corners))
     stacked = np.array(endpoints).reshape(-1, 2, 2)
     chosen = np.array(found, dtype=np.int64)
     return Streaks(stacked, sigma[chosen], segmented.candidates.flux[chosen], chosen, tuple(crowded))
@@ -224,14 +229,258 @@ def cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, Fl
 
     In the image, the pixels of other regions are zero.
     """
-    rows, columns = segmented.signal.shape
-    top, bottom, left, right = segmented.candidates.boxes[index]
+    candidates = segmented.candidates
+    return _cut(segmented.signal, candidates.labels, candidates.boxes[index], int(candidates.label[index]))
+
+
+def _cut(signal: Image, labels: Image, box: IntArray, label: int) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Return the image, mask and first pixel of the region `label` with a margin, as `cut_out` does."""
+    rows, columns = signal.shape
+    top, bottom, left, right = box
     top, left = max(top - _PADDING, 0), max(left - _PADDING, 0)
     bottom, right = min(bottom + _PADDING, rows), min(right + _PADDING, columns)
-    labels = segmented.candidates.labels[top:bottom, left:right]
-    mask = labels == segmented.candidates.label[index]
-    image = np.where(mask | (labels == 0), segmented.signal[top:bottom, left:right], 0.0).astype(np.float64)
+    around = labels[top:bottom, left:right]
+    mask = around == label
+    image = np.where(mask | (around == 0), signal[top:bottom, left:right], 0.0).astype(np.float64)
     return image, mask, np.array([left, top], dtype=float)
+
+
+def _harris_corners(segmented: Segmented, index: int, settings: EndpointSettings) -> FloatArray:
+    """Return the corners (n, 2), px, of a candidate region by the Harris response of the frame."""
+    candidates = segmented.candidates
+    derivative, window = (kernel_radius(each) for each in (settings.derivative_sigma, settings.window_sigma))
+    return _region_corners(
+        segmented.signal,
+        candidates.labels,
+        candidates.boxes[index],
+        int(candidates.label[index]),
+        gaussian_kernel(settings.derivative_sigma, derivative),
+        gaussian_derivative_kernel(settings.derivative_sigma, derivative),
+        gaussian_kernel(settings.window_sigma, window),
+        settings.harris_k,
+        settings.peak_relative,
+        settings.intensity_half_width,
+    )
+
+
+def _region_corners_numpy(
+    signal: Image,
+    labels: Image,
+    box: IntArray,
+    label: int,
+    smooth: FloatArray,
+    slope: FloatArray,
+    window: FloatArray,
+    k: float,
+    relative: float,
+    half_width: int,
+) -> FloatArray:
+    """Return the corners of a region as `_region_corners` does."""
+    image, mask, corner = _cut(signal, labels, box, label)
+    gx, gy = _separable(image, smooth, slope), _separable(image, slope, smooth)
+    tensor = StructureTensor(*(_separable(each, window, window) for each in (gx * gx, gx * gy, gy * gy)))
+    response = harris_response(tensor, k)
+    return find_corners(response, mask, relative, half_width, response) + corner
+
+
+@compiled_form_of(_region_corners_numpy)
+def _region_corners(
+    signal: Image,
+    labels: Image,
+    box: IntArray,
+    label: int,
+    smooth: FloatArray,
+    slope: FloatArray,
+    window: FloatArray,
+    k: float,
+    relative: float,
+    half_width: int,
+) -> FloatArray:
+    """Return the corners (x, y) of a region (n, 2), px, which are the peaks of its Harris response.
+
+    The response is computed near the pixels of the region only.
+
+    Args:
+        signal: counts above the background (rows, columns).
+        labels: label of the region at each pixel (rows, columns); 0 outside all regions.
+        box: first row, last row + 1, first column and last column + 1 of the region.
+        label: label of the region.
+        smooth: kernel of the Gaussian that smooths the image for the gradient.
+        slope: kernel of the derivative of this Gaussian.
+        window: kernel of the window of the structure tensor.
+        k: constant of the Harris response.
+        relative: minimum response of a corner, relative to the largest response.
+        half_width: half-width of the window of the centre of intensity, px.
+    """
+    top, left = max(box[0] - _PADDING, 0), max(box[2] - _PADDING, 0)
+    rows = min(box[1] + _PADDING, signal.shape[0]) - top
+    columns = min(box[3] + _PADDING, signal.shape[1]) - left
+    own = _spans_of(labels, label, top, left, rows, columns)
+    wanted = _widened(own, max(half_width, 1), columns)
+    gradients = _widened(wanted, len(window) // 2, columns)
+    lit = _widened(gradients, len(smooth) // 2, columns)
+    image = _own_light(signal, labels, label, top, left, lit, columns)
+    response = _response(image, gradients, wanted, smooth, slope, window, k)
+    corners = _peaks(
+        response, labels[top : top + rows, left : left + columns], label, own, relative, half_width
+    )
+    for each in range(len(corners)):
+        corners[each, 0] += left
+        corners[each, 1] += top
+    return corners
+
+
+@loop_helper
+def _spans_of(labels: Image, label: int, top: int, left: int, rows: int, columns: int) -> IntArray:
+    """Return the first and last column of a region in each row of a cut-out (rows, 2)."""
+    spans = np.empty((rows, 2), dtype=np.int64)
+    spans[:, 0], spans[:, 1] = columns, -1
+    for row in range(rows):
+        for column in range(columns):
+            if labels[top + row, left + column] == label:
+                spans[row, 0] = min(spans[row, 0], column)
+                spans[row, 1] = column
+    return spans
+
+
+@loop_helper
+def _widened(spans: IntArray, margin: int, columns: int) -> IntArray:
+    """Return the spans (rows, 2) of a region that is wider by `margin` px in all directions."""
+    rows = len(spans)
+    wide = np.empty((rows, 2), dtype=np.int64)
+    for row in range(rows):
+        first, last = columns, -1
+        for other in range(max(row - margin, 0), min(row + margin + 1, rows)):
+            first, last = min(first, spans[other, 0]), max(last, spans[other, 1])
+        wide[row, 0] = max(first - margin, 0) if last >= 0 else columns
+        wide[row, 1] = min(last + margin, columns - 1) if last >= 0 else -1
+    return wide
+
+
+@loop_helper
+def _own_light(
+    signal: Image, labels: Image, label: int, top: int, left: int, spans: IntArray, columns: int
+) -> FloatArray:
+    """Return the light of a region and of no region within spans of columns, in a cut-out (rows, columns)."""
+    image = np.zeros((len(spans), columns))
+    for row in range(len(spans)):
+        for column in range(spans[row, 0], spans[row, 1] + 1):
+            here = labels[top + row, left + column]
+            if here in (label, 0):
+                image[row, column] = signal[top + row, left + column]
+    return image
+
+
+@loop_helper
+def _response(
+    image: FloatArray,
+    gradients: IntArray,
+    wanted: IntArray,
+    smooth: FloatArray,
+    slope: FloatArray,
+    window: FloatArray,
+    k: float,
+) -> FloatArray:
+    """Return the Harris response of an image, within the spans `wanted` (rows, 2) only.
+
+    The gradient is computed within the spans `gradients` (rows, 2).
+    """
+    scratch = np.empty(image.shape)
+    xx, yy, xy = np.empty(image.shape), np.empty(image.shape), np.empty(image.shape)
+    _correlate(image, gradients, smooth, slope, scratch, xx)
+    _correlate(image, gradients, slope, smooth, scratch, yy)
+    for row in range(len(image)):
+        for column in range(gradients[row, 0], gradients[row, 1] + 1):
+            x, y = xx[row, column], yy[row, column]
+            xx[row, column], yy[row, column], xy[row, column] = x * x, y * y, x * y
+    for product in (xx, yy, xy):
+        _correlate(product, wanted, window, window, scratch, product)
+    for row in range(len(image)):
+        for column in range(wanted[row, 0], wanted[row, 1] + 1):
+            a, b, c = xx[row, column], yy[row, column], xy[row, column]
+            xx[row, column] = a * b - c * c - k * (a + b) ** 2
+    return xx
+
+
+@loop_helper
+def _correlate(
+    image: FloatArray,
+    spans: IntArray,
+    down: FloatArray,
+    across: FloatArray,
+    scratch: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Set `out` to the correlation of an image with an outer product, within spans of columns (rows, 2).
+
+    The border pixels are repeated beyond the border. The array `out` may be the image.
+    """
+    rows, columns = image.shape
+    high, wide = len(down) // 2, len(across) // 2
+    for row in range(rows):
+        first, last = max(spans[row, 0] - wide, 0), min(spans[row, 1] + wide, columns - 1)
+        for column in range(first, last + 1):
+            scratch[row, column] = 0.0
+        for tap in range(2 * high + 1):
+            other, factor = min(max(row + tap - high, 0), rows - 1), down[tap]
+            for column in range(first, last + 1):
+                scratch[row, column] += factor * image[other, column]
+    for row in range(rows):
+        for column in range(spans[row, 0], spans[row, 1] + 1):
+            total = 0.0
+            if column >= wide and column + wide < columns:
+                for tap in range(2 * wide + 1):
+                    total += across[tap] * scratch[row, column + tap - wide]
+            else:
+                for tap in range(2 * wide + 1):
+                    total += across[tap] * scratch[row, min(max(column + tap - wide, 0), columns - 1)]
+            out[row, column] = total
+
+
+@loop_helper
+def _peaks(
+    response: FloatArray, labels: Image, label: int, spans: IntArray, relative: float, half_width: int
+) -> FloatArray:
+    """Return the centres of intensity (n, 2), px, at the peaks of the response in a region of a cut-out."""
+    rows, columns = response.shape
+    top, count = 0.0, 0
+    for row in range(1, rows - 1):
+        for column in range(max(spans[row, 0], 1), min(spans[row, 1], columns - 2) + 1):
+            if labels[row, column] == label:
+                top = max(top, response[row, column])
+    corners = np.empty((len(labels) * labels.shape[1] // 4 + 1, 2))
+    for row in range(1, rows - 1):
+        for column in range(max(spans[row, 0], 1), min(spans[row, 1], columns - 2) + 1):
+            here = response[row, column]
+            if labels[row, column] != label or here < relative * top or top <= 0.0:
+                continue
+            highest = -np.inf
+            for dy in range(-1, 2):
+                for dx in range(-1, 2):
+                    if dx != 0 or dy != 0:
+                        highest = max(highest, response[row + dy, column + dx])
+            if here > highest:
+                _set_centre(response, row, column, half_width, corners[count])
+                count += 1
+    return corners[:count].copy()
+
+
+@loop_helper
+def _set_centre(image: FloatArray, row: int, column: int, half_width: int, centre: FloatArray) -> None:
+    """Set `centre` (2,) to the centre of intensity around a pixel, as `centre_of_intensity` does."""
+    rows, columns = image.shape
+    n = min(half_width, row, column, columns - 1 - column, rows - 1 - row)
+    total, x, y = 0.0, 0.0, 0.0
+    for dy in range(-n, n + 1):
+        for dx in range(-n, n + 1):
+            light = max(image[row + dy, column + dx], 0.0)
+            total += light
+            x += light * dx
+            y += light * dy
+    centre[0], centre[1] = column, row
+    if total > 0.0:
+        centre[0] += x / total
+        centre[1] += y / total
 
 
 class StructureTensor(NamedTuple):

@@ -10,17 +10,13 @@ from knightcube.vision.objects.settings import EndpointSettings
 from knightcube.vision.objects.star_light import (
     Patch,
     StarLight,
+    _brightest_path,
     _fit_line,
-    _line_image,
     brightest_left,
     fit_stars,
-    spread_over,
-    spread_with_slopes,
-    star_paths,
-    straight_path,
-    streak_at,
 )
 from knightcube.vision.objects.streak_ends import segment_frame
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_frames import deposit, rate_at, rotate, star_camera
 
 _CAMERA = star_camera(512)
@@ -102,51 +98,6 @@ def test_pure_noise_contains_neither_star_nor_object() -> None:
     assert brightest_left(patch, left) is None
 
 
-def test_slopes_of_light_are_those_of_small_moves() -> None:
-    path = straight_path(np.array([[10.3, 8.1], [27.8, 14.6]]))
-    share = np.linspace(0.0, 1.0, len(path))
-    light, across, down = spread_with_slopes(path, share[None], 40, 24, 1.0)
-    np.testing.assert_allclose(light, spread_over(path, 40, 24, 1.0), atol=1e-12)
-    assert abs(float(light.sum()) - 1.0) < 1e-5
-    step = 1e-4 * share[:, None]
-    for slope, axis in ((across, [1.0, 0.0]), (down, [0.0, 1.0])):
-        moved = [spread_over(path + sign * step * axis, 40, 24, 1.0) for sign in (1.0, -1.0)]
-        # The tolerance is the flux beyond 5 sigma divided by the step.
-        np.testing.assert_allclose(slope, (moved[0] - moved[1]) / 2e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("length", [3.0, 20.0, 150.0])
-@pytest.mark.parametrize("bend", [0.0, 0.03, 0.6])
-def test_the_image_of_a_streak_is_that_of_its_points(length: float, bend: float) -> None:
-    path = straight_path(np.array([[30.2, 90.4], [30.2 + 0.8 * length, 90.4 + 0.6 * length]]))
-    path = path + np.outer(np.linspace(-1.0, 1.0, len(path)) ** 2 * bend * length, [-0.6, 0.8])
-    image = spread_over(path, 240, 300, 1.0)
-    row, column = np.divmod(np.arange(image.size), 240)
-    found = streak_at(np.stack([column, row], axis=-1), path, 1.0).reshape(image.shape)
-    np.testing.assert_allclose(found, image, atol=0.02 * image.max())
-
-
-def test_the_slopes_of_a_line_are_those_of_its_points() -> None:
-    ends = np.array([[15.3, 22.1], [66.8, 40.6]])
-    path = straight_path(ends)
-    share = (np.arange(len(path)) + 0.5) / len(path)
-    images = spread_with_slopes(path, np.stack([1.0 - share, share]), 90, 60, 1.0)
-    line = _line_image(ends, 90, 60, 1.0)
-    for end in range(2):
-        slopes = np.stack([image.reshape(-1)[line.pixels] for image in images[1 + 2 * end : 3 + 2 * end]])
-        found = line.images[1 + 2 * end : 3 + 2 * end]
-        np.testing.assert_allclose(found, line.axes @ slopes, atol=0.06 * np.abs(slopes).max())
-
-
-def test_paths_of_stars_rotate_with_the_sky() -> None:
-    directions = _CAMERA.pinhole.unit_vectors(np.array([[240.0, 238.0], [300.0, 120.0]]))
-    paths = star_paths(directions, _ROTATION, np.array([0.0, 0.25]), _CAMERA.pinhole)
-    for path, direction, start in zip(paths, directions, (0.0, 0.25), strict=True):
-        parts = (np.arange(len(path)) + 0.5) / len(path) - start
-        seen = np.array([rotate(direction[None], part * _ROTATION)[0] for part in parts])
-        np.testing.assert_allclose(path, _CAMERA.pinhole.project(seen), atol=1e-6)
-
-
 @pytest.mark.parametrize(("beyond", "lit"), [(0.0, True), (1.5, True), (12.0, False), (30.0, False)])
 def test_an_end_in_the_dark_is_noticed(beyond: float, lit: bool) -> None:
     """A streak of 100 px with an end `beyond` px too far is rejected if that end is dark."""
@@ -158,3 +109,15 @@ def test_an_end_in_the_dark_is_noticed(beyond: float, lit: bool) -> None:
     claimed = ends + np.array([[0.0, 0.0], [0.8, 0.6]]) * beyond
     light = StarLight(segmented, claimed, _ROTATION, _CAMERA.pinhole, 1.0, 1.0, 65_535.0)
     assert light.lit_to_ends(claimed) is lit
+
+
+@pytest.mark.parametrize("beyond", [0.0, np.inf])
+def test_all_forms_find_the_same_brightest_path(beyond: float) -> None:
+    draw = np.random.default_rng(4)
+    for threshold in (0.1, 1.5, 9.0):
+        seen = draw.normal(1.0, 1.0, (16, 20))
+        steps = np.rint(np.linspace(-0.5, 0.5, 9)[:, None] * draw.normal(0.0, 12.0, 2)).astype(np.int64)
+        factor = np.array([2.0, *np.ones(7), 2.0])
+        given = seen, steps, factor, np.array([beyond, 0.0, 0.0, beyond]), threshold
+        assert_forms_agree(_brightest_path, *given)
+    assert _brightest_path(*given) == (-np.inf, -1, -1)

@@ -9,6 +9,7 @@ from scipy import ndimage
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.frame import box_sum, less_boxes, repair_hot_pixels
 from knightcube.vision.objects.streak_ends import (
+    _region_corners,
     centre_of_intensity,
     centre_of_rotation,
     chord_outward,
@@ -25,6 +26,7 @@ from knightcube.vision.objects.streak_ends import (
     threshold_local,
     threshold_mean,
 )
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_frames import rate_at, rotate, star_camera, star_frame
 
 
@@ -237,3 +239,20 @@ def test_the_centre_of_rotation_is_the_axis_projected() -> None:
 def test_parallel_streaks_have_no_centre_of_rotation() -> None:
     streaks = np.array([[[0.0, 0.0], [10.0, 0.0]], [[50.0, 40.0], [70.0, 40.0]]])
     assert np.isnan(centre_of_rotation(streaks)).all()
+
+
+@pytest.mark.parametrize("half_width", [0, 3])
+def test_all_forms_find_the_same_corners_of_regions(half_width: int) -> None:
+    """The regions include a bright streak, noise peaks, and regions at the border of the frame."""
+    draw = np.random.default_rng(5)
+    signal = 10.0 * ndimage.gaussian_filter(draw.normal(size=(40, 50)), 1.2)
+    signal += 40.0 * np.exp(-0.5 * (np.arange(40)[:, None] - 14.0 - 0.3 * np.arange(50)) ** 2)
+    regions = find_regions(signal > 3.0, signal.astype(np.float32), 1)
+    labels = np.ascontiguousarray(regions.labels, dtype=np.int32)
+    kernels = gaussian_kernel(1.0, 3), gaussian_derivative_kernel(1.0, 3), gaussian_kernel(1.5, 5)
+    corners = 0
+    for label, box in zip(regions.label.tolist(), regions.boxes, strict=True):
+        given = signal.astype(np.float32), labels, box, label, *kernels, 0.15, 0.005, half_width
+        assert_forms_agree(_region_corners, *given, interpreted=label == 1)
+        corners += len(_region_corners(*given))
+    assert corners > 1

@@ -1,0 +1,767 @@
+"""Paths of stars and objects in an image during an exposure, and the images of their streaks.
+
+A streak is the light of a point that moves along its path at a constant rate. The camera's point spread
+function (PSF) is a Gaussian. The light of a nearly straight path is the product of its profiles across and
+along the path. The light of any other path is the sum of the light of its points. The functions that the
+search for objects calls most have a numpy form and a compiled form (`knightcube.compiled`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtr
+
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.compiled import compiled_form_of, loop_helper
+from knightcube.vision.camera.lens import Pinhole
+
+# Spacing (px) of the Gaussians whose sum models a streak.
+# The sum of Gaussians has a ripple of 0.2 % for a PSF of 0.6 px.
+_STEP_PX = 1.0
+# Number of points of a star's path from which the length of the path is computed.
+_SAMPLES = 17
+# Distance at which the Gaussian PSF is truncated, in standard deviations.
+_FARTHEST = 5.0
+_BELL, _ROOT_HALF = 1.0 / math.sqrt(2.0 * math.pi), math.sqrt(0.5)
+
+
+def star_path(direction: FloatArray, rotation: FloatArray, start: float, pinhole: Pinhole) -> FloatArray:
+    """Return points (m, 2), px, along the path of a star during the exposure.
+
+    The star is at `direction` (3,), camera axes, when it has covered the fraction `start` of the path.
+    """
+    return np.asarray(star_paths(direction[None], rotation, np.array([start]), pinhole)[0])
+
+
+def star_paths(
+    directions: FloatArray, rotation: FloatArray, starts: FloatArray, pinhole: Pinhole
+) -> FloatArray:
+    """Return points (n, m, 2), px, along the paths of n stars during the exposure.
+
+    Each star is at its direction `directions` (n, 3), camera axes, when it has covered the fraction `starts`
+    (n,) of its path. All paths have as many points as the longest path needs.
+    """
+    return _paths_on_circles(directions, rotation, starts, pinhole.focal_length, *pinhole.centre)
+
+
+def _paths_on_circles_numpy(
+    directions: FloatArray,
+    rotation: FloatArray,
+    starts: FloatArray,
+    focal: float,
+    centre_x: float,
+    centre_y: float,
+) -> FloatArray:
+    """Return the points of `star_paths` for a focal length, px, and a centre of the image, px."""
+
+    def projected(parts: FloatArray) -> FloatArray:
+        vectors = _rotated(directions, rotation, parts - starts[:, None])
+        ahead = np.where(vectors[..., 2:] > 0.0, vectors[..., 2:], np.nan)
+        return np.asarray(focal * vectors[..., :2] / ahead + np.array([centre_x, centre_y]))
+
+    steps = np.diff(projected(np.linspace(0.0, 1.0, _SAMPLES)), axis=1)
+    lengths = np.hypot(steps[..., 0], steps[..., 1]).sum(axis=1)
+    count = _steps(float(np.max(lengths[np.isfinite(lengths)], initial=0.0)))
+    return projected((np.arange(count) + 0.5) / count)
+
+
+@compiled_form_of(_paths_on_circles_numpy)
+def _paths_on_circles(
+    directions: FloatArray,
+    rotation: FloatArray,
+    starts: FloatArray,
+    focal: float,
+    centre_x: float,
+    centre_y: float,
+) -> FloatArray:
+    """Return the points of `star_paths` for a focal length, px, and a centre of the image, px."""
+    stars, longest = len(starts), 0.0
+    sampled = np.empty((_SAMPLES, 2))
+    for star in range(stars):
+        _set_circle(directions[star], rotation, -starts[star], 1.0 / (_SAMPLES - 1), focal, sampled)
+        length = 0.0
+        for k in range(_SAMPLES - 1):
+            length += math.hypot(sampled[k + 1, 0] - sampled[k, 0], sampled[k + 1, 1] - sampled[k, 1])
+        if math.isfinite(length) and length > longest:
+            longest = length
+    count = max(1, math.ceil(longest / _STEP_PX))
+    points = np.empty((stars, count, 2))
+    for star in range(stars):
+        _set_circle(directions[star], rotation, 0.5 / count - starts[star], 1.0 / count, focal, points[star])
+        for k in range(count):
+            points[star, k, 0] += centre_x
+            points[star, k, 1] += centre_y
+    return points
+
+
+@loop_helper
+def _set_circle(
+    star: FloatArray, rotation: FloatArray, first: float, step: float, focal: float, points: FloatArray
+) -> None:
+    """Set `points` (m, 2) to the image points, px from the centre, of a star that is rotated step by step."""
+    angle = math.sqrt(rotation[0] ** 2 + rotation[1] ** 2 + rotation[2] ** 2)
+    scale = 1.0 / angle if angle > 0.0 else 1.0
+    a, b, c = rotation[0] * scale, rotation[1] * scale, rotation[2] * scale
+    x, y, z = star[0], star[1], star[2]
+    share = x * a + y * b + z * c
+    u, v, w = share * a, share * b, share * c
+    for k in range(len(points)):
+        turned = (first + k * step) * angle
+        cosine, sine = math.cos(turned), math.sin(turned)
+        ahead = cosine * (z - w) + sine * (x * b - y * a) + w
+        if ahead > 0.0:
+            points[k, 0] = focal * (cosine * (x - u) + sine * (y * c - z * b) + u) / ahead
+            points[k, 1] = focal * (cosine * (y - v) + sine * (z * a - x * c) + v) / ahead
+        else:
+            points[k, 0] = points[k, 1] = math.nan
+
+
+def straight_path(ends: FloatArray) -> FloatArray:
+    """Return evenly spaced points (m, 2), px, on the straight line between two ends (2, 2), px."""
+    steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
+    parts = (np.arange(steps)[:, None] + 0.5) / steps
+    return np.asarray(ends[0] + parts * (ends[1] - ends[0]))
+
+
+def path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
+    """Return points (m, 2), px, of a uniform motion relative to the stars between two ends (2, 2), px.
+
+    The ends are passed in the order in time that gives the slower motion relative to the stars.
+    """
+    vectors = pinhole.unit_vectors(ends)
+    both = [at_mid_exposure(pair, rotation) for pair in (vectors, vectors[::-1])]
+    first, last = min(both, key=lambda pair: float(np.linalg.norm(pair[1] - pair[0])))
+    steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
+    parts = (np.arange(steps) + 0.5) / steps
+    at = first + parts[:, None] * (last - first)
+    turns = attitude_matrix(from_rotation_vector((parts - 0.5)[:, None] * rotation))
+    return pinhole.project(np.einsum("mij,mj->mi", turns, at))
+
+
+def at_mid_exposure(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Return the mid-exposure directions (2, 3) of two stars from their directions `vectors` at other times.
+
+    The rows of `vectors` (2, 3) are the first star's direction at the start of the exposure, and the second
+    star's direction at the end of the exposure.
+    """
+    turns = attitude_matrix(from_rotation_vector(np.array([[0.5], [-0.5]]) * rotation))
+    return np.asarray(np.einsum("mij,mj->mi", turns, vectors))
+
+
+def _rotated(directions: FloatArray, rotation: FloatArray, parts: FloatArray) -> FloatArray:
+    """Return the directions (n, m, 3) of n stars after fractions `parts` (n, m) of the camera's rotation."""
+    angle = float(np.linalg.norm(rotation))
+    axis = rotation / angle if angle > 0.0 else rotation
+    along = (directions @ axis)[:, None] * axis
+    turned = (parts * angle)[..., None]
+    out = np.cos(turned) * (directions - along)[:, None]
+    out += np.sin(turned) * np.cross(directions, axis)[:, None]
+    out += along[:, None]
+    return np.asarray(out)
+
+
+def _steps(length: float) -> int:
+    return max(1, int(np.ceil(length / _STEP_PX)))
+
+
+def _pixels_near_numpy(points: FloatArray, reach: float, rows: int, columns: int) -> IntArray:
+    """Return the pixels (x, y) within about `reach` px of any of the points (m, 2), row by row, as (p, 2)."""
+    points = np.rint(points)
+    r = int(np.ceil(reach))
+    inside = np.all((points >= -r) & (points < (columns + r, rows + r)), axis=-1)
+    points = points[inside].astype(np.int64)
+    first = points.min(axis=0, initial=columns + rows) - r
+    width, height = np.maximum(points.max(axis=0, initial=0) + r + 1 - first, 1)
+    # A map of the points is combined with copies of itself that are shifted by all steps within a disc.
+    lit = np.zeros((height, width), dtype=np.bool_)
+    lit[points[:, 1] - first[1], points[:, 0] - first[0]] = True
+    marked = np.zeros_like(lit)
+    for down in range(-r, r + 1):
+        for right in range(-r, r + 1):
+            if down**2 + right**2 <= reach**2:
+                onto = _shifted(height, down), _shifted(width, right)
+                marked[onto] |= lit[_shifted(height, -down), _shifted(width, -right)]
+    row, column = np.nonzero(marked)
+    near = np.stack([column, row], axis=-1) + first
+    return np.ascontiguousarray(near[np.all((near >= 0) & (near < (columns, rows)), axis=-1)])
+
+
+def _shifted(count: int, step: int) -> slice:
+    """Return the part of an axis of `count` pixels that a map shifted by `step` pixels covers."""
+    return slice(max(step, 0), count + min(step, 0))
+
+
+@compiled_form_of(_pixels_near_numpy)
+def pixels_near(points: FloatArray, reach: float, rows: int, columns: int) -> IntArray:
+    """Return the pixels (x, y) within about `reach` px of any of the points (m, 2), row by row, as (p, 2)."""
+    r = math.ceil(reach)
+    centres = np.empty(points.shape, dtype=np.int64)
+    count, low_x, low_y, high_x, high_y = 0, columns + r, rows + r, -r, -r
+    for k in range(len(points)):
+        x, y = np.rint(points[k, 0]), np.rint(points[k, 1])
+        if -r <= x < columns + r and -r <= y < rows + r:
+            column, row = int(x), int(y)
+            centres[count, 0], centres[count, 1] = column, row
+            count += 1
+            low_x, high_x = min(low_x, column), max(high_x, column)
+            low_y, high_y = min(low_y, row), max(high_y, row)
+    if count == 0:
+        return np.empty((0, 2), dtype=np.int64)
+    half = np.empty(2 * r + 1, dtype=np.int64)
+    for k in range(2 * r + 1):
+        rest = reach**2 - (k - r) ** 2
+        half[k] = math.floor(math.sqrt(rest)) if rest >= 0.0 else -1
+    low_x, high_x = max(low_x - r, 0), min(high_x + r, columns - 1)
+    low_y, high_y = max(low_y - r, 0), min(high_y + r, rows - 1)
+    marked = np.zeros((high_y - low_y + 1, high_x - low_x + 1), dtype=np.bool_)
+    spans = np.empty((len(marked), 2), dtype=np.int64)
+    total = _mark_discs(centres[:count], half, low_x, low_y, marked, spans)
+    near = np.empty((total, 2), dtype=np.int64)
+    place = 0
+    for row in range(len(marked)):
+        for column in range(spans[row, 0], spans[row, 1] + 1):
+            if marked[row, column]:
+                near[place, 0], near[place, 1] = column + low_x, row + low_y
+                place += 1
+    return near
+
+
+@loop_helper
+def _mark_discs(
+    centres: IntArray, half: IntArray, low_x: int, low_y: int, marked: BoolArray, spans: IntArray
+) -> int:
+    """Mark discs of pixels around `centres` (m, 2), set the marked span of each row, and return the number.
+
+    The array `half` (2 r + 1,) holds the half-width of the disc in each row.
+    """
+    rows, columns = marked.shape
+    r, total = len(half) // 2, 0
+    spans[:, 0], spans[:, 1] = columns, -1
+    for k in range(len(centres)):
+        x = centres[k, 0] - low_x
+        for step in range(2 * r + 1):
+            row = centres[k, 1] - low_y + step - r
+            if row < 0 or row >= rows:
+                continue
+            first, last = max(x - half[step], 0), min(x + half[step], columns - 1)
+            for column in range(first, last + 1):
+                if not marked[row, column]:
+                    marked[row, column] = True
+                    total += 1
+            if first <= last:
+                spans[row, 0], spans[row, 1] = min(spans[row, 0], first), max(spans[row, 1], last)
+    return total
+
+
+# Number of points of a path between which the path is straight enough for the image of a streak.
+_NODES = 33
+# Minimum cosine between a nearly straight path and its chord.
+_LEAST_AHEAD = 0.85
+# Number of points of a path below which the image of a streak is the sum of the images of its points.
+_LEAST_POINTS = 4
+
+
+def streak_at(pixels: IntArray, path: FloatArray, sigma: float) -> FloatArray:
+    """Return the image of a streak of one count along `path` (m, 2), px, on the given pixels (p, 2), (p,).
+
+    See `streak_images`.
+    """
+    return np.asarray(streak_images(pixels, path[None], sigma, False)[0, 0])
+
+
+def _streak_images_numpy(pixels: IntArray, paths: FloatArray, sigma: float, slopes: bool) -> FloatArray:
+    """Return the images of streaks as `streak_images` does."""
+    images = np.zeros((len(paths), 3 if slopes else 1, len(pixels)))
+    for path, image in zip(paths, images, strict=True):
+        chord = path[-1] - path[0]
+        length = float(np.linalg.norm(chord))
+        steps = np.diff(path, axis=0)
+        ahead = steps @ chord - _LEAST_AHEAD * length * np.hypot(steps[:, 0], steps[:, 1])
+        if len(path) < _LEAST_POINTS or length == 0.0 or ahead.min() < 0.0:
+            _add_points_numpy(image, pixels, path, sigma)
+        else:
+            _add_streak_numpy(image, pixels, path, sigma)
+    return images
+
+
+def _add_points_numpy(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: float) -> None:
+    """Add the light of one count that the `points` (m, 2), px, share to `image` (1 or 3, p)."""
+    for point in points:
+        near = np.flatnonzero(np.abs(pixels - point).max(axis=1) < _FARTHEST * sigma + 1.0)
+        edges = ((pixels[near] - point)[:, :, None] + np.array([-0.5, 0.5])) / sigma
+        x, y = np.diff(ndtr(edges), axis=2)[..., 0].T / np.sqrt(len(points))
+        image[0, near] += x * y
+        if len(image) == 3:
+            bells = np.exp(-0.5 * edges**2) / (np.sqrt(2.0 * np.pi * len(points)) * sigma)
+            dx, dy = -np.diff(bells, axis=2)[..., 0].T
+            image[1, near] += dx * y
+            image[2, near] += x * dy
+
+
+def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: float) -> None:
+    """Add the light of one count along a nearly straight `path` (m, 2), px, to `image` (1 or 3, p)."""
+    chord = path[-1] - path[0]
+    length = float(np.linalg.norm(chord))
+    width = float(np.sqrt(sigma**2 + 1.0 / 12.0))
+    tangent = chord / length
+    normal = np.array([-tangent[1], tangent[0]])
+    # The nodes are given in coordinates along and across the chord, and by their arc length.
+    count = min(_NODES, len(path))
+    place = np.arange(count) * (len(path) - 1) // (count - 1)
+    nodes = path[place] - path[0]
+    along, across = nodes @ tangent, nodes @ normal
+    gaps = np.diff(along), np.diff(across)
+    steps = np.hypot(*gaps)
+    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    # Slope and spacing of the points are interpolated between the middles of adjacent nodes.
+    middles, slope, spacing = along[:-1] + 0.5 * gaps[0], gaps[1] / gaps[0], steps / np.diff(place)
+    away = pixels - path[0]
+    u, v = away @ tangent, away @ normal
+    room = _FARTHEST * width
+    near = (u > -room - 1.0) & (u < length + room + 1.0)
+    near &= (v > across.min() - room - 1.0) & (v < across.max() + room + 1.0)
+    chosen = np.flatnonzero(near)
+    u, v = u[chosen], v[chosen]
+    bend, pace = np.interp(u, middles, slope), np.interp(u, middles, spacing)
+    beyond = u - np.clip(u, along[0], along[-1])
+    off = v - np.interp(u, along, across) - beyond * bend
+    cosine = 1.0 / np.sqrt(1.0 + bend**2)
+    n = off * cosine
+    s = np.interp(u, along, arc) + (beyond + off * bend * cosine**2) / cosine
+    light = np.exp(-0.5 * (n / width) ** 2) / (np.sqrt(2.0 * np.pi) * width * pace * len(path))
+    # Only pixels near the ends of the streak are affected by the ends.
+    covered, sloping = np.ones(len(s)), np.zeros(len(s))
+    for sign, distance in ((1.0, s + 0.5 * spacing[0]), (-1.0, arc[-1] + 0.5 * spacing[-1] - s)):
+        ending = np.flatnonzero(distance < room)
+        part = distance[ending] / width
+        bell = np.exp(-0.5 * part**2) / (np.sqrt(2.0 * np.pi) * width)
+        sloping[ending] = sloping[ending] * ndtr(part) + sign * covered[ending] * bell
+        covered[ending] *= ndtr(part)
+    image[0, chosen] += light * covered
+    if len(image) == 3:
+        across_x, across_y = (cosine * (normal[k] - bend * tangent[k]) for k in (0, 1))
+        along_x, along_y = (cosine * (tangent[k] + bend * normal[k]) for k in (0, 1))
+        aside = covered * n / width**2
+        image[1, chosen] += light * (aside * across_x - sloping * along_x)
+        image[2, chosen] += light * (aside * across_y - sloping * along_y)
+
+
+@compiled_form_of(_streak_images_numpy)
+def streak_images(pixels: IntArray, paths: FloatArray, sigma: float, slopes: bool) -> FloatArray:
+    """Return the images of streaks of one count along k paths, on p pixels, (k, 1, p) or (k, 3, p).
+
+    The count is distributed evenly over the points of the path. The image is the product of the profiles
+    across and along the path, which are blurred by a Gaussian with the standard deviation `sigma`, px, and by
+    the pixel. The error is at most 2 % of the largest value. The image of a strongly bent path is the sum of
+    the images of its points.
+
+    Args:
+        pixels: pixels (p, 2) on which the images are computed.
+        paths: points of the paths (k, m, 2), px.
+        sigma: standard deviation of the PSF, px.
+        slopes: whether the derivatives of the image, 1/px, for displacements of the whole path along x and
+            along y follow the image of each path.
+    """
+    images = np.zeros((len(paths), 3 if slopes else 1, len(pixels)))
+    for k in range(len(paths)):
+        if _goes_ahead(paths[k]):
+            _add_streak(images[k], pixels, paths[k], sigma)
+        else:
+            _add_points(images[k], pixels, paths[k], sigma)
+    return images
+
+
+@loop_helper
+def _goes_ahead(path: FloatArray) -> bool:
+    """Return whether a path (m, 2) is nearly straight."""
+    m = len(path)
+    x, y = path[m - 1, 0] - path[0, 0], path[m - 1, 1] - path[0, 1]
+    length = math.hypot(x, y)
+    if m < _LEAST_POINTS or length == 0.0:
+        return False
+    for k in range(m - 1):
+        dx, dy = path[k + 1, 0] - path[k, 0], path[k + 1, 1] - path[k, 1]
+        if dx * x + dy * y - _LEAST_AHEAD * length * math.hypot(dx, dy) < 0.0:
+            return False
+    return True
+
+
+@loop_helper
+def _area(x: float) -> float:
+    """Return the integral of the normal density from minus infinity to `x`."""
+    return 0.5 * math.erfc(-x * _ROOT_HALF)
+
+
+@loop_helper
+def _bell(x: float) -> float:
+    """Return the normal density at `x`."""
+    return _BELL * math.exp(-0.5 * x * x)
+
+
+@loop_helper
+def _add_points(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: float) -> None:
+    """Add the light of one count that the `points` (m, 2), px, share to `image` (1 or 3, p)."""
+    reach, share = _FARTHEST * sigma + 1.0, 1.0 / len(points)
+    for k in range(len(points)):
+        for p in range(len(pixels)):
+            x, y = pixels[p, 0] - points[k, 0], pixels[p, 1] - points[k, 1]
+            if abs(x) >= reach or abs(y) >= reach:
+                continue
+            left, right = (x - 0.5) / sigma, (x + 0.5) / sigma
+            top, bottom = (y - 0.5) / sigma, (y + 0.5) / sigma
+            across, down = _area(right) - _area(left), _area(bottom) - _area(top)
+            image[0, p] += share * across * down
+            if len(image) == 3:
+                image[1, p] -= share * (_bell(right) - _bell(left)) / sigma * down
+                image[2, p] -= share * (_bell(bottom) - _bell(top)) / sigma * across
+
+
+@loop_helper
+def _between(x: float, grid: FloatArray, values: FloatArray, place: int) -> float:
+    """Return linearly interpolated `values`, constant beyond the grid, for x in or near interval `place`."""
+    last = len(grid) - 1
+    if x <= grid[0]:
+        return float(values[0])
+    if x >= grid[last]:
+        return float(values[last])
+    k = min(max(place, 0), last - 1)
+    while x < grid[k]:
+        k -= 1
+    while x >= grid[k + 1]:
+        k += 1
+    step = (values[k + 1] - values[k]) / (grid[k + 1] - grid[k])
+    return float(values[k] + step * (x - grid[k]))
+
+
+@loop_helper
+def _nodes_of(path: FloatArray, x: float, y: float) -> FloatArray:
+    """Return the nodes of a path (m, 2) as rows: along, across, arc length, middle, slope and spacing (6, c).
+
+    The last three rows, of the intervals between nodes, have one value less. The path's chord has the
+    direction (x, y).
+    """
+    m = len(path)
+    count = min(_NODES, m)
+    nodes = np.zeros((6, count))
+    before = 0
+    for k in range(count):
+        place = k * (m - 1) // (count - 1)
+        dx, dy = path[place, 0] - path[0, 0], path[place, 1] - path[0, 1]
+        nodes[0, k], nodes[1, k] = dx * x + dy * y, dy * x - dx * y
+        if k > 0:
+            along, across = nodes[0, k] - nodes[0, k - 1], nodes[1, k] - nodes[1, k - 1]
+            step = math.hypot(along, across)
+            nodes[2, k] = nodes[2, k - 1] + step
+            nodes[3, k - 1] = nodes[0, k - 1] + 0.5 * along
+            nodes[4, k - 1], nodes[5, k - 1] = across / along, step / (place - before)
+        before = place
+    return nodes
+
+
+@loop_helper
+def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: float) -> None:
+    """Add the light of one count along a nearly straight `path` (m, 2), px, to `image` (1 or 3, p)."""
+    m, width = len(path), math.sqrt(sigma**2 + 1.0 / 12.0)
+    room = _FARTHEST * width
+    x, y = path[m - 1, 0] - path[0, 0], path[m - 1, 1] - path[0, 1]
+    length = math.hypot(x, y)
+    x, y = x / length, y / length
+    nodes = _nodes_of(path, x, y)
+    along, across, arc, last = nodes[0], nodes[1], nodes[2], nodes.shape[1] - 1
+    middles, slope, spacing = nodes[3, :last], nodes[4, :last], nodes[5, :last]
+    low, high = across.min() - room - 1.0, across.max() + room + 1.0
+    begin, end = 0.5 * spacing[0], arc[last] + 0.5 * spacing[last - 1]
+    for p in range(len(pixels)):
+        dx, dy = pixels[p, 0] - path[0, 0], pixels[p, 1] - path[0, 1]
+        u, v = dx * x + dy * y, dy * x - dx * y
+        if u <= -room - 1.0 or u >= length + room + 1.0 or v <= low or v >= high:
+            continue
+        place = int(u / length * last)
+        bend, pace = _between(u, middles, slope, place), _between(u, middles, spacing, place)
+        beyond = u - min(max(u, along[0]), along[last])
+        off = v - _between(u, along, across, place) - beyond * bend
+        cosine = 1.0 / math.sqrt(1.0 + bend * bend)
+        n = off * cosine
+        s = _between(u, along, arc, place) + (beyond + off * bend * cosine * cosine) / cosine
+        light = _bell(n / width) / (width * pace * m)
+        covered, sloping = 1.0, 0.0
+        if s + begin < room:
+            covered, sloping = _area((s + begin) / width), _bell((s + begin) / width) / width
+        if end - s < room:
+            part = _area((end - s) / width)
+            sloping = sloping * part - covered * _bell((end - s) / width) / width
+            covered *= part
+        image[0, p] += light * covered
+        if len(image) == 3:
+            aside = covered * n / width**2
+            image[1, p] -= light * cosine * (aside * (y + bend * x) + sloping * (x - bend * y))
+            image[2, p] += light * cosine * (aside * (x - bend * y) - sloping * (y + bend * x))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineImage:
+    """Image of a straight streak of one count on p pixels, with its derivatives by displacements of the ends.
+
+    Attributes:
+        pixels: flat indices of the pixels in the patch (p,).
+        images: counts of the pixels, and their derivatives, 1/px, by displacements of the first end along
+            and across the streak, and of the second end along and across the streak (5, p).
+        axes: unit vectors along and across the streak (2, 2).
+    """
+
+    pixels: IntArray
+    images: FloatArray
+    axes: FloatArray
+
+
+def line_image(ends: FloatArray, columns: int, rows: int, sigma: float) -> LineImage:
+    """Return the image of a straight streak between two different `ends` (2, 2), px, near the streak."""
+    width = float(np.sqrt(sigma**2 + 1.0 / 12.0))
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    tangent = (ends[1] - ends[0]) / length
+    axes = np.array([tangent, [-tangent[1], tangent[0]]])
+    low = np.clip(np.floor(ends.min(axis=0) - 4.0 * width).astype(int), 0, (columns, rows))
+    high = np.clip(np.ceil(ends.max(axis=0) + 4.0 * width).astype(int) + 1, 0, (columns, rows))
+    x, y = np.arange(low[0], high[0]), np.arange(low[1], high[1])
+    n = (x - ends[0, 0]) * axes[1, 0] + ((y - ends[0, 1]) * axes[1, 1])[:, None]
+    row, column = np.nonzero(np.abs(n) < 4.0 * width)
+    n = n[row, column]
+    s = (x[column] - ends[0, 0]) * axes[0, 0] + (y[row] - ends[0, 1]) * axes[0, 1]
+    a, b = s / width, (s - length) / width
+    bell_a, bell_b = (np.exp(-0.5 * each**2) / np.sqrt(2.0 * np.pi) for each in (a, b))
+    profile = np.exp(-0.5 * (n / width) ** 2) / (np.sqrt(2.0 * np.pi) * width * length)
+    covered = ndtr(a) - ndtr(b)
+    whole = profile * covered
+    # The moment of the image by the relative position along the streak is the share of the second end.
+    second = profile * (s * covered + width * (bell_a - bell_b)) / length
+    aside = n / width**2
+    images = np.stack(
+        [
+            whole,
+            whole / length - profile * bell_a / width,
+            aside * (whole - second),
+            profile * bell_b / width - whole / length,
+            aside * second,
+        ]
+    )
+    return LineImage((y[row]) * columns + x[column], images, axes)
+
+
+# Largest step (px) of the fit of a line, step (px) that ends the fit, and maximum number of steps.
+_LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
+# Distance (standard deviations) from the end of a line beyond which the end does not change the light.
+_COVERED = 8.5
+# Relative ridge of the normal equations of a fit to pixels.
+_RIDGE = 1e-6
+
+
+def least_squares(images: FloatArray, target: FloatArray) -> FloatArray:
+    """Return the least-squares coefficients (k,) of `images` (p, k), slightly regularised."""
+    normal = images.T @ images
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    normal = normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
+    return np.asarray(np.linalg.solve(normal, (images.T @ target) / scale) / scale)
+
+
+def _fitted_line_numpy(light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: float) -> FloatArray:
+    """Return the ends of a line as `fitted_line` does."""
+    rows, columns = light.shape
+    weights, lights = weight.reshape(-1), light.reshape(-1)
+    for _ in range(_FITS):
+        line = line_image(ends, columns, rows, sigma)
+        share = weights[line.pixels]
+        solution = least_squares((line.images * share).T, lights[line.pixels] * share)
+        if solution[0] <= 0.0:
+            break
+        steps = np.clip(solution[1:] / solution[0], -_LARGEST_STEP, _LARGEST_STEP).reshape(2, 2)
+        ends = ends + steps @ line.axes
+        if np.abs(steps).max() < _CONVERGED or np.all(ends[0] == ends[1]):
+            break
+    return ends
+
+
+@compiled_form_of(_fitted_line_numpy)
+def fitted_line(light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: float) -> FloatArray:
+    """Return the ends (2, 2), px, of the line that Gauss-Newton fits to the counts `light` (rows, columns).
+
+    Args:
+        light: counts of the pixels (rows, columns).
+        weight: reciprocal standard deviations of the pixels (rows, columns), 1/counts.
+        ends: initial guess of the two ends (2, 2), px, which differ.
+        sigma: standard deviation of the PSF, px.
+    """
+    ends = ends.copy()
+    sums = np.empty((6, 5))
+    for _ in range(_FITS):
+        length = math.hypot(ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1])
+        x, y = (ends[1, 0] - ends[0, 0]) / length, (ends[1, 1] - ends[0, 1]) / length
+        _sum_line(light, weight, ends, sigma, sums)
+        solution = _solved(sums)
+        if solution[0] <= 0.0:
+            break
+        largest = 0.0
+        for end in range(2):
+            along = min(max(solution[2 * end + 1] / solution[0], -_LARGEST_STEP), _LARGEST_STEP)
+            across = min(max(solution[2 * end + 2] / solution[0], -_LARGEST_STEP), _LARGEST_STEP)
+            ends[end, 0] += along * x - across * y
+            ends[end, 1] += along * y + across * x
+            largest = max(largest, abs(along), abs(across))
+        if largest < _CONVERGED or (ends[0, 0] == ends[1, 0] and ends[0, 1] == ends[1, 1]):
+            break
+    return ends
+
+
+@loop_helper
+def _sum_line(
+    light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: float, sums: FloatArray
+) -> None:
+    """Set `sums` (6, 5) to the products of the images of `line_image`, and in the last row with the light."""
+    rows, columns = light.shape
+    width = math.sqrt(sigma**2 + 1.0 / 12.0)
+    reach = 4.0 * width
+    length = math.hypot(ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1])
+    x, y = (ends[1, 0] - ends[0, 0]) / length, (ends[1, 1] - ends[0, 1]) / length
+    left = min(max(math.floor(min(ends[0, 0], ends[1, 0]) - reach), 0), columns)
+    right = min(max(math.ceil(max(ends[0, 0], ends[1, 0]) + reach) + 1, 0), columns)
+    top = min(max(math.floor(min(ends[0, 1], ends[1, 1]) - reach), 0), rows)
+    bottom = min(max(math.ceil(max(ends[0, 1], ends[1, 1]) + reach) + 1, 0), rows)
+    sums[:] = 0.0
+    image = np.empty(5)
+    for row in range(top, bottom):
+        first, last = left, right
+        if abs(y) > 1e-3:
+            middle, half = ends[0, 0] + (row - ends[0, 1]) * x / y, reach / abs(y) + 1.0
+            first = max(first, int(min(max(middle - half, left), right)))
+            last = min(last, int(min(max(middle + half, left), right)) + 1)
+        for column in range(first, last):
+            dx, dy = column - ends[0, 0], row - ends[0, 1]
+            n = dy * x - dx * y
+            if abs(n) < reach:
+                _set_pixel_of_line(dx * x + dy * y, n, width, length, image)
+                share = weight[row, column] ** 2
+                for k in range(5):
+                    for other in range(k + 1):
+                        sums[k, other] += share * image[k] * image[other]
+                    sums[5, k] += share * image[k] * light[row, column]
+
+
+@loop_helper
+def _set_pixel_of_line(s: float, n: float, width: float, length: float, image: FloatArray) -> None:
+    """Set `image` (5,) to the light of `line_image` at one pixel, s px along and n px across the line."""
+    profile = _bell(n / width) / (width * length)
+    a, b = s / width, (s - length) / width
+    covered, bell_a, bell_b = 1.0, 0.0, 0.0
+    if a < _COVERED or b > -_COVERED:
+        covered, bell_a, bell_b = _area(a) - _area(b), _bell(a), _bell(b)
+    whole = profile * covered
+    second = profile * (s * covered + width * (bell_a - bell_b)) / length
+    aside = n / width**2
+    image[0] = whole
+    image[1] = whole / length - profile * bell_a / width
+    image[2] = aside * (whole - second)
+    image[3] = profile * bell_b / width - whole / length
+    image[4] = aside * second
+
+
+@loop_helper
+def _solved(sums: FloatArray) -> FloatArray:
+    """Return the solution (k,) of normal equations (k, k) with the right side in the last row, regularised.
+
+    Only the lower triangle of the equations is read. The method is the Cholesky decomposition.
+    """
+    size = sums.shape[1]
+    scale, solution, lower = np.empty(size), np.empty(size), np.empty((size, size))
+    for k in range(size):
+        scale[k] = math.sqrt(max(sums[k, k], 1e-300))
+    for k in range(size):
+        for other in range(k + 1):
+            value = sums[k, other] / (scale[k] * scale[other])
+            value += _RIDGE if k == other else 0.0
+            for j in range(other):
+                value -= lower[k, j] * lower[other, j]
+            lower[k, other] = math.sqrt(value) if k == other else value / lower[other, other]
+        value = sums[size, k] / scale[k]
+        for j in range(k):
+            value -= lower[k, j] * solution[j]
+        solution[k] = value / lower[k, k]
+    for k in range(size - 1, -1, -1):
+        for j in range(k + 1, size):
+            solution[k] -= lower[j, k] * solution[j]
+        solution[k] /= lower[k, k]
+    return solution / scale
+
+
+def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> FloatArray:
+    """Return the image (rows, columns) of a streak of one count along `path` (m, 2), px.
+
+    The count is distributed evenly over the points of the path, and each point is blurred by a Gaussian with
+    the standard deviation `sigma`, px.
+    """
+    x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
+    return _added(x, y, x.values, y.values) / len(path)
+
+
+def spread_with_slopes(
+    path: FloatArray, shares: FloatArray, columns: int, rows: int, sigma: float
+) -> list[FloatArray]:
+    """Return the image of a streak of one count, and its derivatives, 1/px, by displacements of the path.
+
+    Each of the k displacements moves each of the m points of the path by the given fraction `shares` (k, m)
+    of a displacement. For each displacement of the path, the derivatives for a displacement along x and along
+    y are returned.
+    """
+    x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
+    dx, dy = (_slopes_within_pixels(each, path[:, k], sigma) for k, each in enumerate((x, y)))
+    images = [_added(x, y, x.values, y.values)]
+    for share in shares:
+        images += [_added(x, y, share[:, None] * dx, y.values), _added(x, y, share[:, None] * x.values, dy)]
+    return [image / len(path) for image in images]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Profiles:
+    """Profiles of m points on w adjacent pixels along one axis of `count` pixels.
+
+    Attributes:
+        count: number of pixels along the axis.
+        first: index of the first of the w pixels of each point (m,), which may lie beside the axis.
+        values: integrals of the point spread over the pixels (m, w).
+    """
+
+    count: int
+    first: IntArray
+    values: FloatArray
+
+
+def _within_pixels(count: int, centres: FloatArray, sigma: float) -> _Profiles:
+    """Return integrals of normal densities centred on `centres` (m,), px, over the nearest pixels."""
+    reach = int(np.ceil(_FARTHEST * sigma))
+    first = np.rint(centres).astype(np.int64) - reach
+    edges = (first[:, None] + np.arange(2 * reach + 2) - 0.5 - centres[:, None]) / sigma
+    return _Profiles(count, first, np.diff(ndtr(edges), axis=1))
+
+
+def _slopes_within_pixels(profiles: _Profiles, centres: FloatArray, sigma: float) -> FloatArray:
+    """Return the derivatives (m, w), 1/px, of the values of `profiles` with respect to the centres (m,)."""
+    edges = profiles.first[:, None] + np.arange(profiles.values.shape[1] + 1) - 0.5 - centres[:, None]
+    return np.asarray(-np.diff(np.exp(-0.5 * (edges / sigma) ** 2), axis=1) / (np.sqrt(2.0 * np.pi) * sigma))
+
+
+def _added(x: _Profiles, y: _Profiles, across: FloatArray, down: FloatArray) -> FloatArray:
+    """Return the image (rows, columns) of points that are each the product of two profiles.
+
+    The values `across` (m, w) and `down` (m, w) belong to the pixels of the profiles `x` and `y`. Only the
+    pixels near the points are computed, which matters for long streaks in large images.
+    """
+    width = across.shape[1]
+    columns = x.count + 2 * width
+    corner = (np.clip(y.first, -width, y.count) + width) * columns + np.clip(x.first, -width, x.count) + width
+    step = (np.arange(width)[:, None] * columns + np.arange(width)).reshape(-1)
+    light = (down[:, :, None] * across[:, None, :]).reshape(-1)
+    rows = y.count + 2 * width
+    image = np.bincount((corner[:, None] + step).reshape(-1), light, rows * columns).reshape(rows, columns)
+    return np.asarray(image[width:-width, width:-width])
