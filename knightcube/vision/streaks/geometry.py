@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_product, select
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import FOURTH_AS, CameraKnowledge, CameraModel, Lens, Pinhole
 
 PIXEL_VARIANCE = 1.0 / 12.0
@@ -207,32 +208,17 @@ class StarPaths:
 
 def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> StarPaths:
     """Return points at `time` (m,) on the paths of stars that are at `stars` (m, 2), px, at mid-exposure."""
-    v = _rotated(_rotation_until(motion, time), _directions(pinhole, stars))
-    w = _rate(motion, time)
-    velocity = _cross(v, w)  # -omega x v
-    acceleration = _cross(velocity, w)
-    if not motion.constant:
-        acceleration += _cross(v, motion.acceleration[:, None] + motion.higher(time, 2))
-    focal = pinhole.focal_length
-    inverse = 1.0 / v[2]
-    there = v[:2] * inverse
-    pace = (velocity[:2] - there * velocity[2]) * inverse
-    bent = (acceleration[:2] - there * acceleration[2] - 2.0 * pace * velocity[2]) * inverse
-    ideal = StarPaths(_pixels(pinhole, there), (focal * pace).T, (focal * bent).T)
+    position, velocity, acceleration = _ideal_paths(*_ideal_arguments(pinhole, motion, stars, time))
     if not isinstance(pinhole, DistortedPinhole):
-        return ideal
-    jacobian = pinhole.jacobian(ideal.position)
-    velocity, acceleration = (
-        (jacobian @ each[..., None])[..., 0] for each in (ideal.velocity, ideal.acceleration)
-    )
-    acceleration += pinhole.curvature(ideal.position, ideal.velocity)
-    return StarPaths(pinhole.distorted(ideal.position), velocity, acceleration)
+        return StarPaths(position, velocity, acceleration)
+    jacobian = pinhole.jacobian(position)
+    bent = (jacobian @ acceleration[..., None])[..., 0] + pinhole.curvature(position, velocity)
+    return StarPaths(pinhole.distorted(position), (jacobian @ velocity[..., None])[..., 0], bent)
 
 
 def positions(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
     """Return only the positions (m, 2), px, of the points that `paths` returns, in less time."""
-    v = _rotated(_rotation_until(motion, time), _directions(pinhole, stars))
-    points = _pixels(pinhole, v[:2] / v[2])
+    points = _ideal_positions(*_ideal_arguments(pinhole, motion, stars, time))
     return pinhole.distorted(points) if isinstance(pinhole, DistortedPinhole) else points
 
 
@@ -241,7 +227,9 @@ def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
 
     If the camera rotates at the rate u (rad per exposure), a star moves by B u px per exposure.
     """
-    return _flow(pinhole, _directions(pinhole, points)[:2]).transpose(2, 0, 1)
+    view = (pinhole.focal_length, *pinhole.centre)
+    ideal = pinhole.undistorted(points) if isinstance(pinhole, DistortedPinhole) else points
+    return _flow(pinhole.focal_length, _directions(view, ideal)[:2]).transpose(2, 0, 1)
 
 
 def sensitivities(
@@ -261,16 +249,147 @@ def sensitivities_and_velocity(
     exact. The derivatives with respect to the acceleration have an error of second order in the rotation
     angle, and are zero unless the acceleration is fitted (`growing`).
     """
+    arguments = _ideal_arguments(pinhole, motion, stars, time)
+    change, pace = _ideal_sensitivities(*arguments, growing)
+    if isinstance(pinhole, DistortedPinhole):
+        jacobian = pinhole.jacobian(_ideal_positions(*arguments))
+        change, pace = jacobian @ change, (jacobian @ pace[..., None])[..., 0]
+        # Positions at mid-exposure include distortion, so that their derivatives need the inverse Jacobian.
+        change[..., 6:] = change[..., 6:] @ np.linalg.inv(pinhole.jacobian(arguments[4]))
+    return change, pace
+
+
+_View = tuple[float, float, float]
+"""Focal length and image centre (x, y) of a pinhole, px."""
+_Arguments = tuple[_View, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def _ideal_arguments(
+    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray
+) -> _Arguments:
+    """Return view, rate, acceleration, higher terms, undistorted `stars` (m, 2) and `time` (m,)."""
+    if isinstance(pinhole, DistortedPinhole):
+        stars = pinhole.undistorted(stars)
+    terms = motion.rate, motion.acceleration, motion.higher_terms
+    rate, acceleration, higher = (np.ascontiguousarray(term) for term in terms)
+    view = (pinhole.focal_length, *pinhole.centre)
+    return view, rate, acceleration, higher, np.ascontiguousarray(stars), np.ascontiguousarray(time)
+
+
+# The numpy forms use arrays of m vectors (..., 3, m), whose components are contiguous, and return transposed
+# views of them.
+
+
+def _ideal_positions_numpy(
+    view: _View,
+    rate: FloatArray,
+    acceleration: FloatArray,
+    higher: FloatArray,
+    stars: FloatArray,
+    time: FloatArray,
+) -> FloatArray:
+    """Return the positions (m, 2), px, at `time` (m,) of `stars` (m, 2), px, without distortion."""
+    motion = CameraMotion(rate, acceleration, higher)
+    v = _rotated(_rotation_until(motion, time), _directions(view, stars))
+    return _pixels(view, v[:2] / v[2])
+
+
+@compiled_form_of(_ideal_positions_numpy)
+def _ideal_positions(
+    view: _View,
+    rate: FloatArray,
+    acceleration: FloatArray,
+    higher: FloatArray,
+    stars: FloatArray,
+    time: FloatArray,
+) -> FloatArray:
+    """See `_ideal_positions_numpy`."""
+    out = np.empty((2, len(time)))
+    if len(higher) == 0 and _is_small(rate, acceleration, time):
+        for m in range(len(time)):
+            turn, w, change = _motion_at(rate, acceleration, time[m])
+            turned = _turned(turn, _small_turn(_inner(turn, turn)), _direction(view, stars, m))
+            out[0, m], out[1, m], _, _, _, _ = _projected(view, turned, w, change)
+    else:
+        for m in range(len(time)):
+            turn, w, change = _any_motion_at(rate, acceleration, higher, time[m])
+            turned = _turned(turn, _any_turn(_inner(turn, turn)), _direction(view, stars, m))
+            out[0, m], out[1, m], _, _, _, _ = _projected(view, turned, w, change)
+    return out.T
+
+
+def _ideal_paths_numpy(
+    view: _View,
+    rate: FloatArray,
+    acceleration: FloatArray,
+    higher: FloatArray,
+    stars: FloatArray,
+    time: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return position, velocity and acceleration (m, 2) of `stars` (m, 2), px, without distortion."""
+    motion = CameraMotion(rate, acceleration, higher)
+    v = _rotated(_rotation_until(motion, time), _directions(view, stars))
+    w = _rate(motion, time)
+    velocity = _cross(v, w)  # -omega x v
+    bent = _cross(velocity, w)
+    if not motion.constant:
+        bent += _cross(v, acceleration[:, None] + motion.higher(time, 2))
+    focal = view[0]
+    inverse = 1.0 / v[2]
+    there = v[:2] * inverse
+    pace = (velocity[:2] - there * velocity[2]) * inverse
+    bend = (bent[:2] - there * bent[2] - 2.0 * pace * velocity[2]) * inverse
+    return _pixels(view, there), (focal * pace).T, (focal * bend).T
+
+
+@compiled_form_of(_ideal_paths_numpy)
+def _ideal_paths(
+    view: _View,
+    rate: FloatArray,
+    acceleration: FloatArray,
+    higher: FloatArray,
+    stars: FloatArray,
+    time: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """See `_ideal_paths_numpy`."""
+    out = np.empty((6, len(time)))
+    if len(higher) == 0 and _is_small(rate, acceleration, time):
+        # Machine code for this branch uses vector instructions.
+        for m in range(len(time)):
+            turn, w, change = _motion_at(rate, acceleration, time[m])
+            turned = _turned(turn, _small_turn(_inner(turn, turn)), _direction(view, stars, m))
+            point = _projected(view, turned, w, change)
+            out[0, m], out[1, m], out[2, m], out[3, m], out[4, m], out[5, m] = point
+    else:
+        for m in range(len(time)):
+            turn, w, change = _any_motion_at(rate, acceleration, higher, time[m])
+            turned = _turned(turn, _any_turn(_inner(turn, turn)), _direction(view, stars, m))
+            point = _projected(view, turned, w, change)
+            out[0, m], out[1, m], out[2, m], out[3, m], out[4, m], out[5, m] = point
+    return out[0:2].T, out[2:4].T, out[4:6].T
+
+
+def _ideal_sensitivities_numpy(
+    view: _View,
+    rate: FloatArray,
+    acceleration: FloatArray,
+    higher: FloatArray,
+    stars: FloatArray,
+    time: FloatArray,
+    growing: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Return derivatives (m, 2, 8) and velocities (m, 2) without distortion."""
+    motion = CameraMotion(rate, acceleration, higher)
     turned = _rotation_until(motion, time)
-    v = _rotated(turned, _directions(pinhole, stars))
+    v = _rotated(turned, _directions(view, stars))
     there = v[:2] / v[2]
     out = np.zeros((2, 8, len(time)))
     # A change of the rate rotates the camera by a small vector psi, which moves the direction v by v x psi.
     # The vector psi at the time t is the integral over t' of the rotation from t' to t.
-    flow = _flow(pinhole, there)
+    flow = _flow(view[0], there)
     # For psi, the body is assumed to rotate at the mean rate since mid-exposure (error of higher order).
-    mean = motion.rate[:, None] + 0.5 * time * motion.acceleration[:, None]
-    if motion.higher_terms.any():
+    mean = rate[:, None] + 0.5 * time * acceleration[:, None]
+    if higher.any():
         mean += motion.higher(time) / np.where(np.abs(time) < _TINY, 1.0, time)
     angle = np.sqrt(np.sum(mean * mean, axis=0))
     axis = mean / np.maximum(angle, _TINY)
@@ -286,45 +405,207 @@ def sensitivities_and_velocity(
         beside = _rotated(turned, unit)
         out[:, column] = (beside[:2] - there * beside[2]) / v[2]
     velocity = np.sum(flow * _rate(motion, time), axis=1)
-    change, pace = out.transpose(2, 0, 1), velocity.T
-    if isinstance(pinhole, DistortedPinhole):
-        jacobian = pinhole.jacobian(_pixels(pinhole, there))
-        change, pace = jacobian @ change, (jacobian @ pace[..., None])[..., 0]
-        # Positions at mid-exposure include distortion, so that their derivatives need the inverse Jacobian.
-        change[..., 6:] = change[..., 6:] @ np.linalg.inv(pinhole.jacobian(pinhole.undistorted(stars)))
-    return change, pace
+    return out.transpose(2, 0, 1), velocity.T
 
 
-# From here on, functions use arrays of m vectors (..., 3, m), whose components are contiguous.
-# The public functions above this line return transposed views of arrays of m vectors (..., 3, m).
+@compiled_form_of(_ideal_sensitivities_numpy)
+def _ideal_sensitivities(
+    view: _View,
+    rate: FloatArray,
+    acceleration: FloatArray,
+    higher: FloatArray,
+    stars: FloatArray,
+    time: FloatArray,
+    growing: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """See `_ideal_sensitivities_numpy`."""
+    focal = view[0]
+    out, velocity = np.zeros((len(time), 2, 8)), np.empty((len(time), 2))
+    for m in range(len(time)):
+        t = time[m]
+        turn, w, _ = _any_motion_at(rate, acceleration, higher, t)
+        trig = _any_turn(_inner(turn, turn))
+        v = _turned(turn, trig, _direction(view, stars, m))
+        x, y = v[0] / v[2], v[1] / v[2]
+        flow = (x * y, -1.0 - x * x, y), (1.0 + y * y, -x * y, -x)
+        mean = _mean_rate(rate, acceleration, higher, t)
+        square = t * t * _inner(mean, mean)
+        sine, versine = _any_turn(square)
+        rest = (1.0 - sine) / square if square > _SMALL_SQUARE else 1.0 / 6.0 - square / 120.0
+        beside = _turned(turn, trig, (1.0, 0.0, 0.0)), _turned(turn, trig, (0.0, 1.0, 0.0))
+        for i in range(2):
+            about, along = _product(flow[i], mean), t * t * rest * _inner(flow[i], mean)
+            for k in range(3):
+                part = sine * flow[i][k] - t * versine * about[k] + along * mean[k]
+                out[m, i, k] = focal * t * part
+                if growing:
+                    out[m, i, 3 + k] = focal * t * t * (0.5 * flow[i][k] - t / 6.0 * about[k])
+            for k in range(2):
+                out[m, i, 6 + k] = (beside[k][i] - (y if i else x) * beside[k][2]) / v[2]
+            velocity[m, i] = focal * _inner(flow[i], w)
+    return out, velocity
 
 
-def _flow(pinhole: Pinhole, there: FloatArray) -> FloatArray:
+_Vector = tuple[float, float, float]
+
+# Squared rotation angle (rad^2) below which two terms of a series are exact.
+_SMALL_SQUARE = 1e-4
+# Largest squared rotation angle (rad^2) for which the series of sine and cosine are exact.
+_LARGEST_SQUARE = 4.0
+
+
+@loop_helper
+def _product(a: _Vector, b: _Vector) -> _Vector:
+    """Return the cross product of two vectors."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@loop_helper
+def _inner(a: _Vector, b: _Vector) -> float:
+    """Return the scalar product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@loop_helper
+def _direction(view: _View, stars: FloatArray, m: int) -> _Vector:
+    """Return the direction of star `m`, scaled to z = 1."""
+    return (stars[m, 0] - view[1]) * (1.0 / view[0]), (stars[m, 1] - view[2]) * (1.0 / view[0]), 1.0
+
+
+@loop_helper
+def _motion_at(rate: FloatArray, acceleration: FloatArray, t: float) -> tuple[_Vector, _Vector, _Vector]:
+    """Return rotation vector since mid-exposure, rate and angular acceleration at the time `t`."""
+    half, cube = 0.5 * t * t, t * t * t * (1.0 / 12.0)
+    x = t * rate[0] + half * acceleration[0] + cube * (rate[1] * acceleration[2] - rate[2] * acceleration[1])
+    y = t * rate[1] + half * acceleration[1] + cube * (rate[2] * acceleration[0] - rate[0] * acceleration[2])
+    z = t * rate[2] + half * acceleration[2] + cube * (rate[0] * acceleration[1] - rate[1] * acceleration[0])
+    return (
+        (x, y, z),
+        (rate[0] + t * acceleration[0], rate[1] + t * acceleration[1], rate[2] + t * acceleration[2]),
+        (acceleration[0], acceleration[1], acceleration[2]),
+    )
+
+
+@loop_helper
+def _any_motion_at(
+    rate: FloatArray, acceleration: FloatArray, higher: FloatArray, t: float
+) -> tuple[_Vector, _Vector, _Vector]:
+    """Return `_motion_at` with the higher terms of the rotation vector."""
+    (x, y, z), (wx, wy, wz), (gx, gy, gz) = _motion_at(rate, acceleration, t)
+    power = t
+    for term in range(len(higher)):
+        p = term + 3.0
+        a, b, c = higher[term, 0] * power, higher[term, 1] * power, higher[term, 2] * power
+        x, y, z = x + a * t * t, y + b * t * t, z + c * t * t
+        wx, wy, wz = wx + p * a * t, wy + p * b * t, wz + p * c * t
+        gx, gy, gz = gx + p * (p - 1.0) * a, gy + p * (p - 1.0) * b, gz + p * (p - 1.0) * c
+        power *= t
+    return (x, y, z), (wx, wy, wz), (gx, gy, gz)
+
+
+@loop_helper
+def _mean_rate(rate: FloatArray, acceleration: FloatArray, higher: FloatArray, t: float) -> _Vector:
+    """Return the mean rate between mid-exposure and the time `t`."""
+    x = rate[0] + 0.5 * t * acceleration[0]
+    y = rate[1] + 0.5 * t * acceleration[1]
+    z = rate[2] + 0.5 * t * acceleration[2]
+    power = t * t
+    for term in range(len(higher)):
+        x, y, z = x + higher[term, 0] * power, y + higher[term, 1] * power, z + higher[term, 2] * power
+        power *= t
+    return x, y, z
+
+
+@loop_helper
+def _is_small(rate: FloatArray, acceleration: FloatArray, time: FloatArray) -> bool:
+    """Return whether the series of sine and cosine are exact at every `time`."""
+    latest = 0.0
+    for m in range(len(time)):
+        latest = max(latest, abs(time[m]))
+    u = math.sqrt(rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2])
+    g = math.sqrt(acceleration[0] ** 2 + acceleration[1] ** 2 + acceleration[2] ** 2)
+    angle = latest * (u + latest * (0.5 * g + latest * u * g / 12.0))
+    return angle * angle < _LARGEST_SQUARE
+
+
+@loop_helper
+def _small_turn(q: float) -> tuple[float, float]:
+    """Return sin(a)/a and (1 - cos(a))/a^2 for the squared angle q = a^2 by their power series."""
+    sine = 1.0 - q * (1 / 272) * (1.0 - q * (1 / 342) * (1.0 - q * (1 / 420)))
+    sine = 1.0 - q * (1 / 110) * (1.0 - q * (1 / 156) * (1.0 - q * (1 / 210) * sine))
+    sine = 1.0 - q * (1 / 20) * (1.0 - q * (1 / 42) * (1.0 - q * (1 / 72) * sine))
+    versine = 1.0 - q * (1 / 306) * (1.0 - q * (1 / 380) * (1.0 - q * (1 / 462)))
+    versine = 1.0 - q * (1 / 132) * (1.0 - q * (1 / 182) * (1.0 - q * (1 / 240) * versine))
+    versine = 1.0 - q * (1 / 30) * (1.0 - q * (1 / 56) * (1.0 - q * (1 / 90) * versine))
+    return 1.0 - q * (1 / 6) * sine, 0.5 - q * (1 / 24) * versine
+
+
+@loop_helper
+def _any_turn(q: float) -> tuple[float, float]:
+    """Return `_small_turn` for any squared angle q."""
+    if q < _LARGEST_SQUARE:
+        return _small_turn(q)
+    angle = math.sqrt(q)
+    return math.sin(angle) / angle, (1.0 - math.cos(angle)) / q
+
+
+@loop_helper
+def _turned(turn: _Vector, trig: tuple[float, float], v: _Vector) -> _Vector:
+    """Return an inertially fixed direction in the axes of the camera after the rotation `turn`."""
+    about = _product(v, turn)
+    along = trig[1] * _inner(turn, v)
+    still = 1.0 - trig[1] * _inner(turn, turn)
+    return (
+        still * v[0] + trig[0] * about[0] + along * turn[0],
+        still * v[1] + trig[0] * about[1] + along * turn[1],
+        still * v[2] + trig[0] * about[2] + along * turn[2],
+    )
+
+
+@loop_helper
+def _projected(
+    view: _View, v: _Vector, w: _Vector, change: _Vector
+) -> tuple[float, float, float, float, float, float]:
+    """Return position, velocity and acceleration in the image of a star in the direction `v`.
+
+    The camera has the rate `w` and the angular acceleration `change`.
+    """
+    first = _product(v, w)
+    second, third = _product(first, w), _product(v, change)
+    inverse = 1.0 / v[2]
+    x, y = v[0] * inverse, v[1] * inverse
+    dx, dy = (first[0] - x * first[2]) * inverse, (first[1] - y * first[2]) * inverse
+    down = second[2] + third[2]
+    bx = (second[0] + third[0] - x * down - 2.0 * dx * first[2]) * inverse
+    by = (second[1] + third[1] - y * down - 2.0 * dy * first[2]) * inverse
+    focal = view[0]
+    return focal * x + view[1], focal * y + view[2], focal * dx, focal * dy, focal * bx, focal * by
+
+
+def _flow(focal_length: float, there: FloatArray) -> FloatArray:
     """Return image-flow matrices (2, 3, m), px/rad, at the normalised image coordinates `there` (2, m)."""
     x, y = there
     xy = x * y
     out = np.empty((2, 3, len(x)))
     out[0, 0], out[0, 1], out[0, 2] = xy, -1.0 - x * x, y
     out[1, 0], out[1, 1], out[1, 2] = 1.0 + y * y, -xy, -x
-    out *= pinhole.focal_length
+    out *= focal_length
     return out
 
 
-def _directions(pinhole: Pinhole, stars: FloatArray) -> FloatArray:
-    """Return the directions (3, m) of pixels `stars` (m, 2), scaled to z = 1."""
-    if isinstance(pinhole, DistortedPinhole):
-        stars = pinhole.undistorted(stars)
+def _directions(view: _View, stars: FloatArray) -> FloatArray:
+    """Return the directions (3, m) of undistorted pixels `stars` (m, 2), scaled to z = 1."""
     out = np.ones((3, len(stars)))
     out[:2] = stars.T
-    out[:2] -= np.array(pinhole.centre)[:, None]
-    out[:2] /= pinhole.focal_length
+    out[:2] -= np.array(view[1:])[:, None]
+    out[:2] /= view[0]
     return out
 
 
-def _pixels(pinhole: Pinhole, there: FloatArray) -> FloatArray:
+def _pixels(view: _View, there: FloatArray) -> FloatArray:
     """Return the ideal image positions (m, 2), px, of normalised coordinates `there` (2, m), x/z and y/z."""
-    pixel = pinhole.focal_length * there
-    pixel += np.array(pinhole.centre)[:, None]
+    pixel = view[0] * there
+    pixel += np.array(view[1:])[:, None]
     return pixel.T
 
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.vision.streaks import geometry
 from knightcube.vision.streaks.geometry import CameraMotion, DistortedPinhole, paths, positions, sensitivities
+from tests.support.compiled_forms import assert_forms_agree
 
 _LENS = DistortedPinhole(1024, 1024, 2903.0, (3.0, -2.0), 0.002, 0.01)
 _MOTION = CameraMotion(np.array([0.03, 0.05, 0.1]), np.array([0.003, -0.002, 0.01]))
@@ -53,3 +55,17 @@ def test_sensitivities_are_derivatives_of_the_position(parameter: int) -> None:
     expected = (moved(1.0) - moved(-1.0)) / (2.0 * change[parameter])
     found = sensitivities(_LENS, _MOTION, _STARS, _TIME)[:, :, parameter]
     assert found == pytest.approx(expected, abs=1e-3 * float(np.abs(expected).max()))
+
+
+@pytest.mark.parametrize("higher", [np.zeros((0, 3)), np.array([[0.02, -0.01, 0.03], [0.01, 0.05, -0.04]])])
+@pytest.mark.parametrize("acceleration", [np.zeros(3), np.array([0.03, -0.2, 0.1])])
+@pytest.mark.parametrize("rate", [np.zeros(3), np.array([0.03, 0.05, 0.1]), np.array([-0.4, 0.7, 0.5])])
+def test_the_compiled_paths_equal_those_in_numpy(
+    rate: FloatArray, acceleration: FloatArray, higher: FloatArray
+) -> None:
+    time = np.append(_TIME[1:], 0.0)
+    arguments = (2903.0, 511.5, 411.5), rate, acceleration, higher, _STARS, time
+    assert_forms_agree(geometry._ideal_positions, *arguments)
+    assert_forms_agree(geometry._ideal_paths, *arguments)
+    for growing in (False, True):
+        assert_forms_agree(geometry._ideal_sensitivities, *arguments, growing)
