@@ -42,6 +42,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
@@ -104,8 +105,12 @@ class Strips:
 
     def rows(self, of: IntArray | slice) -> Float32Array:
         """Return the frame's row indices (.., LINES, k) of the pixels in the blocks that `of` selects."""
-        along = np.arange(self.index.shape[2]) * self.step[of, 1, None, None]
-        return (self.corner[of, :, 1, None] + along).astype(np.float32)
+        return _rows(self.corner[of], self.step[of], self.index.shape[2])
+
+
+def _rows(corner: IntArray, step: IntArray, count: int) -> Float32Array:
+    """Return the row indices (b, LINES, count) of the pixels on lines, see `Strips`."""
+    return (corner[:, :, 1, None] + np.arange(count) * step[:, 1, None, None]).astype(np.float32)
 
 
 def cut_strips(
@@ -310,6 +315,9 @@ _BEYOND = 5.5
 # Number of instants at which a path with a changing rate is evaluated to divide it into segments.
 _SPOT_SAMPLES = 33
 _BELL = 1.0 / math.sqrt(2.0 * math.pi)
+_ROOT_HALF = math.sqrt(0.5)
+_OCTAVE = math.log(2.0)
+_PER_OCTAVE = 1.0 / math.log(2.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -460,35 +468,79 @@ def images(
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
-    velocity = path.velocity.reshape(*shape, 2)
-    speed = np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), _SLOWEST)
-    position, acceleration = path.position.reshape(*shape, 2), path.acceleration.reshape(*shape, 2)
-    lines = position, velocity / speed[..., None], speed, acceleration
+    drawn = (path.position, path.velocity, path.acceleration)
+    lines = (np.ascontiguousarray(each.T).reshape(2, *shape) for each in drawn)
     out = np.empty((len(strips.star), IMAGES + more, *strips.index.shape[1:]), dtype=np.float32)
-    for first in range(0, len(out), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        _draw(out[part], strips, part, tuple(line[part] for line in lines), shutter, width)
+    delay = float(shutter.delay_per_row), float(shutter.middle)
+    _draw(out, strips.corner, strips.step, strips.time, *lines, width, delay)
     return out
 
 
-def _draw(
+def _draw_numpy(
     out: Float32Array,
-    strips: Strips,
-    part: slice,
-    path: tuple[FloatArray, ...],
-    shutter: Shutter,
+    corner: IntArray,
+    step: IntArray,
+    time: FloatArray,
+    position: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
     width: float,
+    delay: tuple[float, float],
 ) -> None:
-    """Compute the basis images for the blocks `part` of pixels from the star's path through these blocks."""
-    speed, time = path[2], strips.time[part]
+    """Compute the basis images `out` (b, .., LINES, k) from the points at which paths cross lines of pixels.
+
+    Position, velocity and acceleration are arrays (2, b, LINES). The two values `delay` are the exposure
+    delay from row to row and the row without delay.
+    """
+    speed = np.maximum(np.hypot(velocity[0], velocity[1]), _SLOWEST)
+    tangent = velocity / speed
     # The variable `gained` is the star's acceleration along its path, px per exposure^2.
-    gained = np.sum(path[3] * path[1], axis=-1)
-    light, aside, s = _endless(strips, part, (*path, gained), out.shape[3], width)
+    gained = np.sum(acceleration * tangent, axis=0)
+    bend = (acceleration[1] * tangent[0] - acceleration[0] * tangent[1]) / speed**2
     centre = time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1, keepdims=True)
-    s += ((time - centre) * speed).astype(np.float32)
+    for first in range(0, len(out), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        lines = _Crossings(
+            corner[part],
+            step[part],
+            position[:, part].transpose(1, 2, 0),
+            tangent[:, part].transpose(1, 2, 0),
+            time[part],
+            centre[part],
+            speed[part],
+            gained[part],
+            bend[part],
+        )
+        _draw_part(out[part], lines, width, Shutter(*delay))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Crossings:
+    """Points at which paths cross the lines of b blocks of pixels (b, LINES).
+
+    First pixels and steps are those of `Strips`. Position and unit tangent are arrays (b, LINES, 2). Time,
+    speed, acceleration along the path (`gained`) and curvature (`bend`) are arrays (b, LINES), and the time
+    at the centre of each block an array (b, 1).
+    """
+
+    corner: IntArray
+    step: IntArray
+    position: FloatArray
+    tangent: FloatArray
+    time: FloatArray
+    centre: FloatArray
+    speed: FloatArray
+    gained: FloatArray
+    bend: FloatArray
+
+
+def _draw_part(out: Float32Array, lines: _Crossings, width: float, shutter: Shutter) -> None:
+    """Compute the basis images of some blocks of pixels."""
+    light, aside, s = _endless(lines, out.shape[3], width)
+    s += ((lines.time - lines.centre) * lines.speed).astype(np.float32)
     out[:, 0] = light.transpose(1, 2, 0)
     across, along = (np.ascontiguousarray(each.transpose(1, 2, 0)) for each in (aside, s))
-    _ends(out, along, (time, centre, speed, gained), shutter, strips, part, width)
+    _ends(out, along, lines, shutter, width)
     light = out[:, 0]
     u = across * across
     u *= np.float32(1.0 / width**3)
@@ -505,17 +557,14 @@ def _draw(
     out[:, 6] = 1.0
 
 
-def _endless(
-    strips: Strips, part: slice, path: tuple[FloatArray, ...], count: int, width: float
-) -> tuple[Float32Array, Float32Array, Float32Array]:
+def _endless(lines: _Crossings, count: int, width: float) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Return counts on the pixels of an endless streak, and the pixels' distances (px) across and along it.
 
     All returned arrays have the shape (count, b, LINES) for b blocks with `count` pixels per line.
     """
-    position, tangent, speed, acceleration, gained = path
-    tx, ty = tangent[..., 0], tangent[..., 1]
-    bend = (acceleration[..., 1] * tx - acceleration[..., 0] * ty) / speed**2
-    aside, ahead = path_distances(strips.corner[part], strips.step[part], position, tangent, count)
+    speed, gained, bend = lines.speed, lines.gained, lines.bend
+    tx, ty = lines.tangent[..., 0], lines.tangent[..., 1]
+    aside, ahead = path_distances(lines.corner, lines.step, lines.position, lines.tangent, count)
     squeeze = bend.astype(np.float32) * aside
     np.clip(squeeze, np.float32(-0.5), np.float32(0.5), out=squeeze)
     s = ahead / (np.float32(1.0) - squeeze)
@@ -539,28 +588,21 @@ def _endless(
     return light, aside, s
 
 
-def _ends(
-    out: Float32Array,
-    along: Float32Array,
-    lines: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    shutter: Shutter,
-    strips: Strips,
-    part: slice,
-    width: float,
-) -> None:
+def _ends(out: Float32Array, along: Float32Array, lines: _Crossings, shutter: Shutter, width: float) -> None:
     """Limit the counts `out[:, 0]` of an endless streak to its exposure, and compute the images of its ends.
 
     The array `along` (b, LINES, k) is the distance (px) of each pixel along the path from the centre of its
-    block of pixels. The tuple `lines` holds the times at which the path crosses each line of pixels (b,
-    LINES) and the block centre (b, 1), and the star's speed and acceleration there.
+    block of pixels.
     """
     out[:, 3:6] = 0.0
-    crossing, centre, speed, gained = lines
+    crossing, centre, speed, gained = lines.time, lines.centre, lines.speed, lines.gained
     rolling = shutter.delay_per_row != 0.0
-    delay = shutter.delay(strips.rows(part)[..., [0, -1]]) if rolling else np.zeros(2)
+    delay = np.zeros((len(along), 1, 1), dtype=np.float32)
+    if rolling:
+        delay = shutter.delay(_rows(lines.corner, lines.step, along.shape[2]))
     for end, image in ((-0.5, 3), (0.5, 4)):
         sign = -1.0 if end > 0.0 else 1.0
-        closest = sign * (crossing - end) - np.max(sign * delay, axis=-1)
+        closest = sign * (crossing - end) - np.max(sign * delay[..., [0, -1]], axis=-1)
         near = np.flatnonzero((closest * speed < (_ENDS + _OBLIQUE) * width).any(axis=1))
         if not near.size:
             continue
@@ -569,7 +611,7 @@ def _ends(
         u += _wide((centre[near] - end) * speed[near] - 0.5 * gained[near] * before_end**2)
         if rolling:
             # With a rolling shutter, the end of the exposure depends on the row of the pixel.
-            u -= shutter.delay(strips.rows(near + part.start)) * _wide(speed[near])
+            u -= delay[near] * _wide(speed[near])
         u *= np.float32(sign / width)
         bell = u * u
         bell *= np.float32(-0.5)
@@ -584,6 +626,168 @@ def _ends(
         out[near, 0] -= _wide(sign * width**2 * thinning) * bell
         bell *= u
         out[near, 5] -= bell
+
+
+@compiled_form_of(_draw_numpy)
+def _draw(
+    out: Float32Array,
+    corner: IntArray,
+    step: IntArray,
+    time: FloatArray,
+    position: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
+    width: float,
+    delay: tuple[float, float],
+) -> None:
+    """See `_draw_numpy`."""
+    blocks, count = len(out), out.shape[3]
+    pixels, bits = np.empty((4, LINES * count)), np.empty(LINES * count, dtype=np.int64)
+    exponential = bits.view(np.float64)
+    paces = np.empty((LINES, 5))
+    for b in range(blocks):
+        centre = 0.5 * (time[b, LINES // 2 - 1] + time[b, LINES // 2])
+        by_x, by_y = step[b, 0], step[b, 1]
+        for i in range(LINES):
+            speed = max(math.sqrt(velocity[0, b, i] ** 2 + velocity[1, b, i] ** 2), _SLOWEST)
+            tx, ty = velocity[0, b, i] / speed, velocity[1, b, i] / speed
+            bent_x, bent_y = acceleration[0, b, i], acceleration[1, b, i]
+            dx, dy = corner[b, i, 0] - position[0, b, i], corner[b, i, 1] - position[1, b, i]
+            first = dy * tx - dx * ty, dx * tx + dy * ty
+            each = by_y * tx - by_x * ty, by_x * tx + by_y * ty
+            bend, narrow = (bent_y * tx - bent_x * ty) / speed**2, 1.0 / width**2
+            square = _KURTOSIS / 24.0 * narrow * narrow * (1.0 - 2.0 * (tx * ty) ** 2)
+            paces[i, 0], paces[i, 1] = speed, bent_x * tx + bent_y * ty
+            paces[i, 2], paces[i, 3] = time[b, i], time[b, i] - centre
+            paces[i, 4] = (corner[b, i, 1] - delay[1]) * delay[0]
+            thinning, shift = paces[i, 1] / speed**2, paces[i, 3] * speed
+            profile = narrow, _BELL / (width * speed), square
+            _endless_line(pixels, i * count, count, first, each, (bend, thinning, shift), profile)
+        _exponential(pixels[2], bits, exponential)
+        _fill(out[b].reshape(out.shape[1], LINES * count), pixels, exponential)
+        for i in range(LINES):
+            part = slice(i * count, (i + 1) * count)
+            late, later = paces[i, 4], paces[i, 4] + by_y * delay[0] * (count - 1)
+            reach = (_ENDS + _OBLIQUE) * width / paces[i, 0]
+            for sign in (1.0, -1.0):
+                edge = max(late, later) if sign > 0.0 else min(late, later)
+                if 0.5 + sign * (paces[i, 2] - edge) < reach:
+                    _from_end(pixels[:, part], paces[i], width, sign, by_y * delay[0])
+                    _exponential(pixels[2, part], bits[part], exponential[part])
+                    ended = out[b].reshape(out.shape[1], LINES * count)[:, part]
+                    _draw_end(ended, pixels[3, part], exponential[part], width, sign, paces[i])
+        _draw_moments(out[b].reshape(out.shape[1], LINES * count), pixels, width)
+
+
+@loop_helper
+def _exponential(exponents: FloatArray, bits: IntArray, out: FloatArray) -> None:
+    """Compute the exponential `out` (k,) of non-positive exponents (k,), which are overwritten.
+
+    The power of two is written as the exponent `bits` of `out`, which shares its memory with `bits`. The
+    relative error is below 1e-9. Exponents below -80 count as -80.
+    """
+    for k in range(len(bits)):
+        exponent = max(exponents[k], -80.0)
+        power = np.int32(exponent * _PER_OCTAVE - 0.5)
+        exponents[k] = exponent - power * _OCTAVE
+        bits[k] = (np.int64(power) + 1023) << 52
+    for k in range(len(bits)):
+        x = exponents[k]
+        series = 1.0 + x * (1 / 6) * (1.0 + x * (1 / 7) * (1.0 + x * (1 / 8)))
+        series = 1.0 + x * (1 / 3) * (1.0 + x * (1 / 4) * (1.0 + x * (1 / 5) * series))
+        out[k] *= 1.0 + x * (1.0 + x * (1 / 2) * series)
+
+
+_Three = tuple[float, float, float]
+
+
+@loop_helper
+def _endless_line(
+    pixels: FloatArray,
+    begin: int,
+    count: int,
+    first: tuple[float, float],
+    each: tuple[float, float],
+    path: _Three,
+    profile: _Three,
+) -> None:
+    """Compute four values for each of `count` pixels on a line across an endless streak, from index `begin`.
+
+    The values are distance across the path, distance along the path from the centre of the block, exponent
+    of the profile, and factor of the profile. Distances (px) across and along the path from the point at
+    which the path crosses the line are `first` at the first pixel, and change by `each`. The values `path`
+    are curvature, acceleration along the path over squared speed, and distance of the line from the centre;
+    those of `profile` are inverse squared width, maximum, and relative correction for the fourth cumulant.
+    """
+    across, ahead, by_across, by_ahead = first[0], first[1], each[0], each[1]
+    bend, thinning, shift = path
+    narrow, middle, quadratic = profile[0], profile[1] * (1.0 + 3.0 * profile[2]), profile[1] * profile[2]
+    for k in range(count):
+        aside, s = across + k * by_across, ahead + k * by_ahead
+        squeeze = min(max(bend * aside, -0.5), 0.5)
+        bent = 0.5 * bend * s
+        s /= 1.0 - squeeze
+        aside -= bent * s
+        u = narrow * aside * aside
+        pixels[0, begin + k], pixels[1, begin + k], pixels[2, begin + k] = aside, s + shift, -0.5 * u
+        thinned = (1.0 + squeeze * (0.5 + 0.375 * squeeze)) * (1.0 - s * thinning)
+        pixels[3, begin + k] = thinned * ((u - 6.0) * u * quadratic + middle)
+
+
+@loop_helper
+def _fill(out: Float32Array, pixels: FloatArray, exponential: FloatArray) -> None:
+    """Set the images of a block of pixels to those of an endless streak."""
+    for k in range(len(exponential)):
+        out[0, k] = exponential[k] * pixels[3, k]
+        out[3, k], out[4, k], out[5, k], out[6, k] = 0.0, 0.0, 0.0, 1.0
+
+
+@loop_helper
+def _from_end(pixels: FloatArray, pace: FloatArray, width: float, sign: float, later: float) -> None:
+    """Compute the distances `pixels[3]`, in widths, of a line of pixels from one end of the streak.
+
+    The variable `sign` is 1 for the start and -1 for the stop of the exposure. The values `pace` are speed,
+    acceleration along the path, time, time from the centre of the block, and delay of the first pixel. The
+    delay increases by `later` from pixel to pixel.
+    """
+    speed, gained, time, end = pace[0], pace[1], pace[2], -0.5 * sign
+    shift = (time - pace[3] - end - pace[4]) * speed - 0.5 * gained * (time - end) ** 2
+    slope, scale = later * speed, sign / width
+    for k in range(pixels.shape[1]):
+        u = (pixels[1, k] + shift - k * slope) * scale
+        pixels[3, k], pixels[2, k] = u, -0.5 * u * u
+
+
+@loop_helper
+def _draw_end(
+    out: Float32Array,
+    distance: FloatArray,
+    exponential: FloatArray,
+    width: float,
+    sign: float,
+    pace: FloatArray,
+) -> None:
+    """Limit the counts on a line of pixels to one end of the exposure, see `_ends`."""
+    image, scale, thinned = 3 if sign > 0.0 else 4, _BELL / width, sign * width**2 * pace[1] / pace[0] ** 2
+    for k in range(len(distance)):
+        u = distance[k]
+        bell = exponential[k] * scale * out[0, k]
+        out[image, k] = bell
+        out[5, k] -= bell * u
+        lit = 1.0 if u > _ENDS else (0.0 if u < -_ENDS else 0.5 * math.erfc(-u * _ROOT_HALF))
+        out[0, k] = out[0, k] * lit - thinned * bell
+
+
+@loop_helper
+def _draw_moments(out: Float32Array, pixels: FloatArray, width: float) -> None:
+    """Compute the images of a block of pixels that depend on the limited counts."""
+    narrow, cubed, inverse = 1.0 / width**2, 1.0 / width**3, 1.0 / width
+    for k in range(out.shape[1]):
+        light, across = out[0, k], pixels[0, k]
+        by_aside = across * narrow * light
+        out[1, k] = by_aside
+        out[2, k] = pixels[1, k] * by_aside + across * (out[3, k] - out[4, k])
+        out[5, k] += (across * across * cubed - inverse) * light
 
 
 def _wide(line: FloatArray) -> Float32Array:

@@ -18,8 +18,9 @@ from knightcube.vision.streaks.geometry import (
     sensitivities_and_velocity,
 )
 from knightcube.vision.streaks.normal_equations import cut_windows, light_of
-from knightcube.vision.streaks.streak_model import cut_strips
+from knightcube.vision.streaks.streak_model import IMAGES, LINES, cut_strips
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
+from tests.support.compiled_forms import assert_forms_agree
 
 _PINHOLE = Pinhole(320, 320, 2903.6)
 _CASES = [
@@ -184,3 +185,20 @@ def test_the_rotation_of_a_changing_rate_equals_many_small_rotations() -> None:
     star = _PINHOLE.project(np.array([[0.02, -0.03, 1.0]]))
     found = paths(_PINHOLE, motion, star, np.array([0.5])).position
     assert np.allclose(found, _PINHOLE.project(vector[None]), atol=2e-3)
+
+
+@pytest.mark.parametrize("growth", [0.0, 1.2])
+@pytest.mark.parametrize("delay", [0.0, 4e-4])
+@pytest.mark.parametrize(("turn", "star"), _CASES)
+def test_the_compiled_images_equal_those_in_numpy(
+    turn: list[float], star: list[float], delay: float, growth: float
+) -> None:
+    motion = CameraMotion(np.array(turn), growth * np.array(turn))
+    stars = np.array([star, [150.2, 180.9]])
+    strips = cut_strips(_PINHOLE, motion, stars, np.tile([-0.45, 0.5], (2, 1)), 4.1)
+    points = paths(_PINHOLE, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
+    drawn = (points.position, points.velocity, points.acceleration)
+    lines = (np.ascontiguousarray(each.T).reshape(2, *strips.time.shape) for each in drawn)
+    out = np.zeros((len(strips.star), IMAGES + 1, *strips.index.shape[1:]), dtype=np.float32)
+    arguments = out, strips.corner, strips.step, strips.time, *lines, 1.3, (delay, 160.0)
+    assert_forms_agree(streak_model._draw, *arguments, relative=3e-5, interpreted=growth == 0.0)
