@@ -21,6 +21,7 @@ from scipy.special import fdtri
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
+from knightcube.vision.streaks.fit_windows import FitWindows, cut_windows, window_areas
 from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
@@ -37,18 +38,15 @@ from knightcube.vision.streaks.normal_equations import (
     ALONE,
     SHARED,
     Evaluation,
-    FitWindows,
     Solution,
     StarEstimates,
     consistent_stars,
-    cut_windows,
     evaluate,
     light_of,
     solve,
     star_estimates,
     step_significance,
     stepped,
-    window_areas,
 )
 from knightcube.vision.streaks.settings import LikelihoodSettings
 

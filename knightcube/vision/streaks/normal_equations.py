@@ -1,10 +1,4 @@
-"""Selection of the fitted pixels, and the normal equations of a scene (Fisher scoring).
-
-Long streaks are fitted on strips of pixels along their paths, and stars with short or slow paths (spots) on
-square patches of pixels. The flux per px of a streak is inversely proportional to the speed of the star. The
-model of a streak on a strip expands the flux per px to first order around each block of pixels. This
-expansion does not hold near zero speed. If the rate increases from zero or decreases to zero, a square patch
-of pixels covers the slow part of each streak.
+"""Normal equations of a scene on the pixels of its fit windows (Fisher scoring).
 
 The weight of a pixel is the inverse of the variance that the model predicts. The iteration therefore
 converges to the maximum likelihood for Poisson noise. The residual of a pixel is its value minus the modelled
@@ -19,294 +13,27 @@ estimates disagree with the majority, no longer affect the motion.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model
-from knightcube.vision.streaks.frame import MEDIAN_ERROR, ReducedFrame
-from knightcube.vision.streaks.geometry import (
-    CameraMotion,
-    Shutter,
-    StreakScene,
-    exposure_bounds,
-    path_lengths,
-    paths,
-    positions,
-    sensitivities,
-)
-from knightcube.vision.streaks.streak_model import STEEPEST, Patches, Strips, cut_patches, cut_strips
-
-# Path length, in point-spread widths, below which a star is fitted on a square patch of pixels.
-_SPOT_WIDTHS = 8.0
-# Margin below saturation, in standard deviations of the modelled counts, within which a pixel is excluded.
-# The modelled counts are used, because a selection by the measured counts would be biased by their noise.
-_MARGIN = 3.0
-# Number of instants at which the position of a star on its path is evaluated.
-_INSTANTS = 9
-# Residual, relative to the modelled counts, up to which a pixel is never excluded as an outlier.
-_UNRESOLVED = 0.1
-# Largest relative speed change over one point-spread width for which a star is fitted on a pixel strip.
-_STEADY = 0.05
-# Minimum length (point-spread widths) of the fast part of a path that is fitted on a pixel strip.
-_LEAST_FAST = 4.0
-# Lower limit (px per exposure) of a star's speed in denominators.
-_SLOWEST = 1e-3
-# Number of instants at which the rate is evaluated to find the slow part of a star's path.
-_SAMPLES = 129
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BlockPixels:
-    """The frame's values at the fitted pixels, which are grouped in b blocks along the first array axis.
-
-    Attributes:
-        slot: index of each pixel in the list of all fitted pixels, in which a pixel that two stars share
-            occurs only once. For a pixel outside the frame, `slot` is the number of fitted pixels.
-        inside: mask of the fitted pixels of each block.
-        signal: counts of each pixel above the background.
-        floor: noise variance of each pixel without a star, counts^2.
-        ceiling: counts above the background from which each pixel is saturated.
-        gain: gain of the camera, electrons per count.
-        crowded: flat indices (e,), in the arrays of this class, of the e pixels that several stars share.
-        common: index of each fitted pixel in the list of the pixels that several stars share.
-    """
-
-    slot: IntArray
-    inside: BoolArray
-    signal: Float32Array
-    floor: Float32Array
-    ceiling: Float32Array
-    gain: float
-    crowded: IntArray
-    common: IntArray
-
-    def residual(self, total: Float32Array, clip: float) -> tuple[Float32Array, Float32Array]:
-        """Return weights and residuals of the pixels for the modelled counts `total` of all fitted pixels.
-
-        The weight is the inverse variance, or 0 for an excluded pixel. Pixels whose residuals exceed `clip`
-        standard deviations plus a tenth of the modelled counts are excluded; `clip` 0 excludes none.
-        """
-        model = total.take(self.slot)
-        variance = np.maximum(model, np.float32(0.0))
-        variance *= np.float32(1.0 / self.gain)
-        variance += self.floor
-        residual = self.signal - model
-        deviation = np.sqrt(variance)
-        good = self.inside & (model + np.float32(_MARGIN) * deviation < self.ceiling)
-        if clip > 0.0:
-            deviation *= np.float32(clip)
-            deviation += np.float32(_UNRESOLVED) * model
-            good &= np.abs(residual) <= deviation
-        weight = np.where(good, np.float32(1.0) / variance, np.float32(0.0))
-        residual[~good] = 0.0
-        return weight, residual
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FitWindows:
-    """The fitted pixels: strips of pixels along long streaks, and square patches of pixels around spots.
-
-    Attributes:
-        long: indices of the stars whose long streak is fitted on a strip of pixels (a,). If part of the
-            streak is slow, the star also has a square patch of pixels for this part.
-        spot: indices of the stars that are fitted on a square patch of pixels (b,).
-        strips: pixels of the strips along long streaks. The star with index i in `strips` has the index
-            `long[i]` in the scene.
-        patches: pixels of the square patches around spots. The patch with index i belongs to the star with
-            the index `spot[i]` in the scene.
-        pixels: flat indices in the frame of all m fitted pixels (m,), each given once.
-        slot: for each pixel of all strips and patches, its index in the list `pixels`, as a flat array.
-        on_strips: values of the frame on the strips of pixels along long streaks.
-        on_patches: values of the frame on the square patches of pixels around spots.
-        shared: number of pixels that belong to more than one star.
-    """
-
-    long: IntArray
-    spot: IntArray
-    strips: Strips
-    patches: Patches
-    pixels: IntArray
-    slot: IntArray
-    on_strips: BlockPixels
-    on_patches: BlockPixels
-    shared: int
-
-    def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
-        """Return the summed counts (m + 1,) of all stars on the m fitted pixels, from each star's own counts.
-
-        The last element is the sum of the counts on pixels outside the frame.
-        """
-        light = np.concatenate([on_strips.reshape(-1), on_patches.reshape(-1).astype(np.float32)])
-        return np.bincount(self.slot, light, len(self.pixels) + 1).astype(np.float32)
-
-    def only(self, on_strips: BoolArray, on_patches: BoolArray) -> FitWindows:
-        """Return the fit windows reduced to the pixels selected by the masks `on_strips` and `on_patches`."""
-        return replace(
-            self,
-            on_strips=replace(self.on_strips, inside=on_strips),
-            on_patches=replace(self.on_patches, inside=on_patches),
-        )
-
-
-def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:
-    """Return the approximate number of pixels (n,) within `reach` point-spread widths of each star's path.
-
-    For all stars, the strip of pixels is assumed to have the width of the widest strip, whose path is the
-    most oblique to rows and columns.
-    """
-    n, room = len(scene.stars), reach * scene.width
-    if n == 0:
-        return np.empty(0)
-    time = np.tile(np.linspace(-0.5, 0.5, _INSTANTS), n)
-    there = positions(pinhole, scene.motion, np.repeat(scene.stars, _INSTANTS, axis=0), time)
-    seen = pinhole.contains(there).reshape(n, _INSTANTS).mean(axis=1)
-    step = np.abs(np.diff(there.reshape(n, _INSTANTS, 2), axis=1))
-    lines = step.max(axis=2)
-    steep = float(np.min(lines / np.maximum(np.hypot(step[..., 0], step[..., 1]), 1e-9)))
-    across = 2.0 * np.floor(room / min(max(steep, STEEPEST), 1.0) + 0.5) + 1.0
-    return np.asarray(across * (lines.sum(axis=1) * seen + 2.0 * room))
-
-
-def cut_windows(
-    frame: ReducedFrame, pinhole: Pinhole, shutter: Shutter, scene: StreakScene, reach: float
-) -> FitWindows:
-    """Return fit windows with all pixels of `frame` within `reach` point-spread widths of the paths."""
-    long, spot, strips, patches = _strips_and_patches(pinhole, shutter, scene, reach * scene.width)
-    index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
-    inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
-    named = index[inside]
-    # If a pixel occurs in several windows, `number` keeps the index of the last occurrence.
-    order = np.arange(len(named), dtype=np.int32)
-    number = np.empty(frame.signal.size, dtype=np.int32)
-    number[named] = order
-    last = number.take(named)
-    own = last == order
-    pixels = named[own]
-    place = (np.cumsum(own) - 1).take(last)
-    shared = np.bincount(place, minlength=len(pixels)) > 1
-    slot = np.full(len(index), len(pixels))
-    slot[inside] = place
-    crowded = np.flatnonzero(np.append(shared, False).take(slot))
-    common = np.cumsum(shared) - 1
-    cut = strips.index.size
-    return FitWindows(
-        long,
-        spot,
-        strips,
-        patches,
-        pixels,
-        slot,
-        _block_pixels(frame, strips.index, strips.inside, slot[:cut], crowded[crowded < cut], common),
-        _block_pixels(
-            frame, patches.index, patches.inside, slot[cut:], crowded[crowded >= cut] - cut, common
-        ),
-        int(np.count_nonzero(shared)),
-    )
-
-
-def _strips_and_patches(
-    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, room: float
-) -> tuple[IntArray, IntArray, Strips, Patches]:
-    """Return the indices of stars with long streaks (a,) and of spots (b,), and the pixel strips and patches.
-
-    The pixel strips and patches contain the pixels within `room` px of the paths.
-    """
-    times = exposure_bounds(pinhole, scene.motion, shutter, scene.stars)
-    fast, slow = _divided(pinhole, scene, times)
-    whole = path_lengths(pinhole, scene.motion, scene.stars) >= _SPOT_WIDTHS * scene.width
-    long = np.flatnonzero(whole & (fast[:, 1] > fast[:, 0]))
-    spot = np.flatnonzero(~(whole & (fast[:, 1] > fast[:, 0])) | (slow[:, 1] > slow[:, 0]))
-    strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
-    # A square patch of pixels covers the slow part of a streak, or the complete path of a spot.
-    part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
-    sampled = part[:, :1] + np.diff(part) * np.linspace(0.0, 1.0, _INSTANTS)
-    stars = np.repeat(scene.stars[spot], _INSTANTS, axis=0)
-    there = positions(pinhole, scene.motion, stars, sampled.reshape(-1)).reshape(-1, _INSTANTS, 2)
-    low, high = there.min(axis=1), there.max(axis=1)
-    half = int(np.ceil(room + 0.5 * float(np.max(high - low, initial=0.0))))
-    patches = cut_patches(pinhole, 0.5 * (low + high), half)
-    strips = _without_patches(strips, long, patches, spot)
-    return long, spot, strips, patches
-
-
-def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return start and end times (n, 2) of the fast part of each star's path, and of its slow part.
-
-    The slow part of a path is at the streak end at which the rate is smaller. If a path has no fast part or
-    no slow part, the start and end times of the missing part are equal.
-    """
-    motion = scene.motion
-    if motion.constant or not motion.rotation.any():
-        return times, np.zeros_like(times)
-    time = np.linspace(times.min(), times.max(), _SAMPLES)
-    pace, change = motion.relative_rate(time), np.abs(motion.relative_rate(time, 1)).max()
-    steady = CameraMotion.steady(motion.rotation)
-    velocity = paths(pinhole, steady, scene.stars, np.zeros(len(times))).velocity
-    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
-    # A star counts as slow while its speed may change too much over one point-spread width.
-    slow = pace < np.sqrt(change * scene.width / (_STEADY * speed))[:, None]
-    fast, rest = times.copy(), times.copy()
-    if pace[0] < pace[-1]:
-        until = np.where(slow.any(axis=1), time[_SAMPLES - 1 - slow[:, ::-1].argmax(axis=1)], -np.inf)
-        divided: FloatArray = np.clip(until, times[:, 0], times[:, 1])
-        fast[:, 0] = rest[:, 1] = divided
-    else:
-        since = np.where(slow.any(axis=1), time[slow.argmax(axis=1)], np.inf)
-        divided = np.clip(since, times[:, 0], times[:, 1])
-        fast[:, 1] = rest[:, 0] = divided
-    way = speed * (motion.progress(fast[:, 1]) - motion.progress(fast[:, 0]))
-    fast[way < _LEAST_FAST * scene.width] = 0.0
-    return fast, rest
-
-
-def _without_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntArray) -> Strips:
-    """Return the pixels along each star's path, without pixels of the star's own square patch."""
-    both = np.isin(long, spot)
-    if not both.any():
-        return strips
-    patch = np.searchsorted(spot, long)[strips.star]
-    split = np.flatnonzero(both[strips.star])
-    patch = patch[split]
-    along = np.arange(strips.index.shape[2])[:, None] * strips.step[split, None, None]
-    pixel = strips.corner[split, :, None] + along
-    theirs = np.stack([patches.column[patch], patches.row[patch]], axis=-1)
-    low, high = theirs[:, None, None, 0], theirs[:, None, None, -1]
-    inside = strips.inside.copy()
-    inside[split] &= ~np.all((pixel >= low) & (pixel <= high), axis=-1)
-    return replace(strips, inside=inside)
-
-
-def _block_pixels(
-    frame: ReducedFrame,
-    index: IntArray,
-    inside: BoolArray,
-    slot: IntArray,
-    crowded: IntArray,
-    common: IntArray,
-) -> BlockPixels:
-    """Return the values of the frame on blocks of pixels, given by the pixels' flat indices `index`."""
-    signal = frame.signal.take(index)
-    return BlockPixels(
-        slot.reshape(index.shape),
-        inside & ~frame.bad.take(index),
-        signal,
-        frame.floor.take(index),
-        # The background is the raw counts minus the signal, and is subtracted from the saturation level.
-        np.float32(frame.top) - frame.counts.take(index) + signal,
-        frame.gain,
-        crowded,
-        common.take(slot.take(crowded)),
-    )
-
+from knightcube.vision.streaks.fit_windows import BlockPixels, FitWindows, residuals
+from knightcube.vision.streaks.frame import MEDIAN_ERROR
+from knightcube.vision.streaks.geometry import Shutter, StreakScene, sensitivities
 
 SHARED = 7
 """Number of parameters that all stars share: rate (3), acceleration (3) and point-spread width (1)."""
 ALONE = 4
 """Number of parameters of a single star: x, y, flux and sky level."""
 
+# Constants of `fit_windows.residuals`, which machine code of this module uses.
+_MARGIN = 3.0
+_UNRESOLVED = 0.1
 # Number of blocks of pixels processed in one matrix product, small enough for the processor's cache.
 _AT_ONCE = 128
 # Prior standard deviation (px) of a star's position, for streaks with both ends outside the frame.
@@ -339,7 +66,7 @@ class Evaluation:
     pixels: FloatArray
     crowds: list[SharedPixels]
     shared: int
-    kept: tuple[BoolArray, BoolArray]
+    kept: list[BoolArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -350,7 +77,6 @@ class SharedPixels:
         star: index of the star of each block of pixels (b,).
         matrix: coefficients that combine i images into the derivatives by each parameter, (b, i, SHARED +
             ALONE) for b blocks.
-        block: index of the block to which each of the e shared pixels belongs (e,).
         first: index of the first shared pixel of each block (b,).
         slot: index of each pixel in the list of all pixels that several stars share (e,).
         weight: inverse variance of the counts of each of the e shared pixels (e,).
@@ -359,7 +85,6 @@ class SharedPixels:
 
     star: IntArray
     matrix: FloatArray
-    block: IntArray
     first: IntArray
     slot: IntArray
     weight: Float32Array
@@ -382,29 +107,16 @@ def evaluate(
     spot_light = spots * scene.light[windows.spot, None, None] + scene.sky[windows.spot, None, None]
     total = windows.total(streak_light, spot_light)
     n, size = len(scene.stars), SHARED + ALONE
-    weights, residuals = zip(
-        windows.on_strips.residual(total, clip), windows.on_patches.residual(total, clip), strict=True
-    )
     out = Evaluation(
-        np.zeros((n, size, size)),
-        np.zeros((n, size)),
-        np.zeros(n),
-        np.zeros(n),
-        [],
-        windows.shared,
-        (weights[0] > 0.0, weights[1] > 0.0),
+        np.zeros((n, size, size)), np.zeros((n, size)), np.zeros(n), np.zeros(n), [], windows.shared, []
     )
-    if len(strips.star):
-        matrix = _block_coefficients(pinhole, shutter, scene, windows, growing)
-        matrix[:, :, :SHARED] *= scene.trusted[of_block, None, None]
-        images[:, streak_model.IMAGES] = residuals[0]
-        _add(out, of_block, windows.on_strips, weights[0], images, matrix)
-    if len(windows.spot):
-        spot_images = _spot_images(scene, windows, spots, change)
-        matrix = np.tile(np.eye(size), (len(windows.spot), 1, 1))
-        matrix[:, :, :SHARED] *= scene.trusted[windows.spot, None, None]
-        spot_images[:, size] = residuals[1]
-        _add(out, windows.spot, windows.on_patches, weights[1], spot_images, matrix)
+    matrix = _block_coefficients(pinhole, shutter, scene, windows, growing)
+    matrix[:, :, :SHARED] *= scene.trusted[of_block, None, None]
+    _add(out, of_block, windows.on_strips, images, matrix, total, clip)
+    spot_images = _spot_images(scene, windows, spots, change)
+    matrix = np.tile(np.eye(size), (len(windows.spot), 1, 1))
+    matrix[:, :, :SHARED] *= scene.trusted[windows.spot, None, None]
+    _add(out, windows.spot, windows.on_patches, spot_images, matrix, total, clip)
     return out
 
 
@@ -452,31 +164,140 @@ def _add(
     out: Evaluation,
     star: IntArray,
     view: BlockPixels,
-    weight: Float32Array,
     images: Float32Array,
     matrix: FloatArray,
+    total: Float32Array,
+    clip: float,
 ) -> None:
     """Add the contributions of blocks of pixels, in the order of their stars, to the normal equations.
 
-    The last of the `images` of each block of pixels is the residual. Products of the residual with the other
-    images give the gradient, and the squared residual gives chi-square.
+    The last of the `images` of each block of pixels is filled with the residuals of the modelled counts
+    `total` of all fitted pixels. The residual limit `clip` is that of `fit_windows.residuals`.
     """
     blocks, count = images.shape[:2]
+    if not blocks:
+        out.kept.append(view.inside)
+        return
     flat = images.reshape(blocks, count, -1)
-    weight = weight.reshape(blocks, -1)
+    weight = np.empty((blocks, flat.shape[2]), dtype=np.float32)
+    pixels = (view.slot, view.inside, view.signal, view.floor, view.ceiling)
+    sums = out.information, out.gradient, out.chi2, out.pixels
+    by_block = (each.reshape(blocks, -1) for each in pixels)
+    _sum_products(*sums, weight, flat, star, matrix, total, *by_block, float(view.gain), float(clip))
+    out.kept.append((weight > 0.0).reshape(view.inside.shape))
+    if len(view.crowded):
+        out.crowds.append(_shared_pixels(star, view, weight, flat, matrix))
+
+
+def _sum_products_numpy(
+    information: FloatArray,
+    gradient: FloatArray,
+    chi2: FloatArray,
+    pixels: FloatArray,
+    weight: Float32Array,
+    images: Float32Array,
+    star: IntArray,
+    matrix: FloatArray,
+    total: Float32Array,
+    slot: IntArray,
+    inside: BoolArray,
+    signal: Float32Array,
+    floor: Float32Array,
+    ceiling: Float32Array,
+    gain: float,
+    clip: float,
+) -> None:
+    """Add weighted products of the images of b blocks of p pixels to the normal equations of their stars.
+
+    The weights (b, p) and the last of the `images` (b, i + 1, p), which holds the residuals, are computed
+    from the modelled counts `total` of all fitted pixels. Products of the residual with the other images give
+    the gradient, and the squared residual gives chi-square. Coefficients `matrix` (b, i, SHARED + ALONE)
+    combine the images into derivatives.
+    """
+    weight[:], images[:, -1] = residuals(total, slot, inside, signal, floor, ceiling, gain, clip)
+    blocks, count = images.shape[:2]
     gram = np.empty((blocks, count, count))
     for begin in range(0, blocks, _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
-        gram[part] = (flat[part] * weight[part, None]) @ flat[part].swapaxes(1, 2)
+        gram[part] = (images[part] * weight[part, None]) @ images[part].swapaxes(1, 2)
     transposed = matrix.swapaxes(1, 2)
     first = np.flatnonzero(np.diff(star, prepend=-1))
     owner = star[first]
-    out.information[owner] += np.add.reduceat(transposed @ gram[:, :-1, :-1] @ matrix, first)
-    out.gradient[owner] += np.add.reduceat((transposed @ gram[:, :-1, -1:])[..., 0], first)
-    out.chi2[owner] += np.add.reduceat(gram[:, -1, -1], first)
-    out.pixels[owner] += np.add.reduceat((weight > 0.0).sum(axis=1), first)
-    if len(view.crowded):
-        out.crowds.append(_shared_pixels(star, view, weight, flat, matrix))
+    information[owner] += np.add.reduceat(transposed @ gram[:, :-1, :-1] @ matrix, first)
+    gradient[owner] += np.add.reduceat((transposed @ gram[:, :-1, -1:])[..., 0], first)
+    chi2[owner] += np.add.reduceat(gram[:, -1, -1], first)
+    pixels[owner] += np.add.reduceat((weight > 0.0).sum(axis=1), first)
+
+
+@compiled_form_of(_sum_products_numpy)
+def _sum_products(
+    information: FloatArray,
+    gradient: FloatArray,
+    chi2: FloatArray,
+    pixels: FloatArray,
+    weight: Float32Array,
+    images: Float32Array,
+    star: IntArray,
+    matrix: FloatArray,
+    total: Float32Array,
+    slot: IntArray,
+    inside: BoolArray,
+    signal: Float32Array,
+    floor: Float32Array,
+    ceiling: Float32Array,
+    gain: float,
+    clip: float,
+) -> None:
+    """See `_sum_products_numpy`."""
+    blocks, count, size = images.shape
+    gram, weighted = np.empty((count, count)), np.empty(size, dtype=np.float32)
+    for b in range(blocks):
+        owner, left = star[b], images[b, count - 1]
+        for p in range(size):
+            model = total[slot[b, p]]
+            variance = max(model, np.float32(0.0)) / gain + floor[b, p]
+            off, deviation = signal[b, p] - model, math.sqrt(variance)
+            good = inside[b, p] and model + _MARGIN * deviation < ceiling[b, p]
+            if clip > 0.0 and abs(off) > clip * deviation + _UNRESOLVED * model:
+                good = False
+            weight[b, p], left[p] = (1.0 / variance, off) if good else (0.0, 0.0)
+            pixels[owner] += good
+        for i in range(count):
+            for p in range(size):
+                weighted[p] = weight[b, p] * images[b, i, p]
+            for k in range(i, count):
+                gram[i, k] = _scalar_product(weighted, images[b, k])
+                gram[k, i] = gram[i, k]
+        _add_block(information[owner], gradient[owner], gram, matrix[b])
+        chi2[owner] += gram[count - 1, count - 1]
+
+
+@loop_helper
+def _scalar_product(a: Float32Array, b: Float32Array) -> float:
+    """Return the scalar product of two arrays of equal length."""
+    total = np.float32(0.0)
+    for p in range(len(a)):
+        total += a[p] * b[p]
+    return total
+
+
+@loop_helper
+def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, matrix: FloatArray) -> None:
+    """Add the products `gram` of images to information and gradient of the parameters of one star."""
+    images, count = matrix.shape
+    along = np.empty(images)
+    for q in range(count):
+        for i in range(images):
+            along[i] = 0.0
+        for k in range(images):
+            share = matrix[k, q]
+            if share != 0.0:
+                gradient[q] += share * gram[k, images]
+                for i in range(images):
+                    along[i] += share * gram[k, i]
+        for r in range(count):
+            for i in range(images):
+                information[r, q] += matrix[i, r] * along[i]
 
 
 def _shared_pixels(
@@ -495,7 +316,6 @@ def _shared_pixels(
     return SharedPixels(
         star[held],
         matrix[held],
-        np.repeat(np.arange(len(held)), np.diff(first, append=len(block))),
         first,
         view.common,
         weight.reshape(-1)[view.crowded],
@@ -535,14 +355,104 @@ def apply_information(
     change = np.zeros(evaluation.shared)
     lights = []
     for crowd in evaluation.crowds:
-        mixture = (crowd.matrix @ vector[crowd.star][..., None])[..., 0].T.astype(np.float32)
-        lights.append(np.einsum("ie,ie->e", mixture.take(crowd.block, axis=1), crowd.images))
-        change += np.bincount(crowd.slot, lights[-1], evaluation.shared)
+        lights.append(np.empty(len(crowd.slot), dtype=np.float32))
+        _light_changes(
+            change, lights[-1], vector, crowd.star, crowd.matrix, crowd.first, crowd.slot, crowd.images
+        )
     for crowd, light in zip(evaluation.crowds, lights, strict=True):
-        weighted = crowd.weight * (change[crowd.slot] - light).astype(np.float32)
-        slope = np.add.reduceat(crowd.images * weighted, crowd.first, axis=1).T.astype(np.float64)
-        np.add.at(out, crowd.star, (slope[:, None] @ crowd.matrix)[:, 0])
+        blocks = crowd.star, crowd.matrix, crowd.first, crowd.slot, crowd.images
+        _add_coupling(out, change, light, *blocks, crowd.weight)
     return out[:, :SHARED].sum(axis=0), out[:, SHARED:] + PRIOR * alone
+
+
+def _light_changes_numpy(
+    change: FloatArray,
+    light: Float32Array,
+    vector: FloatArray,
+    star: IntArray,
+    matrix: FloatArray,
+    first: IntArray,
+    slot: IntArray,
+    images: Float32Array,
+) -> None:
+    """Compute the changes of the modelled counts on e shared pixels for a step `vector` of all parameters.
+
+    The change by each star is `light` (e,), and is added to the `change` by all stars, for each pixel in the
+    list of all shared pixels. The other arguments are those of `SharedPixels`.
+    """
+    mixture = (matrix @ vector[star][..., None])[..., 0].T.astype(np.float32)
+    block = np.repeat(np.arange(len(first)), np.diff(first, append=len(slot)))
+    light[:] = np.einsum("ie,ie->e", mixture.take(block, axis=1), images)
+    change += np.bincount(slot, light, len(change))
+
+
+@compiled_form_of(_light_changes_numpy)
+def _light_changes(
+    change: FloatArray,
+    light: Float32Array,
+    vector: FloatArray,
+    star: IntArray,
+    matrix: FloatArray,
+    first: IntArray,
+    slot: IntArray,
+    images: Float32Array,
+) -> None:
+    """See `_light_changes_numpy`."""
+    for b in range(len(first)):
+        stop = first[b + 1] if b + 1 < len(first) else len(slot)
+        light[first[b] : stop] = 0.0
+        for i in range(len(images)):
+            part = np.float32(0.0)
+            for k in range(vector.shape[1]):
+                part += matrix[b, i, k] * vector[star[b], k]
+            for e in range(first[b], stop):
+                light[e] += np.float32(part) * images[i, e]
+        for e in range(first[b], stop):
+            change[slot[e]] += light[e]
+
+
+def _add_coupling_numpy(
+    out: FloatArray,
+    change: FloatArray,
+    light: Float32Array,
+    star: IntArray,
+    matrix: FloatArray,
+    first: IntArray,
+    slot: IntArray,
+    images: Float32Array,
+    weight: Float32Array,
+) -> None:
+    """Add the effect of other stars on e shared pixels to the product `out` (n, SHARED + ALONE).
+
+    The arguments `change` and `light` are results of `_light_changes`; the others those of `SharedPixels`.
+    """
+    weighted = weight * (change[slot] - light).astype(np.float32)
+    slope = np.add.reduceat(images * weighted, first, axis=1).T.astype(np.float64)
+    np.add.at(out, star, (slope[:, None] @ matrix)[:, 0])
+
+
+@compiled_form_of(_add_coupling_numpy)
+def _add_coupling(
+    out: FloatArray,
+    change: FloatArray,
+    light: Float32Array,
+    star: IntArray,
+    matrix: FloatArray,
+    first: IntArray,
+    slot: IntArray,
+    images: Float32Array,
+    weight: Float32Array,
+) -> None:
+    """See `_add_coupling_numpy`."""
+    weighted = np.empty(len(slot), dtype=np.float32)
+    for e in range(len(slot)):
+        weighted[e] = weight[e] * (change[slot[e]] - light[e])
+    for b in range(len(first)):
+        stop = first[b + 1] if b + 1 < len(first) else len(slot)
+        for i in range(len(images)):
+            slope = _scalar_product(weighted[first[b] : stop], images[i, first[b] : stop])
+            for k in range(out.shape[1]):
+                out[star[b], k] += slope * matrix[b, i, k]
 
 
 # Squared residual norm, relative to the squared norm of the first step, at which conjugate gradients stop.

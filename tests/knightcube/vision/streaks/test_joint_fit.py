@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from knightcube.vision.streaks import joint_fit
+from knightcube.vision.streaks.fit_windows import window_areas
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, positions
 from knightcube.vision.streaks.joint_fit import FitProblem, find_light_ends, stretched
-from knightcube.vision.streaks.normal_equations import window_areas
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky
 

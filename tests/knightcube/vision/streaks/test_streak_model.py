@@ -8,6 +8,7 @@ import pytest
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model
+from knightcube.vision.streaks.fit_windows import cut_windows
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
@@ -17,7 +18,7 @@ from knightcube.vision.streaks.geometry import (
     sensitivities,
     sensitivities_and_velocity,
 )
-from knightcube.vision.streaks.normal_equations import cut_windows, light_of
+from knightcube.vision.streaks.normal_equations import light_of
 from knightcube.vision.streaks.streak_model import IMAGES, LINES, cut_strips
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 from tests.support.compiled_forms import assert_forms_agree
