@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import (
@@ -24,7 +25,7 @@ from knightcube.vision.streaks.geometry import (
     paths,
     positions,
 )
-from knightcube.vision.streaks.streak_model import STEEPEST, Patches, Strips, cut_patches, cut_strips
+from knightcube.vision.streaks.path_pixels import STEEPEST, Patches, Strips, cut_patches, cut_strips
 
 # Path length, in point-spread widths, below which a star is fitted on a square patch of pixels.
 _SPOT_WIDTHS = 8.0
@@ -179,34 +180,106 @@ def cut_windows(
     long, spot, strips, patches = _strips_and_patches(pinhole, shutter, scene, reach * scene.width)
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
+    pixels, slot, times = _numbered(index, inside, frame.signal.size)
+    shared = times > 1
+    crowded = np.flatnonzero(np.append(shared, False).take(slot))
+    common = (np.cumsum(shared) - 1).take(slot.take(crowded))
+    of_frame = frame.signal, frame.floor, frame.counts, frame.bad
+    good, *values = _frame_values(index, inside, *of_frame, float(frame.top))
+    cut, first = strips.index.size, int(np.searchsorted(crowded, strips.index.size))
+    on_strips, on_patches = (
+        BlockPixels(
+            *(each[part].reshape(shape) for each in (slot, good, *values)),
+            frame.gain,
+            crowded[of] - part.start,
+            common[of],
+        )
+        for part, shape, of in (
+            (slice(0, cut), strips.index.shape, slice(0, first)),
+            (slice(cut, len(slot)), patches.index.shape, slice(first, len(crowded))),
+        )
+    )
+    shares = int(np.count_nonzero(shared))
+    return FitWindows(long, spot, strips, patches, pixels, slot, on_strips, on_patches, shares)
+
+
+def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the m fitted pixels (m,) once each, the place of every pixel in that list, and frequencies (m,).
+
+    The flat indices `index` (p,) in a frame of `size` pixels repeat if windows overlap. The place of a pixel
+    that is not `inside` is m.
+    """
     named = index[inside]
     # If a pixel occurs in several windows, `number` keeps the index of the last occurrence.
     order = np.arange(len(named), dtype=np.int32)
-    number = np.empty(frame.signal.size, dtype=np.int32)
+    number = np.empty(size, dtype=np.int32)
     number[named] = order
     last = number.take(named)
     own = last == order
     pixels = named[own]
     place = (np.cumsum(own) - 1).take(last)
-    shared = np.bincount(place, minlength=len(pixels)) > 1
     slot = np.full(len(index), len(pixels))
     slot[inside] = place
-    crowded = np.flatnonzero(np.append(shared, False).take(slot))
-    common = np.cumsum(shared) - 1
-    cut = strips.index.size
-    return FitWindows(
-        long,
-        spot,
-        strips,
-        patches,
-        pixels,
-        slot,
-        _block_pixels(frame, strips.index, strips.inside, slot[:cut], crowded[crowded < cut], common),
-        _block_pixels(
-            frame, patches.index, patches.inside, slot[cut:], crowded[crowded >= cut] - cut, common
-        ),
-        int(np.count_nonzero(shared)),
-    )
+    return pixels, slot, np.bincount(place, minlength=len(pixels))
+
+
+@compiled_form_of(_numbered_numpy)
+def _numbered(index: IntArray, inside: BoolArray, size: int) -> tuple[IntArray, IntArray, IntArray]:
+    """See `_numbered_numpy`."""
+    number = np.empty(size, dtype=np.int32)
+    for p in range(len(index)):
+        if inside[p]:
+            number[index[p]] = p
+    pixels, count = np.empty(len(index), dtype=np.int64), 0
+    for p in range(len(index)):
+        if inside[p] and number[index[p]] == p:
+            pixels[count] = index[p]
+            count += 1
+            number[index[p]] = -count
+    slot, times = np.full(len(index), count), np.zeros(count, dtype=np.int64)
+    for p in range(len(index)):
+        if inside[p]:
+            slot[p] = -number[index[p]] - 1
+            times[slot[p]] += 1
+    return pixels[:count].copy(), slot, times
+
+
+def _frame_values_numpy(
+    index: IntArray,
+    inside: BoolArray,
+    signal: Float32Array,
+    floor: Float32Array,
+    counts: Image,
+    bad: BoolArray,
+    top: float,
+) -> tuple[BoolArray, Float32Array, Float32Array, Float32Array]:
+    """Return which pixels are usable, and their signal, floor and ceiling, see `BlockPixels`."""
+    light = signal.take(index)
+    # The background is the raw counts minus the signal, and is subtracted from the saturation level.
+    ceiling = np.float32(top) - counts.take(index) + light
+    return inside & ~bad.take(index), light, floor.take(index), ceiling.astype(np.float32)
+
+
+@compiled_form_of(_frame_values_numpy)
+def _frame_values(
+    index: IntArray,
+    inside: BoolArray,
+    signal: Float32Array,
+    floor: Float32Array,
+    counts: Image,
+    bad: BoolArray,
+    top: float,
+) -> tuple[BoolArray, Float32Array, Float32Array, Float32Array]:
+    """See `_frame_values_numpy`."""
+    size = len(index)
+    good, light = np.empty(size, dtype=np.bool_), np.empty(size, dtype=np.float32)
+    variance, ceiling = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
+    for p in range(size):
+        at = index[p]
+        good[p] = inside[p] and not bad[at]
+        light[p], variance[p] = signal[at], floor[at]
+        ceiling[p] = top - counts[at] + signal[at]
+    return good, light, variance, ceiling
 
 
 def _strips_and_patches(
@@ -279,26 +352,3 @@ def _without_patches(strips: Strips, long: IntArray, patches: Patches, spot: Int
     inside = strips.inside.copy()
     inside[split] &= ~np.all((pixel >= low) & (pixel <= high), axis=-1)
     return replace(strips, inside=inside)
-
-
-def _block_pixels(
-    frame: ReducedFrame,
-    index: IntArray,
-    inside: BoolArray,
-    slot: IntArray,
-    crowded: IntArray,
-    common: IntArray,
-) -> BlockPixels:
-    """Return the values of the frame on blocks of pixels, given by the pixels' flat indices `index`."""
-    signal = frame.signal.take(index)
-    return BlockPixels(
-        slot.reshape(index.shape),
-        inside & ~frame.bad.take(index),
-        signal,
-        frame.floor.take(index),
-        # The background is the raw counts minus the signal, and is subtracted from the saturation level.
-        np.float32(frame.top) - frame.counts.take(index) + signal,
-        frame.gain,
-        crowded,
-        common.take(slot.take(crowded)),
-    )

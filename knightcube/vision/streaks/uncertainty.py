@@ -37,7 +37,7 @@ from knightcube.vision.streaks.normal_equations import (
     rate_covariance,
     star_equations,
 )
-from knightcube.vision.streaks.streak_model import LINES
+from knightcube.vision.streaks.path_pixels import LINES
 from knightcube.vision.streaks.streak_result import MotionResult
 
 # Residual (standard deviations) above which a pixel contains flux of another star.

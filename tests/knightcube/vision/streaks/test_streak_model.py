@@ -19,7 +19,8 @@ from knightcube.vision.streaks.geometry import (
     sensitivities_and_velocity,
 )
 from knightcube.vision.streaks.normal_equations import light_of
-from knightcube.vision.streaks.streak_model import IMAGES, LINES, cut_strips
+from knightcube.vision.streaks.path_pixels import LINES, cut_patches, cut_strips
+from knightcube.vision.streaks.streak_model import IMAGES
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 from tests.support.compiled_forms import assert_forms_agree
 
@@ -138,7 +139,7 @@ def test_strips_of_a_bent_streak_contain_each_pixel_once_in_short_lines(turn: fl
 def test_a_short_bent_streak_is_summed_exactly() -> None:
     """The path of a star 5 px from the axis that is rotated by one radian is far from straight."""
     motion, star = CameraMotion.steady(np.array([0.0, 0.0, 1.0])), np.array([163.0, 155.0])
-    patches = streak_model.cut_patches(_PINHOLE, star[None], 10)
+    patches = cut_patches(_PINHOLE, star[None], 10)
     light, _ = streak_model.spot_derivatives(_PINHOLE, motion, Shutter(), star[None], 1.0, patches)
     truth = _brute(motion, star, 1.0).reshape(-1)[patches.index[0]]
     assert np.abs(light[0] - truth).max() < 2e-4 * truth.max()

@@ -1,0 +1,64 @@
+"""The compiled forms of the streak fit equal their numpy forms for the arguments of real fits."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from knightcube.vision.streaks import fit_windows, normal_equations, path_pixels
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, taken, turn_of
+from tests.support.compiled_forms import assert_forms_agree
+
+_FUNCTIONS = (
+    (path_pixels, "_select_pixels", 1e-9),
+    (fit_windows, "_numbered", 1e-9),
+    (fit_windows, "_frame_values", 1e-6),
+    (normal_equations, "_sum_products", 2e-5),
+    (normal_equations, "_light_changes", 2e-5),
+    (normal_equations, "_add_coupling", 2e-5),
+)
+_SMALL = replace(CAMERA, columns=300, rows=260)
+_MOST_CALLS = 12
+
+
+def _size(arguments: tuple[Any, ...]) -> int:
+    return sum(each.size for each in arguments if isinstance(each, np.ndarray))
+
+
+def _calls(patch: pytest.MonkeyPatch, growth: float) -> dict[str, list[tuple[Any, ...]]]:
+    """Return copies of the arguments with which the fit of a frame calls the functions."""
+    calls: dict[str, list[tuple[Any, ...]]] = {name: [] for _, name, _ in _FUNCTIONS}
+    for module, name, _ in _FUNCTIONS:
+        function = getattr(module, name)
+
+        def called(*arguments: Any, function: Any = function, held: Any = calls[name]) -> Any:
+            if len(held) < _MOST_CALLS:
+                held.append(copy.deepcopy(arguments))
+            return function(*arguments)
+
+        patch.setattr(module, name, called)
+    turn = turn_of(1.1, 60.0, 0.4, _SMALL)
+    one = taken(np.random.default_rng(8), turn, growth * turn, 0.2, _SMALL)
+    settings = LikelihoodSettings(saturation=SATURATION)
+    found = estimate_motion(one.pixels, _SMALL.pinhole, one.exposure, settings, one.rate, 1e-3)
+    assert found.rate is not None
+    return calls
+
+
+@pytest.mark.parametrize("growth", [0.0, 1.95])
+def test_the_compiled_forms_equal_those_in_numpy(monkeypatch: pytest.MonkeyPatch, growth: float) -> None:
+    """A steady frame has strips that cross, and a frame that begins near rest also has patches."""
+    with monkeypatch.context() as patch:
+        calls = _calls(patch, growth)
+    for module, name, relative in _FUNCTIONS:
+        assert calls[name], f"the fit does not call {name}"
+        smallest, *_, largest = sorted(calls[name], key=_size) * 2
+        hot = getattr(module, name)
+        assert_forms_agree(hot, *largest, relative=relative, interpreted=False)
+        assert_forms_agree(hot, *smallest, relative=relative, interpreted=_size(smallest) < 60_000)
