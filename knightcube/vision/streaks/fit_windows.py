@@ -8,6 +8,7 @@ zero, a square patch of pixels covers the slow part of each streak.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -185,20 +186,24 @@ def cut_windows(
     crowded = np.flatnonzero(np.append(shared, False).take(slot))
     common = (np.cumsum(shared) - 1).take(slot.take(crowded))
     of_frame = frame.signal, frame.floor, frame.counts, frame.bad
-    good, *values = _frame_values(index, inside, *of_frame, float(frame.top))
+    good, signal, floor, ceiling = _frame_values(index, inside, *of_frame, float(frame.top))
     cut, first = strips.index.size, int(np.searchsorted(crowded, strips.index.size))
-    on_strips, on_patches = (
-        BlockPixels(
-            *(each[part].reshape(shape) for each in (slot, good, *values)),
+
+    def view(shape: tuple[int, ...], begin: int, of: slice) -> BlockPixels:
+        part = slice(begin, begin + math.prod(shape))
+        return BlockPixels(
+            slot[part].reshape(shape),
+            good[part].reshape(shape),
+            signal[part].reshape(shape),
+            floor[part].reshape(shape),
+            ceiling[part].reshape(shape),
             frame.gain,
-            crowded[of] - part.start,
+            crowded[of] - begin,
             common[of],
         )
-        for part, shape, of in (
-            (slice(0, cut), strips.index.shape, slice(0, first)),
-            (slice(cut, len(slot)), patches.index.shape, slice(first, len(crowded))),
-        )
-    )
+
+    on_strips = view(strips.index.shape, 0, slice(0, first))
+    on_patches = view(patches.index.shape, cut, slice(first, len(crowded)))
     shares = int(np.count_nonzero(shared))
     return FitWindows(long, spot, strips, patches, pixels, slot, on_strips, on_patches, shares)
 

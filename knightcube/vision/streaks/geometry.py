@@ -205,6 +205,16 @@ class StarPaths:
     velocity: FloatArray
     acceleration: FloatArray
 
+    def at_lines(self, shape: tuple[int, ...]) -> PointsAtLines:
+        """Return position, velocity and acceleration, each (2, *shape), of m points on lines of pixels."""
+        x = np.ascontiguousarray(self.position.T).reshape(2, *shape)
+        v = np.ascontiguousarray(self.velocity.T).reshape(2, *shape)
+        return x, v, np.ascontiguousarray(self.acceleration.T).reshape(2, *shape)
+
+
+PointsAtLines = tuple[FloatArray, FloatArray, FloatArray]
+"""Position, velocity and acceleration of stars at b blocks of lines of pixels, each (2, b, LINES)."""
+
 
 def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> StarPaths:
     """Return points at `time` (m,) on the paths of stars that are at `stars` (m, 2), px, at mid-exposure."""

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -180,10 +181,12 @@ def _add(
         return
     flat = images.reshape(blocks, count, -1)
     weight = np.empty((blocks, flat.shape[2]), dtype=np.float32)
-    pixels = (view.slot, view.inside, view.signal, view.floor, view.ceiling)
+    slot, inside = view.slot.reshape(weight.shape), view.inside.reshape(weight.shape)
+    floor, ceiling = view.floor.reshape(weight.shape), view.ceiling.reshape(weight.shape)
+    levels = view.signal.reshape(weight.shape), floor, ceiling
     sums = out.information, out.gradient, out.chi2, out.pixels
-    by_block = (each.reshape(blocks, -1) for each in pixels)
-    _sum_products(*sums, weight, flat, star, matrix, total, *by_block, float(view.gain), float(clip))
+    limits = float(view.gain), float(clip)
+    _sum_products(*sums, weight, flat, star, matrix, total, slot, inside, levels, limits)
     out.kept.append((weight > 0.0).reshape(view.inside.shape))
     if len(view.crowded):
         out.crowds.append(_shared_pixels(star, view, weight, flat, matrix))
@@ -201,20 +204,18 @@ def _sum_products_numpy(
     total: Float32Array,
     slot: IntArray,
     inside: BoolArray,
-    signal: Float32Array,
-    floor: Float32Array,
-    ceiling: Float32Array,
-    gain: float,
-    clip: float,
+    levels: tuple[Float32Array, Float32Array, Float32Array],
+    limits: tuple[float, float],
 ) -> None:
     """Add weighted products of the images of b blocks of p pixels to the normal equations of their stars.
 
     The weights (b, p) and the last of the `images` (b, i + 1, p), which holds the residuals, are computed
     from the modelled counts `total` of all fitted pixels. Products of the residual with the other images give
     the gradient, and the squared residual gives chi-square. Coefficients `matrix` (b, i, SHARED + ALONE)
-    combine the images into derivatives.
+    combine the images into derivatives. The `levels` are signal, floor and ceiling of `BlockPixels`, and
+    the `limits` gain and clip of `fit_windows.residuals`.
     """
-    weight[:], images[:, -1] = residuals(total, slot, inside, signal, floor, ceiling, gain, clip)
+    weight[:], images[:, -1] = residuals(total, slot, inside, *levels, *limits)
     blocks, count = images.shape[:2]
     gram = np.empty((blocks, count, count))
     for begin in range(0, blocks, _AT_ONCE):
@@ -242,13 +243,11 @@ def _sum_products(
     total: Float32Array,
     slot: IntArray,
     inside: BoolArray,
-    signal: Float32Array,
-    floor: Float32Array,
-    ceiling: Float32Array,
-    gain: float,
-    clip: float,
+    levels: tuple[Float32Array, Float32Array, Float32Array],
+    limits: tuple[float, float],
 ) -> None:
     """See `_sum_products_numpy`."""
+    (signal, floor, ceiling), (gain, clip) = levels, limits
     blocks, count, size = images.shape
     gram, weighted = np.empty((count, count)), np.empty(size, dtype=np.float32)
     for b in range(blocks):
@@ -273,9 +272,9 @@ def _sum_products(
 
 
 @loop_helper
-def _scalar_product(a: Float32Array, b: Float32Array) -> float:
+def _scalar_product(a: Float32Array, b: Float32Array) -> np.floating[Any]:
     """Return the scalar product of two arrays of equal length."""
-    total = np.float32(0.0)
+    total: np.floating[Any] = np.float32(0.0)
     for p in range(len(a)):
         total += a[p] * b[p]
     return total

@@ -16,7 +16,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks.geometry import CameraMotion, StarPaths, paths, positions
+from knightcube.vision.streaks.geometry import CameraMotion, PointsAtLines, StarPaths, paths, positions
 
 LINES = 10
 """Number of lines of pixels across a path that form a block."""
@@ -201,9 +201,8 @@ def _pixels(
 ) -> Strips:
     """Return the pixel strips formed by `lines`, which cross the paths at the points `path` (b * LINES)."""
     along, shape = lines.along_rows, lines.line.shape
-    drawn = (path.position, path.velocity, path.acceleration)
-    points = tuple(np.ascontiguousarray(each.T).reshape(2, *shape) for each in drawn)
-    bounds = tuple(np.ascontiguousarray(each) for each in parts)
+    points = path.at_lines(shape)
+    bounds = (np.ascontiguousarray(parts[0]), np.ascontiguousarray(parts[1]), parts[2])
     size = (pinhole.columns, pinhole.rows)
     corner, half = _first_pixels(points, lines.line, lines.real, along, width)
     within = np.empty((*shape, 2 * half + 1), dtype=np.bool_)
@@ -223,12 +222,8 @@ def _pixels(
     return Strips(lines.star[used], lines.time[used], corner, step, index, inside)
 
 
-_Points = tuple[FloatArray, ...]
-"""Position, velocity and acceleration of stars at lines of pixels across their paths, each (2, b, LINES)."""
-
-
 def _first_pixels(
-    points: _Points, line: IntArray, real: BoolArray, along_rows: BoolArray, width: float
+    points: PointsAtLines, line: IntArray, real: BoolArray, along_rows: BoolArray, width: float
 ) -> tuple[IntArray, int]:
     """Return the first pixel (b, LINES, 2) of each line, and the number of pixels before the path."""
     along = along_rows[:, None]
@@ -243,7 +238,7 @@ def _first_pixels(
 def _select_pixels_numpy(
     within: BoolArray,
     corner: IntArray,
-    points: _Points,
+    points: PointsAtLines,
     line: IntArray,
     real: BoolArray,
     time: FloatArray,
@@ -292,7 +287,7 @@ def _select_pixels_numpy(
 def _select_pixels(
     within: BoolArray,
     corner: IntArray,
-    points: _Points,
+    points: PointsAtLines,
     line: IntArray,
     real: BoolArray,
     time: FloatArray,

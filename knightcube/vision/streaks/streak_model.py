@@ -43,6 +43,7 @@ from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
+    PointsAtLines,
     Shutter,
     exposure_bounds,
     paths,
@@ -189,11 +190,9 @@ def images(
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
-    drawn = (path.position, path.velocity, path.acceleration)
-    lines = (np.ascontiguousarray(each.T).reshape(2, *shape) for each in drawn)
     out = np.empty((len(strips.star), IMAGES + more, *strips.index.shape[1:]), dtype=np.float32)
     delay = float(shutter.delay_per_row), float(shutter.middle)
-    _draw(out, strips.corner, strips.step, strips.time, *lines, width, delay)
+    _draw(out, strips.corner, strips.step, strips.time, path.at_lines(shape), width, delay)
     return out
 
 
@@ -202,17 +201,16 @@ def _draw_numpy(
     corner: IntArray,
     step: IntArray,
     time: FloatArray,
-    position: FloatArray,
-    velocity: FloatArray,
-    acceleration: FloatArray,
+    points: PointsAtLines,
     width: float,
     delay: tuple[float, float],
 ) -> None:
     """Compute the basis images `out` (b, .., LINES, k) from the points at which paths cross lines of pixels.
 
-    Position, velocity and acceleration are arrays (2, b, LINES). The two values `delay` are the exposure
+    The arrays `points` are those of `StarPaths.at_lines`. The two values `delay` are the exposure
     delay from row to row and the row without delay.
     """
+    position, velocity, acceleration = points
     speed = np.maximum(np.hypot(velocity[0], velocity[1]), _SLOWEST)
     tangent = velocity / speed
     # The variable `gained` is the star's acceleration along its path, px per exposure^2.
@@ -355,13 +353,12 @@ def _draw(
     corner: IntArray,
     step: IntArray,
     time: FloatArray,
-    position: FloatArray,
-    velocity: FloatArray,
-    acceleration: FloatArray,
+    points: PointsAtLines,
     width: float,
     delay: tuple[float, float],
 ) -> None:
     """See `_draw_numpy`."""
+    position, velocity, acceleration = points
     blocks, _, lines, count = out.shape
     pixels, bits = np.empty((4, lines * count)), np.empty(lines * count, dtype=np.int64)
     exponential = bits.view(np.float64)

@@ -199,8 +199,14 @@ def test_the_compiled_images_equal_those_in_numpy(
     stars = np.array([star, [150.2, 180.9]])
     strips = cut_strips(_PINHOLE, motion, stars, np.tile([-0.45, 0.5], (2, 1)), 4.1)
     points = paths(_PINHOLE, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
-    drawn = (points.position, points.velocity, points.acceleration)
-    lines = (np.ascontiguousarray(each.T).reshape(2, *strips.time.shape) for each in drawn)
     out = np.zeros((len(strips.star), IMAGES + 1, *strips.index.shape[1:]), dtype=np.float32)
-    arguments = out, strips.corner, strips.step, strips.time, *lines, 1.3, (delay, 160.0)
+    arguments = (
+        out,
+        strips.corner,
+        strips.step,
+        strips.time,
+        points.at_lines(strips.time.shape),
+        1.3,
+        (delay, 160.0),
+    )
     assert_forms_agree(streak_model._draw, *arguments, relative=3e-5, interpreted=growth == 0.0)
