@@ -25,7 +25,8 @@ PERIOD_US = 5_000
 """Period (us) of the limit: the unit's `CPUQuotaPeriodSec`."""
 _LEAST_QUOTA_US = 1_000
 """Shortest run time (us) in a period that the kernel accepts."""
-_ROOT = Path("/sys/fs/cgroup")
+ROOT = Path("/sys/fs/cgroup")
+"""Folder of the hierarchy of cgroup v2, or of the hierarchies of cgroup v1."""
 _SOURCE = Path(__file__).with_name("yardstick.c")
 
 
@@ -80,25 +81,28 @@ def measure() -> Yardstick:
 
 @dataclass(frozen=True, slots=True)
 class Used:
-    """What a limited group used: throttled periods of all periods, largest memory (bytes), refusals."""
+    """What a limited group used: throttled periods of all periods, largest memory (bytes), refusals.
+
+    The memory is NaN with a kernel before Linux 5.19, which records no largest use in cgroup v2.
+    """
 
     periods: int
     throttled: int
-    memory: int
+    memory: float
     refusals: int
 
 
 class Limits:
     """The groups of one run: `control` and `workers` inside the limit, `devices` outside of it."""
 
-    def __init__(self, share: float, memory: int) -> None:
-        """Make the groups. Raises OSError where the kernel or the rights refuse them."""
+    def __init__(self, share: float, memory: int, root: Path = ROOT) -> None:
+        """Make the groups below `root`. Raises OSError with the file that the kernel or the rights refuse."""
         name = f"knightcube-board-{os.getpid()}"
-        self._is_v2 = (_ROOT / "cgroup.controllers").exists()
+        self._is_v2 = (root / "cgroup.controllers").exists()
         if self._is_v2:
-            (_ROOT / "cgroup.subtree_control").write_text("+cpu +memory", encoding="ascii")
-        self._cpu = (_ROOT if self._is_v2 else _ROOT / "cpu") / name
-        self._memory = self._cpu if self._is_v2 else _ROOT / "memory" / name
+            _write(root / "cgroup.subtree_control", "+cpu +memory")
+        self._cpu = (root if self._is_v2 else root / "cpu") / name
+        self._memory = self._cpu if self._is_v2 else root / "memory" / name
         self._devices = self._cpu.with_name(f"{name}-devices")
         self.period_us = max(PERIOD_US, math.ceil(_LEAST_QUOTA_US / share))
         self.quota_us = round(share * self.period_us)
@@ -112,20 +116,20 @@ class Limits:
         for folder in {self._cpu, self._memory, self._devices}:
             folder.mkdir()
         if self._is_v2:
-            (self._cpu / "cgroup.subtree_control").write_text("+cpu", encoding="ascii")
-            (self._cpu / "cpu.max").write_text(f"{self.quota_us} {self.period_us}", encoding="ascii")
-            (self._cpu / "memory.max").write_text(str(memory), encoding="ascii")
+            _write(self._cpu / "cgroup.subtree_control", "+cpu")
+            _write(self._cpu / "cpu.max", f"{self.quota_us} {self.period_us}")
+            _write(self._cpu / "memory.max", str(memory))
         else:
-            (self._cpu / "cpu.cfs_period_us").write_text(str(self.period_us), encoding="ascii")
-            (self._cpu / "cpu.cfs_quota_us").write_text(str(self.quota_us), encoding="ascii")
-            (self._memory / "memory.limit_in_bytes").write_text(str(memory), encoding="ascii")
+            _write(self._cpu / "cpu.cfs_period_us", str(self.period_us))
+            _write(self._cpu / "cpu.cfs_quota_us", str(self.quota_us))
+            _write(self._memory / "memory.limit_in_bytes", str(memory))
         for part in ("control", "workers"):
             (self._cpu / part).mkdir()
         weight, most, least = ("cpu.weight", 10000, 1) if self._is_v2 else ("cpu.shares", 262144, 2)
         # Other work of this machine must not take the share: the groups come before it.
         for folder in (self._cpu, self._devices, self._cpu / "control"):
-            (folder / weight).write_text(str(most), encoding="ascii")
-        (self._cpu / "workers" / weight).write_text(str(least), encoding="ascii")
+            _write(folder / weight, str(most))
+        _write(self._cpu / "workers" / weight, str(least))
 
     def line(self) -> str:
         """Return a line of Python by which a process enters the group of the control process."""
@@ -146,16 +150,17 @@ class Limits:
     @staticmethod
     def _enter(folder: Path, process: int) -> None:
         with contextlib.suppress(ProcessLookupError):
-            (folder / "cgroup.procs").write_text(str(process), encoding="ascii")
+            _write(folder / "cgroup.procs", str(process))
 
     def used(self) -> Used:
         """Return what the group used until now."""
         rows = dict(line.split() for line in (self._cpu / "cpu.stat").read_text().splitlines())
-        peak, events = ("memory.peak", "memory.events") if self._is_v2 else ("memory.max_usage_in_bytes", "")
-        refused = "memory.failcnt" if not self._is_v2 else events
-        words = (self._memory / refused).read_text().split()
+        peak, refused = ("peak", "events") if self._is_v2 else ("max_usage_in_bytes", "failcnt")
+        words = (self._memory / f"memory.{refused}").read_text().split()
         refusals = int(words[words.index("max") + 1] if self._is_v2 else words[0])
-        memory = int((self._memory / peak).read_text())
+        memory = math.nan
+        with contextlib.suppress(FileNotFoundError):
+            memory = float((self._memory / f"memory.{peak}").read_text())
         return Used(int(rows["nr_periods"]), int(rows["nr_throttled"]), memory, refusals)
 
     def close(self) -> None:
@@ -168,6 +173,14 @@ class Limits:
                     folder.rmdir()
                     break
                 time.sleep(0.05)
+
+
+def _write(file: Path, text: str) -> None:
+    """Write a setting of a group. Raises OSError with the name of the file."""
+    try:
+        file.write_text(text, encoding="ascii")
+    except OSError as error:
+        raise OSError(error.errno, f"the kernel refuses {text!r}: {error.strerror}", str(file)) from error
 
 
 @contextmanager

@@ -6,7 +6,8 @@ and Linpack's elimination) is measured here and compared with the published figu
 (`tests.support.processor_share`). The inertial unit sends 200 readings a second (`--imu-rate`). The emulated
 devices are outside the limit. `--camera-period` and `--replan-period` ask for more work than fits, so that
 work is shed.
-Needs root, and a cgroup hierarchy with the controllers `cpu` and `memory`.
+Needs root, and a cgroup hierarchy with the controllers `cpu` and `memory`. `user_mode_linux.sh` runs the
+bench with cgroup v2 on a machine with cgroup v1.
 """
 
 from __future__ import annotations
