@@ -16,7 +16,7 @@ import numpy as np
 from flight.app.run import utc_ns
 from flight.link import events
 from flight.link.commands import CommandPacker, Ping
-from flight.link.telemetry.definitions import COMMAND, EVENT, MODES, SEVERITIES, STEERING
+from flight.link.telemetry.definitions import COMMAND, EVENT, FACTS, MODES, SEVERITIES, STEERING
 from flight.link.telemetry.fields import States
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
@@ -203,6 +203,12 @@ class FlightState:
         return None if row is None else row[name]
 
     @property
+    def alarms(self) -> tuple[str, ...]:
+        """Names of the conditions that the monitors of the flight find at present."""
+        held = int(self.value("health", "facts") or 0)
+        return tuple(name for bit, name in FACTS if held >> bit & 1)
+
+    @property
     def error_deg(self) -> float | None:
         """Angle between the estimated and the target attitude, deg, or None if either is unknown."""
         row = self.newest.get("attitude")
@@ -255,7 +261,7 @@ def event_line(event: LoggedEvent) -> str:
 
 
 def state_line(state: FlightState) -> str:
-    """Return a line with time, mode, attitude, coils, cycle slips and faults of a flight."""
+    """Return a line with time, mode, attitude, coils, cycle slips, active alarms and faults of a flight."""
     parts = [f"{state.time:9.3f} s ", state.mode or "mode not known", attitude_text(state)]
     written, dipole = state.value("control", "current_written"), state.value("attitude", "dipole")
     if written is not None:
@@ -266,6 +272,7 @@ def state_line(state: FlightState) -> str:
         parts.append(f"coils {named(STEERING, steering)}")
     if (slips := state.value("health", "slips")) is not None:
         parts.append(f"slips {int(slips)}")
+        parts.append(f"alarms {', '.join(state.alarms) or 'none'}")
     if state.faults:
         parts.append(f"faults {state.faults}")
     return "  ".join(part for part in parts if part)

@@ -9,7 +9,7 @@ import re
 import sys
 import tarfile
 from collections.abc import Iterable
-from contextlib import closing
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import KINDS, Activate, Confirm, Directive, Withdraw
 from flight.link.security import COMMAND_SPIS
 from flight.loop.state import LinuxFiles, replace_file
-from flight.schema.document import read_text
+from flight.schema.document import read_document, read_text
 from flight.schema.reader import parse
 from ground.link.commanding import add_link_options, explained, sha256_of, terminal_of
 from knightcube.errors import FlightError, UsageError
@@ -230,9 +230,24 @@ def artefact(kind: str, path: Path) -> bytes:
     data = LinuxFiles().read(path)
     if data is None:
         raise UsageError(f"{path}: there is no such file")
-    if kind == "elements" and [len(line.rstrip()) for line in data.splitlines() if line.strip()] != [69, 69]:
-        raise UsageError(f"{path}: elements are two lines of 69 characters")
-    return data
+    return _two_lines(data, path) if kind == "elements" else data
+
+
+def _two_lines(data: bytes, path: Path) -> bytes:
+    """Return the two-line elements in a file of two lines, or in the section `elements` of a YAML file.
+
+    Raises UsageError if the file has no two lines of 69 characters.
+    """
+    lines = [line.rstrip() for line in data.decode(errors="replace").splitlines() if line.strip()]
+    if [len(line) for line in lines] == [69, 69]:
+        return data
+    lines = []
+    with suppress(UsageError):
+        found = read_document(read_text(path), str(path)).values.get("elements")
+        lines = [str(line) for line in found] if isinstance(found, list) else []
+    if [len(line) for line in lines] != [69, 69]:
+        raise UsageError(f"{path}: give two lines of 69 characters, or a YAML file with them as `elements`")
+    return "".join(f"{line}\n" for line in lines).encode()
 
 
 def _release_version(kind: str, source: Path) -> int:

@@ -35,7 +35,7 @@ from flight.link.commands import (
     problem_of,
     words_of,
 )
-from flight.link.files.store import Store, files_folder
+from flight.link.files.store import Store, ground_files_folder
 from flight.link.files.transfer import Progress
 from flight.link.modes import Mode
 from flight.link.process import directives
@@ -439,8 +439,8 @@ def _show(table: ParameterTable, before: ParameterTable, refused: str, as_json: 
         old = "" if table.values[key] == before.values[key] else f"   was {before.values[key]:g}"
         sys.stdout.write(f"{key:22s} {table.values[key]:<10g} {field.unit:9s} {low:g} to {high:g}{old}\n")
     kept = "kept for the next starts" if table.kept else "not kept: this flight has no state folder"
-    loads = f"{table.loads} loads so far"
-    sys.stdout.write(f"table {table.crc:08x}, from the {table.origin}, {loads}; {kept}\n")
+    source = "as configured" if table.origin == "configuration" else f"{table.origin} by command"
+    sys.stdout.write(f"table {table.crc:08x}: {source} (number of loads: {table.loads}); {kept}\n")
     if refused:
         sys.stderr.write(f"knightcube: refused: {refused}\n")
 
@@ -487,7 +487,7 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
         "--folder",
         type=Path,
         metavar="DIR",
-        help="folder of received files and open transfers (default: the folder `files` beside the keys)",
+        help="folder of received files and open transfers (default: KEYS-files beside the folder KEYS)",
     )
     text = "maximum rate of frames to the satellite, bytes/s (default %(default)g)"
     parser.add_argument("--rate", type=float, default=_RATE, metavar="B", help=text)
@@ -528,7 +528,7 @@ def run_files(options: argparse.Namespace) -> int:
             raise UsageError(f"--{name} {getattr(options, name)}: must be a positive number")
     terminal = terminal_of(options)
     try:
-        store = Store(options.folder or files_folder(options.keys))
+        store = Store(options.folder or ground_files_folder(options.keys))
         with store.owned(), EndingSignals() as signals:
             session = FileSession(terminal, store, options.spi, options.rate, time.monotonic_ns())
             work = _FileWork(session, terminal, options.timeout, lambda: signals.received)

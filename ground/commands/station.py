@@ -18,7 +18,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from flight.app.service import EndingSignals
-from flight.link.files.store import files_folder
+from flight.link.files.store import ground_files_folder
 from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_runs
 from ground.commands.options import positive
@@ -156,8 +156,9 @@ def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: 
         until = time.monotonic() + wait
         while not {"attitude", "health"} <= state.newest.keys() and time.monotonic() < until:
             state.update(tail.new())
-        if not state.newest:
-            sys.stderr.write(f"knightcube: no packet in {wait:g} s {where}\n")
+        # A link sends packets of its own, which do not show that a flight is in progress.
+        if not state.newest or (options.link is not None and not state.mode):
+            sys.stderr.write(f"knightcube: no state of the flight in {wait:g} s {where}\n")
             return 1
         line = state_line(state) + (f"  ended: {state.ended}" if state.ended else "")
         sys.stdout.write((json.dumps(_facts(state)) if options.json else line) + "\n")
@@ -242,6 +243,7 @@ def _facts(state: FlightState) -> dict[str, Any]:
         "error_deg": state.error_deg,
         "currents_a": currents,
         "streams": streams,
+        "alarms": list(state.alarms),
         "faults": state.faults,
         "events": [
             {"time_s": event.time, "severity": event.severity, "name": event.name, "text": event.text}
@@ -364,7 +366,7 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
         stack.callback(feed.close)
         place = UNKNOWN if options.config is None else FlightSurroundings.of(options.config)
         by_link = CommandForms(feed.send, TELECOMMANDS)
-        files = LinkFiles(feed, files_folder(options.keys))
+        files = LinkFiles(feed, ground_files_folder(options.keys))
         kept = FrameFolder(options.frames)
         return Console(
             options.link, feed, history, place, by_link, frames=kept, files=files, stations=stations

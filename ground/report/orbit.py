@@ -361,7 +361,8 @@ def requirements(
         camera = known.get("star_camera") or known
         error = [math.degrees(camera["with_stars_error_rms_rad"])]
         rows.append(("time from detumbling to fine attitude", fine, limits.fine_within, "s"))
-        rows.append(("attitude error with stars, rms", error, limits.knowledge_deg, "deg"))
+        whose = "attitude error" if camera is known else "star camera's attitude error"
+        rows.append((f"{whose} with stars, rms", error, limits.knowledge_deg, "deg"))
     for target in pointed["targets"] if pointed else []:
         error = [math.degrees(target["axis_rms_rad"])]
         rows.append((f"pointing to {target['target']}, rms", error, limits.pointing_deg, "deg"))

@@ -23,6 +23,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.guidance.one_axis.plant import steady_heat, supply_power
+from knightcube.vision.streaks.streak_result import StreakStatus
 
 Object = dict[str, Any]
 
@@ -192,9 +193,10 @@ def mean_rates(truth: PacketArray, start: FloatArray, stop: FloatArray) -> Float
 def streaks(run: Run) -> Object:
     """Return the number of frames and rates from streaks, and the errors of the rates.
 
-    The errors are those of the camera: the true misalignment of a simulated camera is not part of them.
-    `normalised` is the mean of e' P^-1 e / 3 over the rates with a positive definite covariance P. The mean
-    is 1 if the covariances are correct.
+    The errors are those of the camera: the true misalignment of a simulated camera is not part of them. A
+    rate of unknown sign (status `ambiguous`) is counted, but has no error. `normalised` is the mean of e'
+    P^-1 e / 3 over the rates with a positive definite covariance P. The mean is 1 if the covariances are
+    correct.
     """
     packets = run["streak"]
     rated = with_rate(packets)
@@ -202,7 +204,7 @@ def streaks(run: Run) -> Object:
     true = mean_rates(run["truth"], start, start + rated["exposure"])
     to_camera = attitude_matrix(from_rotation_vector(_misalignment(run)))
     error = rated["rate"] - true @ to_camera.T
-    known = np.all(np.isfinite(error), axis=1)
+    known = np.all(np.isfinite(error), axis=1) & (rated["status"] != StreakStatus.AMBIGUOUS.value.encode())
     return {
         "frames": len(packets),
         "rates": len(rated),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -52,6 +53,17 @@ def test_the_commands_of_two_line_elements_print_the_same_section() -> None:
     assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr
     assert first.stdout == second.stdout
     assert first.stdout.startswith("elements: ")
+
+
+def test_the_example_prints_what_the_page_shows(tmp_path: Path) -> None:
+    (line,) = next(
+        one.commands
+        for one in blocks()
+        if one.page == "docs/fly/my-satellite.md" and "new-satellite" in one.text and one.commands
+    )
+    done = command(*shlex.split(line)[1:], folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.rstrip() == block("written:    heron.yaml")
 
 
 def newcomer() -> tuple[list[str], list[str]]:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from flight.link import events
-from flight.link.telemetry.definitions import ATTITUDE, EVENT, HEALTH, MODE, PACKETS
+from flight.link.telemetry.definitions import ATTITUDE, EVENT, FACTS, HEALTH, LINK, MODE, PACKETS
 from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import Packer, PacketArray
@@ -74,7 +74,7 @@ def test_a_flight_that_is_over_is_shown_to_its_end(growing: Path) -> None:
     last = states[-1]
     for part in ("hold", "q2 ", "slips 4", "faults 1"):
         assert part in last
-    assert lines[-1].endswith("mA  coils following  slips 4  faults 1")
+    assert lines[-1].endswith("mA  coils following  slips 4  alarms none  faults 1")
     assert any(line.endswith("stopped: stopped by SIGTERM") for line in lines)
 
 
@@ -319,13 +319,32 @@ class Portions:
         return scan(self.left.pop(0) if self.left else b"").packets
 
 
+def test_the_line_of_state_names_the_active_alarms(capsys: pytest.CaptureFixture[str]) -> None:
+    held = sum(1 << bit for bit, name in FACTS if name in {"gyro-lost", "camera-late"})
+    packets = (pack(Packer(), HEALTH, 5.0, mode=3, facts=held), pack(Packer(), ATTITUDE, 5.1, mode=3))
+    names = [name for bit, name in FACTS if held >> bit & 1]
+    assert len(names) == 2
+    for as_json in (False, True):
+        options = argparse.Namespace(once=True, json=as_json, link="127.0.0.1:5010")
+        assert station._watch(options, Portions(*packets), 0.0, "over the link") == 0
+        shown = capsys.readouterr().out
+        assert json.loads(shown)["alarms"] == names if as_json else f"alarms {', '.join(names)}" in shown
+
+
+def test_a_link_without_a_flight_has_no_state(capsys: pytest.CaptureFixture[str]) -> None:
+    options = argparse.Namespace(once=True, json=False, link="127.0.0.1:5010")
+    only_the_link = pack(Packer(), LINK, 5.0)
+    assert station._watch(options, Portions(only_the_link), 0.0, "over the link") == 1
+    assert capsys.readouterr().out == ""
+
+
 def test_one_look_over_a_link_waits_for_a_complete_state(capsys: pytest.CaptureFixture[str]) -> None:
     packer = Packer()
     health, attitude = pack(packer, HEALTH, 5.0, mode=3, slips=4), pack(packer, ATTITUDE, 5.1, mode=3)
-    options = argparse.Namespace(once=True, json=False)
+    options = argparse.Namespace(once=True, json=False, link="127.0.0.1:5010")
     assert station._watch(options, Portions(b"", health, attitude), 20.0, "over the link") == 0
     shown = capsys.readouterr().out
     assert "5.100 s" in shown
-    assert "slips 4" in shown
+    assert "slips 4  alarms none" in shown
     assert station._watch(options, Portions(), 0.01, "over the link") == 1
-    assert "no packet in 0.01 s over the link" in capsys.readouterr().err
+    assert "no state of the flight in 0.01 s over the link" in capsys.readouterr().err

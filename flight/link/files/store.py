@@ -106,8 +106,17 @@ def problem_of_name(name: str) -> str:
 
 
 def files_folder(keys: Path) -> Path:
-    """Return the folder for transferred files, which is a sibling of the folder of keys."""
+    """Return the satellite's folder for transferred files, which is a sibling of the folder of keys."""
     return keys.absolute().parent / "files"
+
+
+def ground_files_folder(keys: Path) -> Path:
+    """Return the ground's folder for transferred files, such as keys/ground-files for the keys keys/ground.
+
+    The folder differs from `files_folder`, so that both ends can run on one machine.
+    """
+    folder = keys.absolute()
+    return folder.with_name(f"{folder.name}-files")
 
 
 class Store:

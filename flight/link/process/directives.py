@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from flight.link.commands import CommandError, telecommand
+from flight.link.commands import CommandError, command_of_words, telecommand
 from flight.link.files.store import LONGEST_NAME
 from flight.link.files.transfer import FOREIGN, GROUND
 from flight.link.security import KEY_BYTES
@@ -331,7 +331,11 @@ class Scheduled:
     words: str
 
     def __str__(self) -> str:
-        return f"at {self.at}: {self.words}"
+        try:
+            text = command_of_words(self.words).text
+        except CommandError:  # the report of the refusal gives the reason
+            text = self.words
+        return f"at {self.at}: {text}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,7 +142,7 @@ def test_the_table_is_printed_with_units_bounds_and_earlier_values(
     assert len(lines) == len(PARAMETER_KEYS) + 1
     crc = crc_of([*flight.task._values.values()])
     assert lines[-1] == (
-        f"table {crc:08x}, from the loaded, 1 loads so far; not kept: this flight has no state folder"
+        f"table {crc:08x}: loaded by command (number of loads: 1); not kept: this flight has no state folder"
     )
 
 

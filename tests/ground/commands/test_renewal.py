@@ -107,11 +107,26 @@ def test_one_root_key_is_enough_to_replace_all_keys(signing: Path, tmp_path: Pat
     assert "no root-*.pem is a root key" in command("renewal", "new-key", signing).stderr
 
 
+def test_elements_are_signed_as_the_command_elements_prints_them(signing: Path, tmp_path: Path) -> None:
+    orbit = ("--altitude", "500", "--inclination", "97.4", "--node", "10", "--epoch", "2026-03-20T12:00:00")
+    printed = tmp_path / "elements.yaml"
+    printed.write_text(command("elements", *orbit).stdout, encoding="utf-8")
+    done = command("renewal", "sign", signing, "elements", printed, "--version", "1", "--out", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    with tarfile.open(tmp_path / "elements-1.renewal") as archive:
+        signed = archive.extractfile("targets/elements")
+        assert signed is not None
+        first, second = signed.read().decode().splitlines()
+    assert f"- '{first}'\n  - '{second}'\n" in printed.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     ("kind", "text", "options", "words"),
     [
         ("configuration", "name: [", [], "is not YAML"),
         ("elements", "1 25544U\n2 25544\n", [], "two lines of 69 characters"),
+        ("elements", "elements: [1 25544U, 2 25544]\n", [], "two lines of 69 characters"),
+        ("elements", "name: lark\n", [], "two lines of 69 characters"),
         ("release", "", [], "is not the folder of this software's sources"),
         ("catalogue", "x", ["--expires", "soon"], "--expires soon: is not a date"),
         ("catalogue", None, [], "there is no such file"),

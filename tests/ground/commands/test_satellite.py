@@ -269,7 +269,7 @@ def test_the_table_of_parameters_is_shown_with_its_bounds(flight: Flight) -> Non
                      f"{field.valid[0]:g}", "to", f"{field.valid[1]:g}"]  # fmt: skip
     crc = crc_of([DEFAULTS[key] for key in PARAMETER_KEYS])
     assert f"table {crc:08x}" in lines[-1]
-    assert "2 loads" in lines[-1]
+    assert "(number of loads: 2)" in lines[-1]
     facts = json.loads(command("parameters", "--to", "socket", "--json").stdout)
     assert (facts["crc"], facts["loads"], facts["kept"], facts["refused"]) == (f"{crc:08x}", 2, True, "")
     assert facts["values"] == pytest.approx(DEFAULTS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
@@ -21,6 +21,9 @@ from ground.telemetry import Run, read_run
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from tests.manual_clock import ManualClock
 from tests.support.flights import CONFIG
+
+if TYPE_CHECKING:
+    from ground.report.panels import RunSignals
 
 NAN3 = (math.nan,) * 3
 PERIOD_S, SECOND_AIM_S, SLEWED_S, DURATION_S = 10, 1000, 1700, 2000
@@ -117,6 +120,17 @@ def test_without_the_configuration_nothing_is_judged_and_the_report_says_so(
     assert any(note.startswith("pointing and requirements not judged") for note in summary["notes"])
 
 
+def power_labels(signals: RunSignals) -> list[str]:
+    """Return the texts in the legend of the panel of the coil power."""
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    from ground.report import panels  # noqa: PLC0415 - needs matplotlib
+
+    ax = Figure().subplots()
+    panels.power(ax, signals)
+    return ax.get_legend_handles_labels()[1]
+
+
 def test_a_downloaded_log_without_truth_is_reported_to_its_end(folder: Path, tmp_path: Path) -> None:
     for name in ("flight-0001.ccsds", "config.yaml"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
@@ -126,6 +140,7 @@ def test_a_downloaded_log_without_truth_is_reported_to_its_end(folder: Path, tmp
     from ground.report.orbit_figures import pointing_figure  # noqa: PLC0415 - needs matplotlib
     from ground.report.panels import RunSignals  # noqa: PLC0415 - needs matplotlib
 
+    assert not any("thesis" in text for text in power_labels(RunSignals(read_run(folder))))
     signals = RunSignals(run)
     assert signals.end == DURATION_S - PERIOD_S
     figure, with_power = pointing_figure(signals), pointing_figure(RunSignals(read_run(folder)))

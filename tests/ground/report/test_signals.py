@@ -107,9 +107,12 @@ def test_rates_from_streaks_are_compared_with_the_truth_over_their_exposure() ->
     good = {"exposure_start_ns": 1_000_000_000, "exposure": 1.0, "status": "rate", "accepted": 1,
             "rate": [0.13, 0.04, 0.0], "covariance": [9e-4, 16e-4, 1e-4, 0.0, 0.0, 0.0]}  # fmt: skip
     bad = {"status": "too-few", "rate": [math.nan] * 3, "covariance": [math.nan] * 6}
-    found = signals.streaks(packed_run(truth=truth, streak=[(1.0, good), (2.0, bad), (3.0, bad)]))
-    assert {key: found[key] for key in ("frames", "rates", "accepted", "status", "compared")} == {
-        "frames": 3, "rates": 1, "accepted": 1, "status": {"rate": 1, "too-few": 2}, "compared": 1,
+    reversed_sign = {**good, "rate": [-0.1, 0.0, 0.0], "status": "ambiguous", "accepted": 0}
+    frames = [(1.0, good), (1.5, reversed_sign), (2.0, bad), (3.0, bad)]
+    found = signals.streaks(packed_run(truth=truth, streak=frames))
+    assert found["status"] == {"rate": 1, "ambiguous": 1, "too-few": 2}
+    assert {key: found[key] for key in ("frames", "rates", "accepted", "compared")} == {
+        "frames": 4, "rates": 2, "accepted": 1, "compared": 1,
     }  # fmt: skip
     np.testing.assert_allclose(found["rms_error"], [0.03, 0.04, 0.0])
     assert found["normalised"] == pytest.approx((1.0 + 1.0 + 0.0) / 3.0)

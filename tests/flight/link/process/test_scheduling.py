@@ -90,9 +90,13 @@ def test_an_entry_of_another_release_that_fits_no_packet_is_reported_and_not_exe
     assert link.obeyed == []
 
 
-def test_the_list_shows_angles_in_degrees(link: BothEnds) -> None:
+def test_the_answer_and_the_list_show_angles_in_degrees(link: BothEnds) -> None:
     at = in_seconds(link, 60)
-    send(link, Scheduled(at, "point ground 0.9162979 0.2338741 nan nan 1.5707963"))
+    counter = send(link, Scheduled(at, "point ground 0.9162979 0.2338741 nan nan 1.5707963"))
+    assert (
+        texts(link, counter)[0]
+        == f"at {at}: point ground latitude 52.5000, longitude 13.4000 deg, roll 90 deg"
+    )
     assert (
         texts(link, send(link, Listing()))[1]
         == f"1: {at}Z point ground latitude 52.5000, longitude 13.4000 deg, roll 90 deg"
