@@ -18,6 +18,7 @@ A frame that shows no scene is dead (all pixels are equal) or overexposed. Count
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from enum import Enum
 
@@ -35,7 +36,7 @@ _ROUNDING_VARIANCE = 1.0 / 12.0
 """Variance (count^2) from rounding to whole counts, which is the minimum noise."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Background:
     """Background level and noise (counts) of blocks of pixels on a regular grid over a frame of `shape`."""
 
@@ -43,12 +44,12 @@ class Background:
     noise: FloatArray
     shape: tuple[int, int]
 
-    @property
+    @functools.cached_property
     def typical_level(self) -> float:
         """The median level, counts."""
         return float(np.median(self.level))
 
-    @property
+    @functools.cached_property
     def typical_noise(self) -> float:
         """The median noise, counts."""
         return float(np.median(self.noise))

@@ -314,6 +314,21 @@ _BORDER_PX = 2
 
 
 @dataclass(frozen=True, slots=True)
+class Judgement:
+    """Classification of one streak or region.
+
+    Attributes:
+        verdict: what the streak or region is.
+        candidate: the object, or None if there is no object.
+        light: the stars that explain the pixels, or None for an object and for an untested streak.
+    """
+
+    verdict: Verdict
+    candidate: SpaceObject | None = None
+    light: StarLight | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Judge:
     """Classifies streaks and regions of a frame as stars or objects by their pixels.
 
@@ -333,54 +348,83 @@ class Judge:
     settings: EndpointSettings
     objects: ObjectSettings
 
-    def streak(self, ends: FloatArray, fired: tuple[str, ...]) -> tuple[Verdict, SpaceObject | None]:
-        """Classify a streak or point; `fired` names the indicators that exceed their thresholds.
-
-        The second returned value is the object, or None if the streak is not an object.
-        """
+    def streak(self, ends: FloatArray, fired: tuple[str, ...]) -> Judgement:
+        """Classify a streak or point; `fired` names the indicators that exceed their thresholds."""
         if not fired:
-            return Verdict.STAR, None
+            return Judgement(Verdict.STAR)
         try:
-            if self._few_stars_explain(ends, self.objects.improvement):
-                return Verdict.STARS, None
+            light = self._light(ends, per_length=_FEW_PATHS)
+            if self._only_stars(light, self.objects.improvement):
+                return Judgement(Verdict.STARS, light=light)
             light = self._light(ends)
             found = light.explain(ends)
         except FlightError:
-            return Verdict.UNCLEAR, None
+            return Judgement(Verdict.UNCLEAR)
         if self._is_object(light, found, self.objects.improvement):
             candidate = self._candidate(ends, fired, light, found)
-            return (Verdict.UNCLEAR if candidate is None else Verdict.OBJECT), candidate
-        return self._stars_or_unclear(light), None
+            return Judgement(Verdict.UNCLEAR if candidate is None else Verdict.OBJECT, candidate)
+        return self._stars_or_unclear(light)
 
-    def crowd(self, corners: FloatArray) -> tuple[Verdict, SpaceObject | None]:
-        """Classify a region with more than two corners (k, 2), px, and return its object, if any."""
+    def crowd(self, corners: FloatArray) -> Judgement:
+        """Classify a region with more than two corners (k, 2), px."""
         if len(corners) > self.objects.most_corners:
-            return Verdict.UNCLEAR, None
+            return Judgement(Verdict.UNCLEAR)
         pairs = np.array([corners[list(pair)] for pair in itertools.combinations(range(len(corners)), 2)])
         pairs = pairs[np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=-1) >= _LEAST_CROSSING_PX]
         lines = extend(pairs, chord_outward(pairs), self.settings.endpoint_bias) if len(pairs) else pairs
+        enough = self.objects.crossing_improvement
         try:
-            if self._few_stars_explain(corners, self.objects.improvement):
-                return Verdict.STARS, None
+            light = self._light(corners, per_length=_FEW_PATHS)
+            if self._only_stars(light, enough):
+                return Judgement(Verdict.STARS, light=light)
             light = self._light(corners)
-            hopeless = light.chi_square - light.pixels < self.objects.improvement
+            hopeless = light.chi_square - light.pixels < enough
             tried = [] if hopeless else [(ends, light.explain(ends)) for ends in lines]
         except FlightError:
-            return Verdict.UNCLEAR, None
+            return Judgement(Verdict.UNCLEAR)
         if not tried:
-            return self._stars_or_unclear(light), None
+            return self._stars_or_unclear(light)
         ends, found = min(tried, key=lambda one: one[1].chi_square)
-        enough = self.objects.crossing_improvement
         if self._is_object(light, found, enough) and not self._moves_like_a_star(ends):
             candidate = self._candidate(ends, (), light, found)
-            return (Verdict.UNCLEAR if candidate is None else Verdict.OBJECT), candidate
-        return self._stars_or_unclear(light), None
+            return Judgement(Verdict.UNCLEAR if candidate is None else Verdict.OBJECT, candidate)
+        return self._stars_or_unclear(light)
 
-    def merged(self, settled: IntArray, strange: IntArray) -> list[SpaceObject]:
+    def explained(self, judged: Judgement, label: int) -> bool:
+        """Return whether stars explain all light of a region, so that no object can be merged with stars."""
+        if judged.light is None:
+            return False
+        return judged.light.excess(self._pixels_of(label)) < self.objects.improvement
+
+    def _stars_fill(self, label: int) -> bool:
+        """Return whether few stars near the axis of a region explain all light of the region."""
+        region = self._pixels_of(label)
+        weight = np.maximum(self.segmented.signal[region[:, 1], region[:, 0]], 0.0).astype(np.float64)
+        weight /= weight.sum()
+        centre = weight @ region
+        offset = region - centre
+        ends = line_of(centre, (offset * weight[:, None]).T @ offset, _LEAST_LINE_PX)
+        try:
+            light = self._light(ends, per_length=_FEW_PATHS)
+        except FlightError:
+            return False
+        only_stars = self._only_stars(light, self.objects.crossing_improvement)
+        return only_stars and light.excess(region) < self.objects.improvement
+
+    def _pixels_of(self, label: int) -> IntArray:
+        """Return the pixels (x, y) of a region (m, 2), row by row."""
+        regions = self.segmented.regions
+        top, bottom, left, right = regions.boxes[np.searchsorted(regions.label, label)]
+        row, column = positions(regions.labels[top:bottom, left:right] == label)
+        return np.stack([column + left, row + top], axis=-1)
+
+    def merged(self, settled: IntArray, strange: IntArray, explained: IntArray) -> list[SpaceObject]:
         """Return the objects in regions in which objects and stars may be merged.
 
-        The light of the stars in each region is subtracted, and the brightest remainder is tested. Regions
-        whose label is in `settled` are not examined. Regions whose label is in `strange` are examined first.
+        If few stars do not explain all light of a region, the light of its stars is subtracted, and the
+        brightest remainder is tested. Regions whose label is in `settled` are not examined. Regions whose
+        label is in `strange` are examined first. Regions whose label is in `explained` contain only stars,
+        and count as examined.
         """
         regions = self.segmented.regions
         noise = self.segmented.background.typical_noise
@@ -392,7 +436,11 @@ class Judge:
         indices = np.flatnonzero(chosen)
         order = np.lexsort((-regions.flux[indices], ~np.isin(regions.label[indices], strange)))
         objects = []
-        for index in indices[order[: self.objects.most_merged]].tolist():
+        order = order[: self.objects.most_merged]
+        order = order[~np.isin(regions.label[indices[order]], explained)]
+        for index in indices[order].tolist():
+            if self._stars_fill(int(regions.label[index])):
+                continue
             patch = cut_patch(
                 self.segmented,
                 regions,
@@ -420,7 +468,7 @@ class Judge:
             return None
         enough = self.objects.crossing_improvement
         try:
-            if self._few_stars_explain(ends, enough, stars):
+            if self._only_stars(self._light(ends, stars, _FEW_PATHS), enough):
                 return None
             light = self._light(ends, stars)
             if light.chi_square - light.pixels < enough:
@@ -430,16 +478,12 @@ class Judge:
             return None
         return self._candidate(ends, (), light, found) if self._is_object(light, found, enough) else None
 
-    def _few_stars_explain(
-        self, corners: FloatArray, enough: float, known: Sequence[FloatArray] = ()
-    ) -> bool:
+    def _only_stars(self, few: StarLight, enough: float) -> bool:
         """Return whether few trial stars explain the pixels, as more trial stars then do as well.
 
         Few stars explain the pixels if no object can decrease chi-square by `enough`. A good fit of stars and
-        an object has a chi-square of about one per pixel, which limits the decrease. The other arguments are
-        those of `StarLight`.
+        an object has a chi-square of about one per pixel, which limits the decrease.
         """
-        few = self._light(corners, known, _FEW_PATHS)
         calm = few.chi_square <= self.objects.worst_fit * few.pixels
         return few.chi_square - few.pixels < enough and calm
 
@@ -466,8 +510,9 @@ class Judge:
         fits = found.misfit <= max(self.objects.worst_fit, 0.1 * found.misfit_of_stars)
         return enough and most and fits
 
-    def _stars_or_unclear(self, light: StarLight) -> Verdict:
-        return Verdict.STARS if light.chi_square <= self.objects.worst_fit * light.pixels else Verdict.UNCLEAR
+    def _stars_or_unclear(self, light: StarLight) -> Judgement:
+        stars = light.chi_square <= self.objects.worst_fit * light.pixels
+        return Judgement(Verdict.STARS if stars else Verdict.UNCLEAR, light=light)
 
     def _moves_like_a_star(self, ends: FloatArray, within: float = 2.0) -> bool:
         """Return whether streak ends (2, 2), px, lie within `within` px of the predicted ends of a star."""
@@ -545,26 +590,28 @@ def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Str
 
     The labels `labels` (n,) are those of the regions of the streaks in `indicators`.
     """
-    found: list[SpaceObject] = []
+    judged: list[Judgement] = []
     settled: list[int] = []
     strange: list[int] = []
-    verdicts, crowded = [], []
-    each = zip(labels, indicators.endpoints, indicators.deviations, indicators.fired, strict=True)
+    every = labels.tolist()
+    each = zip(every, indicators.endpoints, indicators.deviations, indicators.fired, strict=True)
     for label, streak, deviation, fired in each:
         names = tuple(name for name, fires in zip(INDICATORS, fired, strict=True) if fires)
-        verdict, candidate = judge.streak(streak, names)
-        verdicts.append(verdict)
-        found += [candidate] if candidate is not None else []
-        calm = verdict is Verdict.OBJECT or np.abs(deviation).max() <= _STRANGE
-        (settled if calm else strange).append(int(label))
+        judged.append(judge.streak(streak, names))
+        calm = judged[-1].verdict is Verdict.OBJECT or np.abs(deviation).max() <= _STRANGE
+        (settled if calm else strange).append(label)
     for index, corners in streaks.crowded:
-        verdict, candidate = judge.crowd(corners)
-        crowded.append(verdict)
-        found += [candidate] if candidate is not None else []
-        settled += [int(judge.segmented.candidates.label[index])] if verdict is Verdict.OBJECT else []
-    found += judge.merged(np.array(settled, dtype=np.int64), np.array(strange, dtype=np.int64))
+        judged.append(judge.crowd(corners))
+        every.append(int(judge.segmented.candidates.label[index]))
+        settled += every[-1:] if judged[-1].verdict is Verdict.OBJECT else []
+    explained = [label for label, one in zip(every, judged, strict=True) if judge.explained(one, label)]
+    found = [one.candidate for one in judged if one.candidate is not None]
+    found += judge.merged(*(np.array(each, dtype=np.int64) for each in (settled, strange, explained)))
+    verdicts = tuple(one.verdict for one in judged)
     found.sort(key=lambda candidate: -candidate.flux)
-    return ObjectReport(indicators, tuple(verdicts), tuple(crowded), tuple(found), judge.rotation)
+    return ObjectReport(
+        indicators, verdicts[: len(labels)], verdicts[len(labels) :], tuple(found), judge.rotation
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

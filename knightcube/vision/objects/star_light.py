@@ -104,6 +104,7 @@ class StarLight:
     Attributes:
         chi_square: chi-square of the best sum of star streaks.
         pixels: number of pixels near the trial star paths and the lines between corners.
+        expected: expected chi-square of a correct model, which is below `pixels` where light is bright.
 
     Raises:
         FlightError: if the least-squares solution of the brightnesses does not converge.
@@ -127,6 +128,7 @@ class StarLight:
         ]
         rows, columns = segmented.signal.shape
         self._psf_sigma, self._rotation, self._pinhole = psf_sigma, rotation, pinhole
+        self._segmented, self._gain, self._saturation = segmented, gain, saturation
         points = np.concatenate([stars.reshape(-1, 2), *lines])
         self._near = pixels_near(points, _REACH * psf_sigma, rows, columns)
         signal = segmented.signal[self._near[:, 1], self._near[:, 0]].astype(np.float64)
@@ -139,6 +141,7 @@ class StarLight:
         self._power = float(self._target @ self._target)
         self.pixels = len(self._near)
         self._brightness, self.chi_square = _brightnesses(self._normal, self._right, self._power)
+        self.expected = float(np.sum(_noise_share(signal, self._weight, segmented.background, gain)))
 
     def explain(self, ends: FloatArray) -> Explanation:
         """Return how well stars and an object between `ends` (2, 2), px, explain the pixels.
@@ -184,11 +187,30 @@ class StarLight:
                 return False
         return True
 
+    def excess(self, region: IntArray) -> float:
+        """Return by how much chi-square of pixels and region exceeds its expected value, without an object.
+
+        The light of pixels of the `region` (m, 2), px, in ascending rows and columns, that are not near any
+        trial path is not explained by stars.
+        """
+        columns = self._segmented.signal.shape[1]
+        near, own = (each[:, 1] * columns + each[:, 0] for each in (self._near, region))
+        place = np.minimum(np.searchsorted(near, own), len(near) - 1)
+        column, row = region[near[place] != own].T if len(near) else region.T
+        signal = self._segmented.signal[row, column].astype(np.float64)
+        weight = _pixel_weights(signal, self._segmented.background, self._gain, self._saturation)
+        noise = _noise_share(signal, weight, self._segmented.background, self._gain)
+        outside = float(np.sum((signal * weight) ** 2 - noise))
+        return self.chi_square - self.expected + outside
+
     def _with_line(self, line: FloatArray) -> tuple[FloatArray, float]:
         """Return the brightnesses (k + 1,) of k stars and of a weighted image `line` (p,), and chi-square."""
         beside = (self._stars.T @ line)[:, None]
         normal = np.block([[self._normal, beside], [beside.T, np.array([[line @ line]])]])
-        return _brightnesses(normal, np.append(self._right, line @ self._target), self._power)
+        right = np.append(self._right, line @ self._target)
+        brightness, chi_square = _brightnesses(normal, right, self._power)
+        # Rounding errors do not make chi-square larger than without the line.
+        return brightness, min(chi_square, self.chi_square)
 
     def _weighted_image(self, path: FloatArray) -> FloatArray:
         """Return the weighted image of a streak of one count along `path` (m, 2), px, on p pixels, (p,)."""
@@ -206,6 +228,11 @@ def _pixel_weights(signal: FloatArray, background: Background, gain: float, satu
     clipped = signal + background.typical_level >= 0.95 * saturation
     error = np.sqrt(background.typical_noise**2 + light / gain + (SHAPE_ERROR * light) ** 2)
     return np.where(clipped, 0.0, 1.0 / error)
+
+
+def _noise_share(signal: FloatArray, weight: FloatArray, background: Background, gain: float) -> FloatArray:
+    """Return the shares of pixel noise and photon noise in the variances of pixels with the given weights."""
+    return (background.typical_noise**2 + np.maximum(signal, 0.0) / gain) * weight**2
 
 
 def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[FloatArray, float]:

@@ -163,12 +163,13 @@ def find_regions(mask: BoolArray, signal: Image, least_area: int) -> Regions:
     light = np.maximum(signal[row, column], 0.0).astype(np.float64)
     found = moments(number, column, row, light, count)
     area = np.bincount(number, minlength=count)
-    slices = ndimage.find_objects(labels)
-    boxes = np.array([(s[0].start, s[0].stop, s[1].start, s[1].stop) for s in slices], dtype=np.int64)
+    boxes = np.empty((count, 4), dtype=np.int64)
+    boxes[:, ::2], boxes[:, 1::2] = max(mask.shape), 0
+    for edge, place in ((0, row), (2, column)):
+        np.minimum.at(boxes[:, edge], number, place)
+        np.maximum.at(boxes[:, edge + 1], number, place + 1)
     kept = np.flatnonzero(area >= least_area)
-    return Regions(
-        labels, kept + 1, boxes.reshape(-1, 4)[kept], area[kept], found.flux[kept], found.length[kept]
-    )
+    return Regions(labels, kept + 1, boxes[kept], area[kept], found.flux[kept], found.length[kept])
 
 
 def near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolArray:
@@ -203,17 +204,11 @@ def measure_streaks(
     found: list[int] = []
     endpoints: list[FloatArray] = []
     crowded: list[tuple[int, FloatArray]] = []
-    usual = cornerness is None and settings.centre_of == "response" and settings.smoothing_sigma <= 0.0
-    for index in range(len(segmented.candidates)):
-        if usual:
-            corners = _harris_corners(segmented, index, settings)
-        else:
-            image, mask, corner = cut_out(segmented, index)
-            response = respond(image, settings)
-            intensity = response if settings.centre_of == "response" else image
-            corners = corner + find_corners(
-                response, mask, settings.peak_relative, settings.intensity_half_width, intensity
-            )
+    if cornerness is None and settings.centre_of == "response" and settings.smoothing_sigma <= 0.0:
+        every = _harris_corners(segmented, settings)
+    else:
+        every = [_corners_in(segmented, index, settings, respond) for index in range(len(sigma))]
+    for index, corners in enumerate(every):
         if len(corners) == 2:
             found.append(index)
             endpoints.append(corners)
@@ -222,6 +217,20 @@ def measure_streaks(
     stacked = np.array(endpoints).reshape(-1, 2, 2)
     chosen = np.array(found, dtype=np.int64)
     return Streaks(stacked, sigma[chosen], segmented.candidates.flux[chosen], chosen, tuple(crowded))
+
+
+def _corners_in(
+    segmented: Segmented,
+    index: int,
+    settings: EndpointSettings,
+    respond: Callable[[FloatArray, EndpointSettings], FloatArray],
+) -> FloatArray:
+    """Return the corners (n, 2), px, of a candidate region, which are the peaks of `respond`."""
+    image, mask, corner = cut_out(segmented, index)
+    response = respond(image, settings)
+    intensity = response if settings.centre_of == "response" else image
+    corners = find_corners(response, mask, settings.peak_relative, settings.intensity_half_width, intensity)
+    return corners + corner
 
 
 def cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, FloatArray]:
@@ -245,15 +254,15 @@ def _cut(signal: Image, labels: Image, box: IntArray, label: int) -> tuple[Float
     return image, mask, np.array([left, top], dtype=float)
 
 
-def _harris_corners(segmented: Segmented, index: int, settings: EndpointSettings) -> FloatArray:
-    """Return the corners (n, 2), px, of a candidate region by the Harris response of the frame."""
+def _harris_corners(segmented: Segmented, settings: EndpointSettings) -> list[FloatArray]:
+    """Return the corners (n, 2), px, of each candidate region by the Harris response of the frame."""
     candidates = segmented.candidates
     derivative, window = (kernel_radius(each) for each in (settings.derivative_sigma, settings.window_sigma))
-    return _region_corners(
+    corners, counts = _corners_of_regions(
         segmented.signal,
         candidates.labels,
-        candidates.boxes[index],
-        int(candidates.label[index]),
+        candidates.boxes,
+        candidates.label,
         gaussian_kernel(settings.derivative_sigma, derivative),
         gaussian_derivative_kernel(settings.derivative_sigma, derivative),
         gaussian_kernel(settings.window_sigma, window),
@@ -261,50 +270,56 @@ def _harris_corners(segmented: Segmented, index: int, settings: EndpointSettings
         settings.peak_relative,
         settings.intensity_half_width,
     )
+    return np.split(corners, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
-def _region_corners_numpy(
+def _corners_of_regions_numpy(
     signal: Image,
     labels: Image,
-    box: IntArray,
-    label: int,
+    boxes: IntArray,
+    label: IntArray,
     smooth: FloatArray,
     slope: FloatArray,
     window: FloatArray,
     k: float,
     relative: float,
     half_width: int,
-) -> FloatArray:
-    """Return the corners of a region as `_region_corners` does."""
-    image, mask, corner = _cut(signal, labels, box, label)
-    gx, gy = _separable(image, smooth, slope), _separable(image, slope, smooth)
-    tensor = StructureTensor(*(_separable(each, window, window) for each in (gx * gx, gx * gy, gy * gy)))
-    response = harris_response(tensor, k)
-    return find_corners(response, mask, relative, half_width, response) + corner
+) -> tuple[FloatArray, IntArray]:
+    """Return the corners of regions as `_corners_of_regions` does."""
+    corners = [np.zeros((0, 2))]
+    for box, own in zip(boxes, label.tolist(), strict=True):
+        image, mask, corner = _cut(signal, labels, box, own)
+        gx, gy = _separable(image, smooth, slope), _separable(image, slope, smooth)
+        products = gx * gx, gx * gy, gy * gy
+        tensor = StructureTensor(*(_separable(each, window, window) for each in products))
+        response = harris_response(tensor, k)
+        corners.append(find_corners(response, mask, relative, half_width, response) + corner)
+    counts = np.array([len(each) for each in corners[1:]], dtype=np.int64)
+    return np.concatenate(corners), counts
 
 
-@compiled_form_of(_region_corners_numpy)
-def _region_corners(
+@compiled_form_of(_corners_of_regions_numpy)
+def _corners_of_regions(
     signal: Image,
     labels: Image,
-    box: IntArray,
-    label: int,
+    boxes: IntArray,
+    label: IntArray,
     smooth: FloatArray,
     slope: FloatArray,
     window: FloatArray,
     k: float,
     relative: float,
     half_width: int,
-) -> FloatArray:
-    """Return the corners (x, y) of a region (n, 2), px, which are the peaks of its Harris response.
+) -> tuple[FloatArray, IntArray]:
+    """Return the corners (x, y) of n regions (m, 2), px, by their Harris response, and their numbers (n,).
 
-    The response is computed near the pixels of the region only.
+    The response is computed near the pixels of the regions only.
 
     Args:
         signal: counts above the background (rows, columns).
         labels: label of the region at each pixel (rows, columns); 0 outside all regions.
-        box: first row, last row + 1, first column and last column + 1 of the region.
-        label: label of the region.
+        boxes: first row, last row + 1, first column and last column + 1 of each region (n, 4).
+        label: labels of the regions (n,).
         smooth: kernel of the Gaussian that smooths the image for the gradient.
         slope: kernel of the derivative of this Gaussian.
         window: kernel of the window of the structure tensor.
@@ -312,34 +327,43 @@ def _region_corners(
         relative: minimum response of a corner, relative to the largest response.
         half_width: half-width of the window of the centre of intensity, px.
     """
-    top, left = max(box[0] - _PADDING, 0), max(box[2] - _PADDING, 0)
-    rows = min(box[1] + _PADDING, signal.shape[0]) - top
-    columns = min(box[3] + _PADDING, signal.shape[1]) - left
-    own = _spans_of(labels, label, top, left, rows, columns)
-    wanted = _widened(own, max(half_width, 1), columns)
-    gradients = _widened(wanted, len(window) // 2, columns)
-    lit = _widened(gradients, len(smooth) // 2, columns)
-    image = _own_light(signal, labels, label, top, left, lit, columns)
-    response = _response(image, gradients, wanted, smooth, slope, window, k)
-    corners = _peaks(
-        response, labels[top : top + rows, left : left + columns], label, own, relative, half_width
-    )
-    for each in range(len(corners)):
-        corners[each, 0] += left
-        corners[each, 1] += top
-    return corners
+    largest, most = 0, 0
+    for number in range(len(boxes)):
+        size = boxes[number, 1] - boxes[number, 0] + 2 * _PADDING
+        size *= boxes[number, 3] - boxes[number, 2] + 2 * _PADDING
+        largest, most = max(largest, size), most + size // 4
+    # Peaks of the response are not adjacent, so that a region has fewer peaks than a quarter of its pixels.
+    corners, counts, total = np.empty((most, 2)), np.zeros(len(label), dtype=np.int64), 0
+    scratch = np.empty((5, largest))
+    for number in range(len(label)):
+        box = boxes[number]
+        top, bottom = max(box[0] - _PADDING, 0), min(box[1] + _PADDING, signal.shape[0])
+        left, right = max(box[2] - _PADDING, 0), min(box[3] + _PADDING, signal.shape[1])
+        light, around = signal[top:bottom, left:right], labels[top:bottom, left:right]
+        spans = _spans_of(around, label[number])
+        wanted = _widened(spans, max(half_width, 1), right - left)
+        response = _response(light, around, label[number], wanted, smooth, slope, window, k, scratch)
+        found = _peaks(response, around, label[number], spans, relative, half_width, corners[total:])
+        for place in range(total, total + found):
+            corners[place, 0] += left
+            corners[place, 1] += top
+        counts[number] = found
+        total += found
+    return corners[:total].copy(), counts
 
 
 @loop_helper
-def _spans_of(labels: Image, label: int, top: int, left: int, rows: int, columns: int) -> IntArray:
+def _spans_of(labels: Image, label: int) -> IntArray:
     """Return the first and last column of a region in each row of a cut-out (rows, 2)."""
+    rows, columns = labels.shape
     spans = np.empty((rows, 2), dtype=np.int64)
-    spans[:, 0], spans[:, 1] = columns, -1
     for row in range(rows):
-        for column in range(columns):
-            if labels[top + row, left + column] == label:
-                spans[row, 0] = min(spans[row, 0], column)
-                spans[row, 1] = column
+        first, last = 0, columns - 1
+        while first < columns and labels[row, first] != label:
+            first += 1
+        while last > first and labels[row, last] != label:
+            last -= 1
+        spans[row, 0], spans[row, 1] = first, last if first < columns else -1
     return spans
 
 
@@ -358,44 +382,41 @@ def _widened(spans: IntArray, margin: int, columns: int) -> IntArray:
 
 
 @loop_helper
-def _own_light(
-    signal: Image, labels: Image, label: int, top: int, left: int, spans: IntArray, columns: int
-) -> FloatArray:
-    """Return the light of a region and of no region within spans of columns, in a cut-out (rows, columns)."""
-    image = np.zeros((len(spans), columns))
-    for row in range(len(spans)):
-        for column in range(spans[row, 0], spans[row, 1] + 1):
-            here = labels[top + row, left + column]
-            if here in (label, 0):
-                image[row, column] = signal[top + row, left + column]
-    return image
-
-
-@loop_helper
 def _response(
-    image: FloatArray,
-    gradients: IntArray,
+    light: Image,
+    labels: Image,
+    label: int,
     wanted: IntArray,
     smooth: FloatArray,
     slope: FloatArray,
     window: FloatArray,
     k: float,
+    scratch: FloatArray,
 ) -> FloatArray:
-    """Return the Harris response of an image, within the spans `wanted` (rows, 2) only.
+    """Return the Harris response of a region in a cut-out, within the spans `wanted` (rows, 2) only.
 
-    The gradient is computed within the spans `gradients` (rows, 2).
+    The light of other regions is omitted. The arrays `scratch` (5, m) keep the images of the cut-out.
     """
-    scratch = np.empty(image.shape)
-    xx, yy, xy = np.empty(image.shape), np.empty(image.shape), np.empty(image.shape)
-    _correlate(image, gradients, smooth, slope, scratch, xx)
-    _correlate(image, gradients, slope, smooth, scratch, yy)
-    for row in range(len(image)):
+    rows, columns = light.shape
+    size, shape = rows * columns, (rows, columns)
+    image, half = scratch[0, :size].reshape(shape), scratch[1, :size].reshape(shape)
+    xx, yy = scratch[2, :size].reshape(shape), scratch[3, :size].reshape(shape)
+    xy = scratch[4, :size].reshape(shape)
+    gradients = _widened(wanted, len(window) // 2, columns)
+    lit = _widened(gradients, len(smooth) // 2, columns)
+    for row in range(rows):
+        for column in range(lit[row, 0], lit[row, 1] + 1):
+            own = labels[row, column] == label or labels[row, column] == 0
+            image[row, column] = light[row, column] if own else 0.0
+    _correlate(image, gradients, smooth, slope, half, xx)
+    _correlate(image, gradients, slope, smooth, half, yy)
+    for row in range(rows):
         for column in range(gradients[row, 0], gradients[row, 1] + 1):
             x, y = xx[row, column], yy[row, column]
             xx[row, column], yy[row, column], xy[row, column] = x * x, y * y, x * y
     for product in (xx, yy, xy):
-        _correlate(product, wanted, window, window, scratch, product)
-    for row in range(len(image)):
+        _correlate(product, wanted, window, window, half, product)
+    for row in range(rows):
         for column in range(wanted[row, 0], wanted[row, 1] + 1):
             a, b, c = xx[row, column], yy[row, column], xy[row, column]
             xx[row, column] = a * b - c * c - k * (a + b) ** 2
@@ -439,16 +460,21 @@ def _correlate(
 
 @loop_helper
 def _peaks(
-    response: FloatArray, labels: Image, label: int, spans: IntArray, relative: float, half_width: int
-) -> FloatArray:
-    """Return the centres of intensity (n, 2), px, at the peaks of the response in a region of a cut-out."""
+    response: FloatArray,
+    labels: Image,
+    label: int,
+    spans: IntArray,
+    relative: float,
+    half_width: int,
+    corners: FloatArray,
+) -> int:
+    """Set `corners` to the centres of intensity at the peaks of the response, and return their number."""
     rows, columns = response.shape
     top, count = 0.0, 0
     for row in range(1, rows - 1):
         for column in range(max(spans[row, 0], 1), min(spans[row, 1], columns - 2) + 1):
             if labels[row, column] == label:
                 top = max(top, response[row, column])
-    corners = np.empty((len(labels) * labels.shape[1] // 4 + 1, 2))
     for row in range(1, rows - 1):
         for column in range(max(spans[row, 0], 1), min(spans[row, 1], columns - 2) + 1):
             here = response[row, column]
@@ -462,7 +488,7 @@ def _peaks(
             if here > highest:
                 _set_centre(response, row, column, half_width, corners[count])
                 count += 1
-    return corners[:count].copy()
+    return count
 
 
 @loop_helper

@@ -261,6 +261,8 @@ def _mark_discs(
 _NODES = 33
 # Minimum cosine between a nearly straight path and its chord.
 _LEAST_AHEAD = 0.85
+# Distance from a path (standard deviations) beyond which the compiled form omits the light, below 1e-11.
+_DARK = 7.0
 # Number of points of a path below which the image of a streak is the sum of the images of its points.
 _LEAST_POINTS = 4
 
@@ -421,32 +423,28 @@ def _add_points(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: 
 
 
 @loop_helper
-def _between(x: float, grid: FloatArray, values: FloatArray, place: int) -> float:
-    """Return linearly interpolated `values`, constant beyond the grid, for x in or near interval `place`."""
-    last = len(grid) - 1
-    if x <= grid[0]:
-        return float(values[0])
-    if x >= grid[last]:
-        return float(values[last])
-    k = min(max(place, 0), last - 1)
-    while x < grid[k]:
+def _interval(x: float, grid: FloatArray, guess: int) -> int:
+    """Return the interval of an ascending grid that contains `x`, or the first or last one, from a guess."""
+    last = len(grid) - 2
+    k = min(max(guess, 0), last)
+    while k > 0 and x < grid[k]:
         k -= 1
-    while x >= grid[k + 1]:
+    while k < last and x >= grid[k + 1]:
         k += 1
-    step = (values[k + 1] - values[k]) / (grid[k + 1] - grid[k])
-    return float(values[k] + step * (x - grid[k]))
+    return k
 
 
 @loop_helper
 def _nodes_of(path: FloatArray, x: float, y: float) -> FloatArray:
-    """Return the nodes of a path (m, 2) as rows: along, across, arc length, middle, slope and spacing (6, c).
+    """Return the nodes of a path (m, 2), whose chord has the direction (x, y), as rows (9, c).
 
-    The last three rows, of the intervals between nodes, have one value less. The path's chord has the
-    direction (x, y).
+    The first three rows are the coordinates along and across the chord and the arc length. The next three
+    rows are the middle, slope and spacing of the c - 1 intervals between nodes. The last three rows are the
+    derivatives of arc length, slope and spacing by the coordinate along the chord.
     """
     m = len(path)
     count = min(_NODES, m)
-    nodes = np.zeros((6, count))
+    nodes = np.zeros((9, count))
     before = 0
     for k in range(count):
         place = k * (m - 1) // (count - 1)
@@ -458,7 +456,12 @@ def _nodes_of(path: FloatArray, x: float, y: float) -> FloatArray:
             nodes[2, k] = nodes[2, k - 1] + step
             nodes[3, k - 1] = nodes[0, k - 1] + 0.5 * along
             nodes[4, k - 1], nodes[5, k - 1] = across / along, step / (place - before)
+            nodes[6, k - 1] = step / along
         before = place
+    for k in range(count - 2):
+        gap = nodes[3, k + 1] - nodes[3, k]
+        nodes[7, k] = (nodes[4, k + 1] - nodes[4, k]) / gap
+        nodes[8, k] = (nodes[5, k + 1] - nodes[5, k]) / gap
     return nodes
 
 
@@ -466,34 +469,43 @@ def _nodes_of(path: FloatArray, x: float, y: float) -> FloatArray:
 def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: float) -> None:
     """Add the light of one count along a nearly straight `path` (m, 2), px, to `image` (1 or 3, p)."""
     m, width = len(path), math.sqrt(sigma**2 + 1.0 / 12.0)
-    room = _FARTHEST * width
+    room, narrow = _FARTHEST * width, 1.0 / width
     x, y = path[m - 1, 0] - path[0, 0], path[m - 1, 1] - path[0, 1]
     length = math.hypot(x, y)
     x, y = x / length, y / length
     nodes = _nodes_of(path, x, y)
-    along, across, arc, last = nodes[0], nodes[1], nodes[2], nodes.shape[1] - 1
-    middles, slope, spacing = nodes[3, :last], nodes[4, :last], nodes[5, :last]
-    low, high = across.min() - room - 1.0, across.max() + room + 1.0
-    begin, end = 0.5 * spacing[0], arc[last] + 0.5 * spacing[last - 1]
+    last = nodes.shape[1] - 1
+    along, middles = nodes[0], nodes[3, :last]
+    rate, share = last / along[last], narrow / m
+    low, high = nodes[1].min() - room - 1.0, nodes[1].max() + room + 1.0
+    begin, end = 0.5 * nodes[5, 0], nodes[2, last] + 0.5 * nodes[5, last - 1]
     for p in range(len(pixels)):
         dx, dy = pixels[p, 0] - path[0, 0], pixels[p, 1] - path[0, 1]
         u, v = dx * x + dy * y, dy * x - dx * y
         if u <= -room - 1.0 or u >= length + room + 1.0 or v <= low or v >= high:
             continue
-        place = int(u / length * last)
-        bend, pace = _between(u, middles, slope, place), _between(u, middles, spacing, place)
-        beyond = u - min(max(u, along[0]), along[last])
-        off = v - _between(u, along, across, place) - beyond * bend
-        cosine = 1.0 / math.sqrt(1.0 + bend * bend)
+        inside = min(max(u, 0.0), along[last])
+        k = _interval(inside, along, int(inside * rate))
+        step = inside - along[k]
+        centre = min(max(u, middles[0]), middles[last - 1])
+        j = _interval(centre, middles, k)
+        bend = nodes[4, j] + nodes[7, j] * (centre - middles[j])
+        pace = nodes[5, j] + nodes[8, j] * (centre - middles[j])
+        beyond = u - inside
+        off = v - nodes[1, k] - nodes[4, k] * step - beyond * bend
+        if abs(off) > _DARK * width * (1.0 + abs(bend)):
+            continue
+        root = math.sqrt(1.0 + bend * bend)
+        cosine = 1.0 / root
         n = off * cosine
-        s = _between(u, along, arc, place) + (beyond + off * bend * cosine * cosine) / cosine
-        light = _bell(n / width) / (width * pace * m)
+        s = nodes[2, k] + nodes[6, k] * step + beyond * root + off * bend * cosine
+        light = _bell(n * narrow) * share / pace
         covered, sloping = 1.0, 0.0
         if s + begin < room:
-            covered, sloping = _area((s + begin) / width), _bell((s + begin) / width) / width
+            covered, sloping = _area((s + begin) * narrow), _bell((s + begin) * narrow) * narrow
         if end - s < room:
-            part = _area((end - s) / width)
-            sloping = sloping * part - covered * _bell((end - s) / width) / width
+            part = _area((end - s) * narrow)
+            sloping = sloping * part - covered * _bell((end - s) * narrow) * narrow
             covered *= part
         image[0, p] += light * covered
         if len(image) == 3:
