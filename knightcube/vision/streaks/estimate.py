@@ -62,6 +62,7 @@ from knightcube.vision.streaks.joint_fit import (
     final_fit,
     iterate,
     misfit,
+    refit,
     trailing_fraction,
     true_ends,
     unbroken,
@@ -81,6 +82,7 @@ from knightcube.vision.streaks.uncertainty import (
     reversal_improvement,
     rotation_uncertainty,
 )
+from knightcube.vision.streaks.vibration import fit_vibration
 
 # Relative difference below which two rotation angles count as equal.
 _SAME_ANGLE = 0.05
@@ -778,9 +780,39 @@ def _has_angle(rotation: FloatArray, angles: list[float]) -> bool:
 def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candidate:
     """Return the motion of the joint fit that starts from the preliminary fit `first`.
 
-    If the joint fit does not succeed, the motion has the verdict REJECTED.
+    If the joint fit does not succeed, the motion has the verdict REJECTED. A rejected motion is fitted again
+    with the vibration that the residuals show.
     """
     last, faint = final_fit(camera, first)
+    found = _candidate(camera, seen, first, last, faint)
+    if found.possible:
+        return found
+    start = first if last is None else _bright_stars(camera, last, len(first.scene.light))
+    begun = replace(camera, growing=bool(start.free[3]))
+    vibrating = fit_vibration(
+        begun, start, lambda scene: iterate(begun, scene, begun.free, FIRST, begun.windows(scene))
+    )
+    if vibrating is None:
+        return found
+    last, faint = final_fit(camera, vibrating)
+    if last is not None:
+        fitted = last
+        last = fit_vibration(camera, last, lambda scene: refit(camera, replace(fitted, scene=scene)))
+    shaken = _candidate(camera, seen, vibrating, last, faint)
+    return shaken if shaken.possible else found
+
+
+def _bright_stars(camera: FitProblem, fit: StreakFit, most: int) -> StreakFit:
+    """Return a fit reduced to the `most` brightest stars that determine the motion."""
+    scene = fit.scene.select(np.flatnonzero(fit.scene.trusted))
+    scene = scene.select(np.argsort(-scene.light, kind="stable")[:most])
+    return replace(fit, scene=scene, windows=camera.windows(scene), hidden=None)
+
+
+def _candidate(
+    camera: FitProblem, seen: MotionResult, first: StreakFit, last: StreakFit | None, faint: FaintStars
+) -> _Candidate:
+    """Return the motion of the joint fit `last`, which started from the preliminary fit `first`."""
     middles, excess = np.empty((0, 2)), np.empty(0)
     if last is None:
         return _Candidate(seen, first.scene.motion.rotation, StreakVerdict.REJECTED, middles, excess)

@@ -318,7 +318,7 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
     The slow part of a path is at the streak end at which the rate is smaller. If a path has no fast part or
     no slow part, the start and end times of the missing part are equal.
     """
-    motion = scene.motion
+    motion = scene.motion.smooth
     if motion.constant or not motion.rotation.any():
         return times, np.zeros_like(times)
     time = np.linspace(times.min(), times.max(), _SAMPLES)

@@ -109,18 +109,76 @@ def streak_pinhole(camera: CameraModel, knowledge: CameraKnowledge) -> Pinhole:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Vibration:
+    """Small rotation of a vibrating camera, as a sum of k sinusoids of time in exposures.
+
+    The rotation vector at the time t is the sum over the sinusoids of `sine` sin(2 pi `frequency` t) +
+    `cosine` (cos(2 pi `frequency` t) - 1), so that it is zero at mid-exposure.
+
+    Attributes:
+        frequency: cycles per exposure of each sinusoid (k,).
+        sine: amplitudes of the sines (k, 3), rad.
+        cosine: amplitudes of the cosines (k, 3), rad.
+    """
+
+    frequency: FloatArray = field(default_factory=lambda: np.zeros(0))
+    sine: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    cosine: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def exists(self) -> bool:
+        """Whether the camera vibrates."""
+        return len(self.frequency) > 0
+
+    @property
+    def amplitude(self) -> FloatArray:
+        """The largest rotation (k,), rad, by each sinusoid, for a vibration about one axis."""
+        return np.sqrt(np.sum(self.sine**2 + self.cosine**2, axis=1))
+
+    def sinusoids(self) -> list[Vibration]:
+        """Return one vibration for each sinusoid."""
+        each = (slice(index, index + 1) for index in range(len(self.frequency)))
+        return [Vibration(self.frequency[one], self.sine[one], self.cosine[one]) for one in each]
+
+    def with_frequency(self, frequency: float) -> Vibration:
+        """Return the vibration with one more sinusoid of zero amplitude."""
+        nothing = np.zeros((1, 3))
+        return Vibration(
+            np.append(self.frequency, frequency),
+            np.concatenate([self.sine, nothing]),
+            np.concatenate([self.cosine, nothing]),
+        )
+
+    def rotation(self, time: FloatArray, derivative: int = 0) -> FloatArray:
+        """Return the rotation vector (3, m) at `time` (m,), rad, or its first or second time derivative."""
+        angular = 2.0 * np.pi * self.frequency[:, None]
+        sine, cosine = np.sin(angular * time), np.cos(angular * time)
+        if derivative == 0:
+            return np.asarray(self.sine.T @ sine + self.cosine.T @ (cosine - 1.0))
+        if derivative == 1:
+            return np.asarray(self.sine.T @ (angular * cosine) - self.cosine.T @ (angular * sine))
+        return np.asarray(-self.sine.T @ (angular**2 * sine) - self.cosine.T @ (angular**2 * cosine))
+
+    def reversed(self) -> Vibration:
+        """Return the vibration with time reversed."""
+        return replace(self, sine=-self.sine)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CameraMotion:
     """Rotation of the camera over one exposure, in camera axes, with the exposure as unit of time.
 
     Attributes:
-        rate: angular rate at mid-exposure (3,), rad per exposure.
-        acceleration: angular acceleration at mid-exposure (3,), rad per exposure^2.
+        rate: angular rate at mid-exposure (3,), rad per exposure, without the rate of a vibration.
+        acceleration: angular acceleration at mid-exposure (3,), rad per exposure^2, without a vibration.
         higher_terms: known coefficients of t^3, t^4, ... in the rotation vector (k, 3), rad.
+        vibration: vibration of the camera, whose rotation vector adds to the other terms.
     """
 
     rate: FloatArray
     acceleration: FloatArray
     higher_terms: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    vibration: Vibration = field(default_factory=Vibration)
 
     @classmethod
     def steady(cls, rate: FloatArray) -> CameraMotion:
@@ -136,7 +194,17 @@ class CameraMotion:
     @property
     def constant(self) -> bool:
         """Whether the angular rate is constant over the exposure."""
-        return not (self.acceleration.any() or self.higher_terms.any())
+        return not (self.accelerates or self.vibration.exists)
+
+    @property
+    def accelerates(self) -> bool:
+        """Whether the angular rate changes in another way than by a vibration."""
+        return bool(self.acceleration.any() or self.higher_terms.any())
+
+    @property
+    def smooth(self) -> CameraMotion:
+        """The motion without its vibration."""
+        return replace(self, vibration=Vibration()) if self.vibration.exists else self
 
     def directed(self, direction: FloatArray) -> CameraMotion:
         """Return this motion or its time reversal, whichever rotates in the sense of `direction` (3,).
@@ -146,7 +214,8 @@ class CameraMotion:
         if self.rotation @ direction >= 0.0:
             return self
         odd = (-1.0) ** np.arange(3, 3 + len(self.higher_terms))
-        return CameraMotion(-self.rate, self.acceleration, odd[:, None] * self.higher_terms)
+        higher = odd[:, None] * self.higher_terms
+        return CameraMotion(-self.rate, self.acceleration, higher, self.vibration.reversed())
 
     def scaled_to(self, rotation: FloatArray) -> CameraMotion:
         """Return this motion with the mean rate `rotation` (3,), rad per exposure, or the opposite rate."""
@@ -167,7 +236,7 @@ class CameraMotion:
     def relative_acceleration(self) -> float:
         """Change of the rate along the mean rotation axis over the exposure, relative to the mean rate."""
         square = float(self.rotation @ self.rotation)
-        rate = self.higher(np.array([-0.5, 0.5]), 1)
+        rate = self.smooth.higher(np.array([-0.5, 0.5]), 1)
         change = self.acceleration + rate[:, 1] - rate[:, 0]
         return float(self.rotation @ change) / square if square else 0.0
 
@@ -183,7 +252,9 @@ class CameraMotion:
         return np.asarray(np.broadcast_to(relative, time.shape))
 
     def higher(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the rotation vector (3, m) from `higher_terms` at `time` (m,), or its time derivative."""
+        """Return the rotation vector (3, m) at `time` (m,) beyond rate and acceleration, or a derivative."""
+        if self.vibration.exists:
+            return self.smooth.higher(time, derivative) + self.vibration.rotation(time, derivative)
         out = np.zeros((3, len(time)))
         if not len(self.higher_terms):
             return out
@@ -218,7 +289,11 @@ PointsAtLines = tuple[FloatArray, FloatArray, FloatArray]
 
 def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> StarPaths:
     """Return points at `time` (m,) on the paths of stars that are at `stars` (m, 2), px, at mid-exposure."""
-    position, velocity, acceleration = _ideal_paths(*_ideal_arguments(pinhole, motion, stars, time))
+    arguments = _ideal_arguments(pinhole, motion, stars, time)
+    if motion.vibration.exists:
+        position, velocity, acceleration = _paths_of(arguments[0], motion, *arguments[4:])
+    else:
+        position, velocity, acceleration = _ideal_paths(*arguments)
     if not isinstance(pinhole, DistortedPinhole):
         return StarPaths(position, velocity, acceleration)
     jacobian = pinhole.jacobian(position)
@@ -228,7 +303,11 @@ def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: Float
 
 def positions(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
     """Return only the positions (m, 2), px, of the points that `paths` returns, in less time."""
-    points = _ideal_positions(*_ideal_arguments(pinhole, motion, stars, time))
+    arguments = _ideal_arguments(pinhole, motion, stars, time)
+    if motion.vibration.exists:
+        points = _positions_of(arguments[0], motion, *arguments[4:])
+    else:
+        points = _ideal_positions(*arguments)
     return pinhole.distorted(points) if isinstance(pinhole, DistortedPinhole) else points
 
 
@@ -260,9 +339,12 @@ def sensitivities_and_velocity(
     angle, and are zero unless the acceleration is fitted (`growing`).
     """
     arguments = _ideal_arguments(pinhole, motion, stars, time)
-    change, pace = _ideal_sensitivities(*arguments, growing)
+    if motion.vibration.exists:
+        change, pace = _sensitivities_of(arguments[0], motion, *arguments[4:], growing)
+    else:
+        change, pace = _ideal_sensitivities(*arguments, growing)
     if isinstance(pinhole, DistortedPinhole):
-        jacobian = pinhole.jacobian(_ideal_positions(*arguments))
+        jacobian = pinhole.jacobian(_positions_of(arguments[0], motion, *arguments[4:]))
         change, pace = jacobian @ change, (jacobian @ pace[..., None])[..., 0]
         # Positions at mid-exposure include distortion, so that their derivatives need the inverse Jacobian.
         change[..., 6:] = change[..., 6:] @ np.linalg.inv(pinhole.jacobian(arguments[4]))
@@ -286,8 +368,15 @@ def _ideal_arguments(
     return view, rate, acceleration, higher, np.ascontiguousarray(stars), np.ascontiguousarray(time)
 
 
+# The compiled forms have no vibration, because few frames show one.
 # The numpy forms use arrays of m vectors (..., 3, m), whose components are contiguous, and return transposed
 # views of them.
+
+
+def _positions_of(view: _View, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
+    """Return the positions (m, 2), px, at `time` (m,) of `stars` (m, 2), px, without distortion."""
+    v = _rotated(_rotation_until(motion, time), _directions(view, stars))
+    return _pixels(view, v[:2] / v[2])
 
 
 def _ideal_positions_numpy(
@@ -298,10 +387,8 @@ def _ideal_positions_numpy(
     stars: FloatArray,
     time: FloatArray,
 ) -> FloatArray:
-    """Return the positions (m, 2), px, at `time` (m,) of `stars` (m, 2), px, without distortion."""
-    motion = CameraMotion(rate, acceleration, higher)
-    v = _rotated(_rotation_until(motion, time), _directions(view, stars))
-    return _pixels(view, v[:2] / v[2])
+    """See `_positions_of`."""
+    return _positions_of(view, CameraMotion(rate, acceleration, higher), stars, time)
 
 
 @compiled_form_of(_ideal_positions_numpy)
@@ -328,6 +415,24 @@ def _ideal_positions(
     return out.T
 
 
+def _paths_of(
+    view: _View, motion: CameraMotion, stars: FloatArray, time: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the position, velocity and acceleration (m, 2) of `stars` (m, 2), px, without distortion."""
+    v = _rotated(_rotation_until(motion, time), _directions(view, stars))
+    w = _rate(motion, time)
+    velocity = _cross(v, w)  # -omega x v
+    bent = _cross(velocity, w)
+    if not motion.constant:
+        bent += _cross(v, motion.acceleration[:, None] + motion.higher(time, 2))
+    focal = view[0]
+    inverse = 1.0 / v[2]
+    there = v[:2] * inverse
+    pace = (velocity[:2] - there * velocity[2]) * inverse
+    bend = (bent[:2] - there * bent[2] - 2.0 * pace * velocity[2]) * inverse
+    return _pixels(view, there), (focal * pace).T, (focal * bend).T
+
+
 def _ideal_paths_numpy(
     view: _View,
     rate: FloatArray,
@@ -336,20 +441,8 @@ def _ideal_paths_numpy(
     stars: FloatArray,
     time: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return position, velocity and acceleration (m, 2) of `stars` (m, 2), px, without distortion."""
-    motion = CameraMotion(rate, acceleration, higher)
-    v = _rotated(_rotation_until(motion, time), _directions(view, stars))
-    w = _rate(motion, time)
-    velocity = _cross(v, w)  # -omega x v
-    bent = _cross(velocity, w)
-    if not motion.constant:
-        bent += _cross(v, acceleration[:, None] + motion.higher(time, 2))
-    focal = view[0]
-    inverse = 1.0 / v[2]
-    there = v[:2] * inverse
-    pace = (velocity[:2] - there * velocity[2]) * inverse
-    bend = (bent[:2] - there * bent[2] - 2.0 * pace * velocity[2]) * inverse
-    return _pixels(view, there), (focal * pace).T, (focal * bend).T
+    """See `_paths_of`."""
+    return _paths_of(view, CameraMotion(rate, acceleration, higher), stars, time)
 
 
 @compiled_form_of(_ideal_paths_numpy)
@@ -379,17 +472,10 @@ def _ideal_paths(
     return out[0:2].T, out[2:4].T, out[4:6].T
 
 
-def _ideal_sensitivities_numpy(
-    view: _View,
-    rate: FloatArray,
-    acceleration: FloatArray,
-    higher: FloatArray,
-    stars: FloatArray,
-    time: FloatArray,
-    growing: bool,
+def _sensitivities_of(
+    view: _View, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives (m, 2, 8) and velocities (m, 2) without distortion."""
-    motion = CameraMotion(rate, acceleration, higher)
+    """Return the derivatives (m, 2, 8) and velocities (m, 2) without distortion."""
     turned = _rotation_until(motion, time)
     v = _rotated(turned, _directions(view, stars))
     there = v[:2] / v[2]
@@ -398,8 +484,8 @@ def _ideal_sensitivities_numpy(
     # The vector psi at the time t is the integral over t' of the rotation from t' to t.
     flow = _flow(view[0], there)
     # For psi, the body is assumed to rotate at the mean rate since mid-exposure (error of higher order).
-    mean = rate[:, None] + 0.5 * time * acceleration[:, None]
-    if higher.any():
+    mean = motion.rate[:, None] + 0.5 * time * motion.acceleration[:, None]
+    if motion.higher_terms.any() or motion.vibration.exists:
         mean += motion.higher(time) / np.where(np.abs(time) < _TINY, 1.0, time)
     angle = np.sqrt(np.sum(mean * mean, axis=0))
     axis = mean / np.maximum(angle, _TINY)
@@ -416,6 +502,19 @@ def _ideal_sensitivities_numpy(
         out[:, column] = (beside[:2] - there * beside[2]) / v[2]
     velocity = np.sum(flow * _rate(motion, time), axis=1)
     return out.transpose(2, 0, 1), velocity.T
+
+
+def _ideal_sensitivities_numpy(
+    view: _View,
+    rate: FloatArray,
+    acceleration: FloatArray,
+    higher: FloatArray,
+    stars: FloatArray,
+    time: FloatArray,
+    growing: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """See `_sensitivities_of`."""
+    return _sensitivities_of(view, CameraMotion(rate, acceleration, higher), stars, time, growing)
 
 
 @compiled_form_of(_ideal_sensitivities_numpy)

@@ -612,7 +612,7 @@ def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
     A constant rate is fitted unless the settings or the pixels require a changing rate.
     """
     settings, before = camera.settings, first.scene
-    if not before.motion.constant:
+    if before.motion.accelerates:
         camera = replace(camera, growing=True)
     faint = _find_along(camera, first)
     whole = before.with_stars(faint.stars, faint.light)

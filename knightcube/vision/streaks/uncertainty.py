@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import chdtri
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.geometry import (
     PIXEL_VARIANCE,
@@ -23,7 +23,6 @@ from knightcube.vision.streaks.geometry import (
     DistortedPinhole,
     StreakScene,
     path_lengths,
-    paths,
     positions,
     sensitivities_and_velocity,
 )
@@ -33,59 +32,20 @@ from knightcube.vision.streaks.normal_equations import (
     contradiction,
     disagreement,
     estimates_of,
-    model_images,
     rate_covariance,
     star_equations,
 )
-from knightcube.vision.streaks.path_pixels import LINES
 from knightcube.vision.streaks.streak_result import MotionResult
+from knightcube.vision.streaks.vibration import (
+    CommonMotion,
+    StreakResiduals,
+    find_common_motion,
+    residuals_of_fit,
+    vibration_covariance,
+)
 
-# Residual (standard deviations) above which a pixel contains flux of another star.
-_FOREIGN_SIGMAS = 5.0
-# Addition to the limit for another star's flux, relative to the brightest modelled pixel of the same line.
-_FOREIGN_SHARE = 0.6
 # Minimum sensitivity of a pixel to a displacement of a streak, relative to the block's most sensitive pixel.
 _LEAST_SENSITIVITY = 0.02
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StreakResiduals:
-    """Residuals of the streaks that determine the motion, on b blocks of pixels.
-
-    Attributes:
-        star: for each block of pixels (b,), the index of its star in the scene.
-        time: time at which the star crosses each line of pixels (b, LINES), relative to mid-exposure, in
-            units of the exposure time.
-        images: images that are combined to model a streak, on lines of k pixels, (b, IMAGES, LINES, k) for b
-            blocks.
-        weight: inverse variance of each pixel of the b blocks (b, LINES, k), 0 for excluded pixels.
-        residual: measured minus modelled counts of each pixel of the b blocks (b, LINES, k).
-    """
-
-    star: IntArray
-    time: FloatArray
-    images: Float32Array
-    weight: Float32Array
-    residual: Float32Array
-
-
-def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
-    """Return the residuals of the fit on the pixels of the long streaks that determine the motion."""
-    scene, windows = fit.scene, fit.windows
-    images, spots, _ = model_images(camera.pinhole, camera.shutter, scene, windows)
-    of_block = windows.long[windows.strips.star]
-    light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
-    peak = light.max(axis=2, keepdims=True, initial=0.0)
-    light += scene.sky[of_block, None, None].astype(np.float32)
-    spot_light = spots * scene.light[windows.spot, None, None] + scene.sky[windows.spot, None, None]
-    weight, residual = windows.on_strips.residual(windows.total(light, spot_light), 0.0)
-    with np.errstate(divide="ignore"):
-        foreign = np.abs(residual) > _FOREIGN_SIGMAS / np.sqrt(weight) + _FOREIGN_SHARE * peak
-    weight[foreign] = 0.0
-    chosen = np.flatnonzero(scene.trusted[of_block])
-    return StreakResiduals(
-        of_block[chosen], windows.strips.time[chosen], images[chosen], weight[chosen], residual[chosen]
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,78 +270,6 @@ def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
     return replace(camera, pinhole=lens)
 
 
-# Number of time bins over the exposure for the estimate of the motion common to all streaks.
-_BINS = 48
-# Minimum significance (standard deviations) of a motion common to all streaks.
-_SIGNIFICANT = 4.0
-
-
-@dataclass(frozen=True, slots=True)
-class CommonMotion:
-    """RMS vibration common to all streaks, as deviation from the smooth model, or 0 if not significant.
-
-    Attributes:
-        across: displacement of the streaks across their paths, px.
-        along: relative change of brightness along the streaks.
-    """
-
-    across: float = 0.0
-    along: float = 0.0
-
-
-def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> CommonMotion:
-    """Return the vibration common to the streaks that determine the motion, or zero without long streaks.
-
-    At each time, vibration displaces all streaks equally across their paths. Along the paths, vibration
-    changes the speed of the stars and thereby their intensity. The residuals of all stars are averaged in
-    bins of time. Only products of the residuals of different stars are summed, so that a neighbour of one
-    star has no effect.
-    """
-    if not len(left.star):
-        return CommonMotion()
-    time, star = left.time, left.star
-    stars = scene.stars[star]
-    velocity = paths(camera.pinhole, scene.motion, np.repeat(stars, LINES, axis=0), time.reshape(-1)).velocity
-    tangent = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    light = scene.light[star, None]
-    place = np.clip(((time + 0.5) * _BINS).astype(np.int64), 0, _BINS - 1).reshape(-1)
-    within = (np.abs(time) < 0.5).reshape(-1)
-    owner = np.repeat(star, LINES)
-    found = []
-    for image, way in ((left.images[:, 1], normal), (left.images[:, 0], tangent)):
-        score = (light * np.sum(left.weight * left.residual * image, axis=2)).reshape(-1)
-        information = (light**2 * np.sum(left.weight * image * image, axis=2)).reshape(-1)
-        cell = (owner * _BINS + place)[within]
-        found.append(_common_rms(cell, score[within, None] * way[within], information[within]))
-    return CommonMotion(*found)
-
-
-def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> float:
-    """Return the rms displacement common to all stars, or 0 if it is not significant.
-
-    The gradients `score` (m, 2) and `information` (m,) of m lines of pixels are summed over each star and
-    time bin, whose combined indices are `cell` (m,).
-    """
-    size = (int(cell.max()) // _BINS + 1) * _BINS if len(cell) else 0
-    if size < 2 * _BINS:
-        return 0.0
-    own = np.stack([np.bincount(cell, score[:, axis], size) for axis in (0, 1)], axis=-1)
-    own = own.reshape(-1, _BINS, 2)
-    known = np.bincount(cell, information, size).reshape(-1, _BINS)
-    # The weight of a star is limited by the star's own scatter, which includes model errors.
-    scatter = np.sum(own**2, axis=(1, 2)) / np.maximum(known.sum(axis=1), 1e-30)
-    trust = 1.0 / np.maximum(scatter, 1.0)
-    own, known = own * trust[:, None, None], known * trust[:, None]
-    square = np.sum(own**2, axis=2)
-    common = float(np.sum(np.sum(own, axis=0) ** 2) - square.sum())
-    chance = float(np.sqrt(2.0 * np.sum(square.sum(axis=0) ** 2 - np.sum(square**2, axis=0))))
-    weight = float(np.sum(known.sum(axis=0) ** 2 - np.sum(known**2, axis=0)))
-    if weight <= 0.0 or common <= _SIGNIFICANT * chance:
-        return 0.0
-    return float(np.sqrt(common / weight))
-
-
 # Minimum relative change of the rate of a motion that starts or ends near rest.
 _NEAR_REST = 1.5
 # Maximum number of bright streaks that are tested for a reversal of the rotation.
@@ -591,6 +479,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     common = float(np.trace(lens.described)) + longer
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
     covariance = covariance + lens.added + longer * np.eye(3)
+    covariance = covariance + spread * vibration_covariance(camera, whole.scene, residuals)
     sides = side_displacement(residuals, whole.scene)
     return RotationUncertainty(
         rotation,

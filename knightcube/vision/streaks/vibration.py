@@ -1,0 +1,389 @@
+"""Vibration of the camera, which displaces all streaks of a frame in common.
+
+A vibration displaces the stars across their paths and changes their speed, and thereby the intensity, along
+their paths. The residuals of a fit without vibration show both as functions of time. The vibration is
+modelled as a sum of few sinusoids of the camera's rotation vector. The first value of a frequency is the one
+that decreases chi-square most. Gauss-Newton steps improve frequencies and amplitudes, and between these steps
+the motion and the stars are fitted again.
+
+In one time bin, the residuals depend linearly on 12 numbers: the rotation vector, its time derivative, and
+the rotation vectors at the start and the end of the exposure, which move the ends of the streaks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
+from knightcube.vision.streaks.geometry import StreakScene, Vibration, image_flow, path_lengths, paths
+from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
+from knightcube.vision.streaks.normal_equations import model_images
+from knightcube.vision.streaks.streak_model import LINES
+
+# Residual (standard deviations) above which a pixel contains flux of another star.
+_FOREIGN_SIGMAS = 5.0
+# Addition to the limit for another star's flux, relative to the brightest modelled pixel of the same line.
+_FOREIGN_SHARE = 0.6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StreakResiduals:
+    """Residuals of the streaks that determine the motion, on b blocks of pixels.
+
+    Attributes:
+        star: for each block of pixels (b,), the index of its star in the scene.
+        time: time at which the star crosses each line of pixels (b, LINES), relative to mid-exposure, in
+            units of the exposure time.
+        images: images that are combined to model a streak, on lines of k pixels, (b, IMAGES, LINES, k) for b
+            blocks.
+        weight: inverse variance of each pixel of the b blocks (b, LINES, k), 0 for excluded pixels.
+        residual: measured minus modelled counts of each pixel of the b blocks (b, LINES, k).
+    """
+
+    star: IntArray
+    time: FloatArray
+    images: Float32Array
+    weight: Float32Array
+    residual: Float32Array
+
+
+def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
+    """Return the residuals of the fit on the pixels of the long streaks that determine the motion."""
+    scene, windows = fit.scene, fit.windows
+    images, spots, _ = model_images(camera.pinhole, camera.shutter, scene, windows)
+    of_block = windows.long[windows.strips.star]
+    light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
+    peak = light.max(axis=2, keepdims=True, initial=0.0)
+    light += scene.sky[of_block, None, None].astype(np.float32)
+    spot_light = spots * scene.light[windows.spot, None, None] + scene.sky[windows.spot, None, None]
+    weight, residual = windows.on_strips.residual(windows.total(light, spot_light), 0.0)
+    with np.errstate(divide="ignore"):
+        foreign = np.abs(residual) > _FOREIGN_SIGMAS / np.sqrt(weight) + _FOREIGN_SHARE * peak
+    weight[foreign] = 0.0
+    chosen = np.flatnonzero(scene.trusted[of_block])
+    return StreakResiduals(
+        of_block[chosen], windows.strips.time[chosen], images[chosen], weight[chosen], residual[chosen]
+    )
+
+
+# Number of time bins over the exposure for the estimate of the motion common to all streaks.
+_BINS = 48
+# Minimum significance (standard deviations) of a motion common to all streaks.
+_SIGNIFICANT = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class CommonMotion:
+    """RMS vibration common to all streaks, as deviation from the smooth model, or 0 if not significant.
+
+    Attributes:
+        across: displacement of the streaks across their paths, px.
+        along: relative change of brightness along the streaks.
+    """
+
+    across: float = 0.0
+    along: float = 0.0
+
+
+def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> CommonMotion:
+    """Return the vibration common to the streaks that determine the motion, or zero without long streaks.
+
+    At each time, vibration displaces all streaks equally across their paths. Along the paths, vibration
+    changes the speed of the stars and thereby their intensity. The residuals of all stars are averaged in
+    bins of time. Only products of the residuals of different stars are summed, so that a neighbour of one
+    star has no effect.
+    """
+    if not len(left.star):
+        return CommonMotion()
+    time, star = left.time, left.star
+    stars = scene.stars[star]
+    velocity = paths(camera.pinhole, scene.motion, np.repeat(stars, LINES, axis=0), time.reshape(-1)).velocity
+    tangent = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    light = scene.light[star, None]
+    place = np.clip(((time + 0.5) * _BINS).astype(np.int64), 0, _BINS - 1).reshape(-1)
+    within = (np.abs(time) < 0.5).reshape(-1)
+    owner = np.repeat(star, LINES)
+    found = []
+    for image, way in ((left.images[:, 1], normal), (left.images[:, 0], tangent)):
+        score = (light * np.sum(left.weight * left.residual * image, axis=2)).reshape(-1)
+        information = (light**2 * np.sum(left.weight * image * image, axis=2)).reshape(-1)
+        cell = (owner * _BINS + place)[within]
+        found.append(_common_rms(cell, score[within, None] * way[within], information[within]))
+    return CommonMotion(*found)
+
+
+def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> float:
+    """Return the rms displacement common to all stars, or 0 if it is not significant.
+
+    The gradients `score` (m, 2) and `information` (m,) of m lines of pixels are summed over each star and
+    time bin, whose combined indices are `cell` (m,).
+    """
+    size = (int(cell.max()) // _BINS + 1) * _BINS if len(cell) else 0
+    if size < 2 * _BINS:
+        return 0.0
+    own = np.stack([np.bincount(cell, score[:, axis], size) for axis in (0, 1)], axis=-1)
+    own = own.reshape(-1, _BINS, 2)
+    known = np.bincount(cell, information, size).reshape(-1, _BINS)
+    # The weight of a star is limited by the star's own scatter, which includes model errors.
+    scatter = np.sum(own**2, axis=(1, 2)) / np.maximum(known.sum(axis=1), 1e-30)
+    trust = 1.0 / np.maximum(scatter, 1.0)
+    own, known = own * trust[:, None, None], known * trust[:, None]
+    square = np.sum(own**2, axis=2)
+    common = float(np.sum(np.sum(own, axis=0) ** 2) - square.sum())
+    chance = float(np.sqrt(2.0 * np.sum(square.sum(axis=0) ** 2 - np.sum(square**2, axis=0))))
+    weight = float(np.sum(known.sum(axis=0) ** 2 - np.sum(known**2, axis=0)))
+    if weight <= 0.0 or common <= _SIGNIFICANT * chance:
+        return 0.0
+    return float(np.sqrt(common / weight))
+
+
+# Number of time bins, and their range in exposures from mid-exposure, for the fit of a vibration.
+_FINE_BINS, _RANGE = 512, 0.56
+# Expected amplitude (px) of a vibration, and of the errors of position, rate and acceleration beside it.
+_USUAL, _LOOSE = 1.0, 10.0
+# Lowest frequency of a vibration, and step between trial frequencies, in cycles per exposure.
+_LOWEST, _GRID = 0.75, 0.2
+# Shortest fitted wavelength of a vibration along the streaks, in point-spread widths.
+_SHORTEST_WAVE = 6.0
+# Minimum decrease of chi-square by a sinusoid.
+_LEAST_GAIN = 60.0
+# Maximum number of sinusoids, and minimum difference of their frequencies, in cycles per exposure.
+_MOST_SINUSOIDS, _LEAST_APART = 2, 1.0
+# Maximum number of Gauss-Newton steps, and the displacement (px) by a step below which the fit is converged.
+_MOST_STEPS, _CONVERGED = 4, 0.02
+# Largest change of a frequency in one step, in cycles per exposure.
+_MOST_DETUNED = 0.3
+# Largest accepted amplitude of a vibration, px.
+_LARGEST = 2.5
+# Start and end of the exposure, in exposures from mid-exposure.
+_ENDS = np.array([-0.5, 0.5])
+
+
+def fit_vibration(
+    camera: FitProblem, fit: StreakFit, again: Callable[[StreakScene], StreakFit | None]
+) -> StreakFit | None:
+    """Return `fit` with the vibration that its residuals show, or None if they show no vibration.
+
+    The function `again` repeats the fit from a scene with a vibration, and returns None if it does not
+    succeed. An existing vibration of `fit` is improved. Returns None also for a vibration that is too large.
+    """
+    while True:
+        vibration = fit.scene.motion.vibration
+        for _ in range(_MOST_STEPS if vibration.exists else 0):
+            sums = _rotation_sums(camera, fit.scene, residuals_of_fit(camera, fit))
+            after, _ = _improved(sums, vibration)
+            moved = np.abs(after.rotation(sums.time) - vibration.rotation(sums.time)).max()
+            vibration = after
+            once_more = again(replace(fit.scene, motion=replace(fit.scene.motion, vibration=vibration)))
+            if once_more is None:
+                return None
+            fit = once_more
+            if moved * camera.pinhole.focal_length < _CONVERGED:
+                break
+        if np.any(vibration.amplitude * camera.pinhole.focal_length > _LARGEST):
+            return None
+        if len(vibration.frequency) == _MOST_SINUSOIDS:
+            return fit
+        sums = _rotation_sums(camera, fit.scene, residuals_of_fit(camera, fit))
+        frequency = _strongest_frequency(sums, vibration, _highest_frequency(camera, fit.scene))
+        if frequency is None:
+            return fit if vibration.exists else None
+        motion = replace(fit.scene.motion, vibration=vibration.with_frequency(frequency))
+        fit = replace(fit, scene=replace(fit.scene, motion=motion))
+
+
+def vibration_covariance(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> FloatArray:
+    """Return the covariance (3, 3), rad^2, that a fitted vibration adds to the rotation over the exposure.
+
+    The model of the streaks neglects that the point spread averages a vibration of short wavelength. The
+    corresponding error of the amplitudes is included.
+    """
+    vibration = scene.motion.vibration
+    if not vibration.exists or not len(left.star):
+        return np.zeros((3, 3))
+    added = _improved(_rotation_sums(camera, scene, left), vibration)[1]
+    wave = _median_length(camera, scene) / vibration.frequency
+    lost = 1.0 - np.exp(-0.5 * (2.0 * np.pi * scene.width / wave) ** 2)
+    for each, share in zip(vibration.sinusoids(), lost, strict=True):
+        change = share * (each.rotation(_ENDS) @ np.array([-1.0, 1.0]))
+        added = added + np.outer(change, change)
+    return added
+
+
+def _median_length(camera: FitProblem, scene: StreakScene) -> float:
+    """Return the median length (px) of the paths of the stars that determine the motion."""
+    return float(np.median(path_lengths(camera.pinhole, scene.motion.smooth, scene.stars[scene.trusted])))
+
+
+def _highest_frequency(camera: FitProblem, scene: StreakScene) -> float:
+    """Return the highest frequency that the streaks resolve, in cycles per exposure."""
+    return _median_length(camera, scene) / (_SHORTEST_WAVE * scene.width)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _RotationSums:
+    """Normal equations of the rotation in b time bins; the first of two index pairs selects four rotations.
+
+    Attributes:
+        time: middle of each bin (b,), in exposures from mid-exposure.
+        information: Fisher information (b, 4, 3, 4, 3) of rotation, rate and rotations at start and end.
+        score: gradient (b, 4, 3) of the log-likelihood.
+        focal_length: focal length, px.
+    """
+
+    time: FloatArray
+    information: FloatArray
+    score: FloatArray
+    focal_length: float
+
+    def normal_equations(self, functions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return information (3n, 3n) and gradient (3n,) of the coefficients of n `functions` (n, b, 4)."""
+        n = 3 * len(functions)
+        half = np.einsum("fbi,bikjl->fkbjl", functions, self.information, optimize=True)
+        whole = half.reshape(n, -1, 3).transpose(0, 2, 1).reshape(3 * n, -1) @ functions.reshape(n // 3, -1).T
+        information = whole.reshape(n, 3, n // 3).transpose(0, 2, 1).reshape(n, n)
+        return information, np.einsum("fbi,bik->fk", functions, self.score, optimize=True).reshape(n)
+
+
+def _rotation_sums(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> _RotationSums:
+    """Return the normal equations of a common rotation of the stars as a function of time.
+
+    The weight of a star is limited by the star's own scatter, which includes model errors.
+    """
+    time, star = left.time.reshape(-1), np.repeat(left.star, LINES)
+    path = paths(camera.pinhole, scene.motion, scene.stars[star], time)
+    speed = np.maximum(np.hypot(*path.velocity.T), _SLOWEST)
+    tangent = path.velocity / speed[:, None]
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    flow = image_flow(camera.pinhole, path.position)
+    across, along = (np.einsum("li,lij->lj", way, flow) for way in (normal, tangent))
+    used = np.count_nonzero(left.weight, axis=2).reshape(-1)
+    squares = np.sum(left.weight * left.residual * left.residual, axis=2).reshape(-1)
+    scatter = np.bincount(star, squares) / np.maximum(np.bincount(star, used), 1)
+    trust = 1.0 / np.maximum(scatter, 1.0)[star]
+    images = left.images[:, [1, 0, 3, 4]]
+    light = scene.light[star]
+    weighted = (images * left.weight[:, None]).transpose(0, 2, 1, 3)
+    gram = (weighted @ images.transpose(0, 2, 3, 1)).reshape(-1, 4, 4)
+    gram = gram * (trust * light**2)[:, None, None]
+    score = (weighted @ left.residual[..., None]).reshape(-1, 4) * (trust * light)[:, None]
+    design = np.stack([across, -along / speed[:, None], -along, along], axis=1)
+    place = np.clip(((time / _RANGE + 1.0) * 0.5 * _FINE_BINS).astype(np.int64), 0, _FINE_BINS - 1)
+    order = np.argsort(place, kind="stable")
+    first = np.searchsorted(place[order], np.arange(_FINE_BINS))
+    of_line = np.einsum("lia,lij,ljb->liajb", design, gram, design, optimize=True)
+    return _RotationSums(
+        _RANGE * (2.0 * (np.arange(_FINE_BINS) + 0.5) / _FINE_BINS - 1.0),
+        _sums_from(of_line[order], first),
+        _sums_from((design * score[..., None])[order], first),
+        camera.pinhole.focal_length,
+    )
+
+
+# Lower limit (px per exposure) of a star's speed in denominators.
+_SLOWEST = 1e-3
+
+
+def _sums_from(values: FloatArray, first: IntArray) -> FloatArray:
+    """Return the sums of consecutive rows of `values`, each from an index in `first` to the next index."""
+    total = np.zeros((len(values) + 1, *values.shape[1:]))
+    np.cumsum(values, axis=0, out=total[1:])
+    return np.asarray(np.diff(total[np.append(first, len(values))], axis=0))
+
+
+def _functions(values: FloatArray, slopes: FloatArray, at_ends: FloatArray) -> FloatArray:
+    """Return values and derivatives (n, b) of n functions in b time bins, and their values at both ends."""
+    ends = np.broadcast_to(at_ends[:, None], (*values.shape, 2))
+    return np.concatenate([values[..., None], slopes[..., None], ends], axis=2)
+
+
+def _powers(time: FloatArray) -> FloatArray:
+    """Return the functions (3, b, 4) of errors of position, rate and acceleration."""
+    one = np.ones_like(time)
+    values, slopes = np.stack([one, time, time**2]), np.stack([0.0 * one, one, 2.0 * time])
+    return _functions(values, slopes, np.stack([_ENDS**0, _ENDS, _ENDS**2]))
+
+
+def _waves(frequency: FloatArray, time: FloatArray) -> FloatArray:
+    """Return the functions (2k, b, 4): k sines, then k cosines minus 1, of the frequencies (k,)."""
+    w = 2.0 * np.pi * frequency[:, None]
+    sine, cosine = np.sin(w * time), np.cos(w * time)
+    at_ends = np.concatenate([np.sin(w * _ENDS), np.cos(w * _ENDS) - 1.0])
+    return _functions(np.concatenate([sine, cosine - 1.0]), np.concatenate([w * cosine, -w * sine]), at_ends)
+
+
+def _detuned_waves(frequency: FloatArray, time: FloatArray) -> FloatArray:
+    """Return the derivatives (2k, b, 4) of `_waves` with respect to the frequency."""
+    w, t = 2.0 * np.pi * frequency[:, None], 2.0 * np.pi * time
+    ends = 2.0 * np.pi * _ENDS
+    sine, cosine = np.sin(w * time), np.cos(w * time)
+    slopes = [cosine - w * time * sine, -(sine + w * time * cosine)]
+    at_ends = np.concatenate([ends * np.cos(w * _ENDS), -ends * np.sin(w * _ENDS)])
+    values = np.concatenate([t * cosine, -t * sine])
+    return _functions(values, 2.0 * np.pi * np.concatenate(slopes), at_ends)
+
+
+def _precisions(focal_length: float, sinusoids: int) -> FloatArray:
+    """Return the inverse prior variances, 1/rad^2, of the coefficients of powers and sinusoids."""
+    return np.repeat([(focal_length / _LOOSE) ** 2, (focal_length / _USUAL) ** 2], [9, 6 * sinusoids])
+
+
+def _strongest_frequency(sums: _RotationSums, known: Vibration, highest: float) -> float | None:
+    """Return the frequency of the sinusoid that decreases chi-square most, or None if none is significant."""
+    grid = np.arange(_LOWEST, highest, _GRID)
+    grid = grid[(np.abs(grid[:, None] - known.frequency) >= _LEAST_APART).all(axis=1)]
+    if not len(grid):
+        return None
+    base = np.concatenate([_powers(sums.time), _waves(known.frequency, sums.time)])
+    waves = _waves(grid, sums.time).reshape(2, len(grid), -1, 4)
+    prior = np.diag(_precisions(sums.focal_length, len(known.frequency) + 1))
+    n = 3 * len(base)
+    information, score = sums.normal_equations(base)
+    before = score @ np.linalg.solve(information + prior[:n, :n], score)
+    gain = np.empty(len(grid))
+    for index in range(len(grid)):
+        information, score = sums.normal_equations(np.concatenate([base, waves[:, index]]))
+        gain[index] = score @ np.linalg.solve(information + prior, score) - before
+    best = int(np.argmax(gain))
+    return float(grid[best]) if gain[best] > _LEAST_GAIN else None
+
+
+def _improved(sums: _RotationSums, vibration: Vibration) -> tuple[Vibration, FloatArray]:
+    """Return the vibration after a Gauss-Newton step, and the covariance (3, 3), rad^2, that it adds.
+
+    The added covariance is that of the rotation over the exposure. Errors of position, rate and acceleration
+    common to all stars are estimated together with the vibration.
+    """
+    k, time = len(vibration.frequency), sums.time
+    functions = [
+        _powers(time),
+        _waves(vibration.frequency, time),
+        _detuned_waves(vibration.frequency, time),
+    ]
+    information, score = sums.normal_equations(np.concatenate(functions))
+    n = 9 + 6 * k
+    # The last k parameters are the frequencies; their functions have the known amplitudes.
+    chosen = np.zeros((len(score), n + k))
+    chosen[:n, :n] = np.eye(n)
+    amplitudes = np.stack([vibration.sine, vibration.cosine])
+    for index in range(k):
+        only = amplitudes * (np.arange(k) == index)[:, None]
+        chosen[n:, n + index] = only.reshape(-1)
+    prior = np.append(_precisions(sums.focal_length, k), np.full(k, _MOST_DETUNED**-2))
+    mean = np.concatenate([np.zeros(9), amplitudes.reshape(-1), np.zeros(k)])
+    matrix = chosen.T @ information @ chosen + np.diag(prior)
+    step = np.linalg.solve(matrix, chosen.T @ score - prior * mean)
+    sine, cosine = amplitudes + step[9:n].reshape(2, k, 3)
+    detuned = np.clip(step[n:], -_MOST_DETUNED, _MOST_DETUNED)
+    # The change of the rotation over the exposure by each parameter.
+    over = np.concatenate(functions)[:, 0, 2:] @ np.array([-1.0, 1.0])
+    rotation = np.kron(over, np.eye(3)) @ chosen
+    total = rotation @ np.linalg.solve(matrix, rotation.T)
+    without = np.linalg.inv(matrix[:9, :9])[3:6, 3:6]
+    size, axes = np.linalg.eigh(total - without)
+    added = axes * np.maximum(size, 0.0) @ axes.T
+    return Vibration(vibration.frequency + detuned, sine, cosine), np.asarray(added)
