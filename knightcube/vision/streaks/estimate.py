@@ -123,6 +123,8 @@ _ENOUGH = 200.0
 # Weight of the flux in regions longer than the guessed streak, when guesses are compared.
 # The weight of overlong regions is below 1, because a long region may be a blend of two streaks.
 _CONTRADICTION = 0.6
+# Median chi-square per degree of freedom above which a preliminary fit is searched for a vibration.
+_SHAKEN = 2.5
 # Last step of the fit (standard deviations) below which a preliminary fit counts as converged.
 _CALM = 2.0
 # Fraction of streak ends that even a wrong rotation matches: one of the two ends of each streak.
@@ -273,19 +275,28 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
+    # The variable `ends` is the smaller of the fractions of confirmed ends and of unbroken streaks.
+    correct = true_ends(camera, done.scene)
+    judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
+    ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
+    if ends > _IN_PLACE and misfit(done.evaluation) > _SHAKEN:
+        done = _vibrating(camera, done) or done
     # With a wrong rotation angle, the model has large residuals at one end of each streak.
     light = done.scene.light**2 / np.maximum(done.solution.joint[:, _LIGHT, _LIGHT], 1e-30)
     residual = done.evaluation.chi2 - done.evaluation.pixels
     good = residual < _MOST_RESIDUAL * light + done.evaluation.pixels
     calm = 1.0 if done.last_step < _CALM else 0.3
     evidence, share = calm * float(np.sum(np.minimum(light, _ENOUGH**2)[good])), float(np.mean(good))
-    # The variable `ends` is the smaller of the fractions of confirmed ends and of unbroken streaks.
-    correct = true_ends(camera, done.scene)
-    judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
-    ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
     explained = evidence * (1.0 - _CONTRADICTION * guess.contradicted) * max(ends - _ENDS_BY_CHANCE, 0.02)
     convincing = explained > _EVIDENT and share > _EXPLAINED and ends > _IN_PLACE and count >= _MANY
     return explained, convincing, done
+
+
+def _vibrating(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
+    """Return a preliminary fit with the vibration that its residuals show, or None without a vibration."""
+    return fit_vibration(
+        camera, fit, lambda scene: iterate(camera, scene, camera.free, FIRST, camera.windows(scene))
+    )
 
 
 def still_fit(camera: FitProblem, regions: BrightRegions) -> StreakFit | None:
@@ -783,22 +794,14 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
     If the joint fit does not succeed, the motion has the verdict REJECTED. A rejected motion is fitted again
     with the vibration that the residuals show.
     """
-    last, faint = final_fit(camera, first)
-    found = _candidate(camera, seen, first, last, faint)
-    if found.possible:
+    last, found = _candidate(camera, seen, first)
+    if found.possible or first.scene.motion.vibration.exists:
         return found
     start = first if last is None else _bright_stars(camera, last, len(first.scene.light))
-    begun = replace(camera, growing=bool(start.free[3]))
-    vibrating = fit_vibration(
-        begun, start, lambda scene: iterate(begun, scene, begun.free, FIRST, begun.windows(scene))
-    )
+    vibrating = _vibrating(replace(camera, growing=bool(start.free[3])), start)
     if vibrating is None:
         return found
-    last, faint = final_fit(camera, vibrating)
-    if last is not None:
-        fitted = last
-        last = fit_vibration(camera, last, lambda scene: refit(camera, replace(fitted, scene=scene)))
-    shaken = _candidate(camera, seen, vibrating, last, faint)
+    shaken = _candidate(camera, seen, vibrating)[1]
     return shaken if shaken.possible else found
 
 
@@ -810,12 +813,16 @@ def _bright_stars(camera: FitProblem, fit: StreakFit, most: int) -> StreakFit:
 
 
 def _candidate(
-    camera: FitProblem, seen: MotionResult, first: StreakFit, last: StreakFit | None, faint: FaintStars
-) -> _Candidate:
-    """Return the motion of the joint fit `last`, which started from the preliminary fit `first`."""
+    camera: FitProblem, seen: MotionResult, first: StreakFit
+) -> tuple[StreakFit | None, _Candidate]:
+    """Return the joint fit that starts from the preliminary fit `first`, or None, and its motion."""
+    last, faint = final_fit(camera, first)
+    if last is not None and last.scene.motion.vibration.exists:
+        whole = last
+        last = fit_vibration(camera, whole, lambda scene: refit(camera, replace(whole, scene=scene)))
     middles, excess = np.empty((0, 2)), np.empty(0)
     if last is None:
-        return _Candidate(seen, first.scene.motion.rotation, StreakVerdict.REJECTED, middles, excess)
+        return None, _Candidate(seen, first.scene.motion.rotation, StreakVerdict.REJECTED, middles, excess)
     scene, motion = last.scene, last.scene.motion
     verdict = check_streaks(camera, scene, faint)
     bounds = exposure_bounds(camera.pinhole, motion, camera.shutter, faint.stars)
@@ -837,4 +844,4 @@ def _candidate(
         time = exposure_bounds(camera.pinhole, motion, camera.shutter, stars).mean(axis=1)
         middles = positions(camera.pinhole, motion, stars, time)
         excess = whole.chi2[bright] - whole.pixels[bright]
-    return _Candidate(result, motion.rotation, verdict, middles, excess)
+    return last, _Candidate(result, motion.rotation, verdict, middles, excess)

@@ -135,11 +135,6 @@ class Vibration:
         """The largest rotation (k,), rad, by each sinusoid, for a vibration about one axis."""
         return np.sqrt(np.sum(self.sine**2 + self.cosine**2, axis=1))
 
-    def sinusoids(self) -> list[Vibration]:
-        """Return one vibration for each sinusoid."""
-        each = (slice(index, index + 1) for index in range(len(self.frequency)))
-        return [Vibration(self.frequency[one], self.sine[one], self.cosine[one]) for one in each]
-
     def with_frequency(self, frequency: float) -> Vibration:
         """Return the vibration with one more sinusoid of zero amplitude."""
         nothing = np.zeros((1, 3))

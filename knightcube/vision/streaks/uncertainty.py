@@ -402,9 +402,9 @@ _CONJUGATE = 12
 # Largest number of stars that cannot be tested for agreement, and the resulting factor on the variance.
 _UNCHECKED = (2, 4.0)
 # Relative difference between fitted and configured point-spread variance that is neglected.
-_SAME_SPREAD = 0.05
+_SAME_SPREAD = 0.02
 # Ratio of the streak ends' error to the root of fitted minus configured point-spread variance.
-_END_SHARE = 0.6
+_END_SHARE = 1.0
 # Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
 _END_FLOOR = 0.12
 # Uncertainty of the streak ends, relative to the displacement that explains their residuals.

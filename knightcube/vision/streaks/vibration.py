@@ -159,6 +159,8 @@ _MOST_STEPS, _CONVERGED = 4, 0.02
 _MOST_DETUNED = 0.3
 # Largest accepted amplitude of a vibration, px.
 _LARGEST = 2.5
+# Error of the rotation over the exposure, relative to the amplitude that the point spread averages out.
+_LOST_SHARE = 2.0
 # Start and end of the exposure, in exposures from mid-exposure.
 _ENDS = np.array([-0.5, 0.5])
 
@@ -199,8 +201,8 @@ def fit_vibration(
 def vibration_covariance(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> FloatArray:
     """Return the covariance (3, 3), rad^2, that a fitted vibration adds to the rotation over the exposure.
 
-    The model of the streaks neglects that the point spread averages a vibration of short wavelength. The
-    corresponding error of the amplitudes is included.
+    The model of the streaks neglects that the point spread averages a vibration of short wavelength, which
+    also reduces the fitted amplitudes. The corresponding error of the streak ends is included.
     """
     vibration = scene.motion.vibration
     if not vibration.exists or not len(left.star):
@@ -208,10 +210,7 @@ def vibration_covariance(camera: FitProblem, scene: StreakScene, left: StreakRes
     added = _improved(_rotation_sums(camera, scene, left), vibration)[1]
     wave = _median_length(camera, scene) / vibration.frequency
     lost = 1.0 - np.exp(-0.5 * (2.0 * np.pi * scene.width / wave) ** 2)
-    for each, share in zip(vibration.sinusoids(), lost, strict=True):
-        change = share * (each.rotation(_ENDS) @ np.array([-1.0, 1.0]))
-        added = added + np.outer(change, change)
-    return added
+    return added + np.eye(3) * float(np.sum((_LOST_SHARE * lost * vibration.amplitude) ** 2))
 
 
 def _median_length(camera: FitProblem, scene: StreakScene) -> float:
@@ -386,4 +385,5 @@ def _improved(sums: _RotationSums, vibration: Vibration) -> tuple[Vibration, Flo
     without = np.linalg.inv(matrix[:9, :9])[3:6, 3:6]
     size, axes = np.linalg.eigh(total - without)
     added = axes * np.maximum(size, 0.0) @ axes.T
-    return Vibration(vibration.frequency + detuned, sine, cosine), np.asarray(added)
+    frequency = np.maximum(vibration.frequency + detuned, _LOWEST)
+    return Vibration(frequency, sine, cosine), np.asarray(added)

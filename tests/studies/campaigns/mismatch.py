@@ -1,8 +1,9 @@
 """Campaigns `mismatch` and `vibration`: cameras and motions unlike the model, by a renderer of its own.
 
 `mismatch` flies each of `imperfections.IMPERFECTIONS` at turns of 10 and 30 % of the field; `vibration` a
-body that shakes by 1 to 5 px at 5 to 50 Hz, with exposures of 0.2 and 1 s. Pointings are uniform over
-the sky, the axis is 0 to 90 deg off the boresight, and five stars must be usable (`scenes.usable`).
+body that shakes by up to 5 px at 5 to 50 Hz in one of `SHAPES`, with exposures of 0.2 and 1 s. Pointings
+are uniform over the sky, the axis is 0 to 90 deg off the boresight, and five stars must be usable
+(`scenes.usable`).
 
 An answer is judged by its error in its own standard deviations (the square root of its NEES) and as a part
 of the rate. More than 6 is confidently wrong: chance makes it so once in 13 million. The true rate of a body
@@ -12,7 +13,7 @@ that shakes is its mean rate, from attitude to attitude at the exposure's ends.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,10 @@ _SIGNIFICANCE = 8.0
 _MARGIN = 4.0
 _MOST_SKIES = 1000
 _VIBRATION_TURN = 10.0
+# Smallest and largest amplitudes of a vibration, px.
+_AMPLITUDES = ((0.2, 1.0), (1.0, 5.0))
+SHAPES = ("sine", "two sines", "decaying", "noise")
+"""How a vibration depends on time. A decaying vibration loses 86 % of its amplitude during the exposure."""
 
 
 def mismatch_cases(runs: int, seed: int) -> list[Case]:
@@ -64,18 +69,19 @@ def mismatch_cases(runs: int, seed: int) -> list[Case]:
 
 
 def vibration_cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` shaking motions, half of them of each exposure."""
+    """Return `runs` shaking motions: each exposure and amplitude in turn, half of them sinusoidal."""
     found = []
     for run in range(runs):
         draw = np.random.default_rng((seed, run, 0))
-        exposure = EXPOSURES[run % len(EXPOSURES)]
+        exposure, (least, most) = EXPOSURES[run % 2], _AMPLITUDES[run // 2 % 2]
         parameters = {
-            "row": f"{exposure:g} s",
+            "row": f"{exposure:g} s, {least:g} to {most:g} px",
             "percent": _VIBRATION_TURN,
             "exposure": exposure,
             "theta": float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi))),
             "frequency": float(draw.uniform(5.0, 50.0)),
-            "amplitude": float(draw.uniform(1.0, 5.0)),
+            "amplitude": float(draw.uniform(least, most)),
+            "shape": SHAPES[int(draw.integers(len(SHAPES)))] if run // 4 % 2 else SHAPES[0],
         }
         found.append(Case(str(run), (seed, run, 1), parameters))
     return found
@@ -94,13 +100,29 @@ def attitudes_of(parameters: dict[str, Any], camera: StarCameraModel, rng: np.ra
         * np.array([np.cos(way), np.sin(way), 0.0])
     )
     cycles = parameters.get("frequency", 0.0) * parameters["exposure"]
+    wave = _wave(parameters.get("shape", SHAPES[0]), cycles, float(phase), rng)
 
     def at(times: FloatArray) -> FloatArray:
         steady = from_rotation_vector(times[:, None] * turn)
-        shaking = from_rotation_vector(np.sin(2.0 * np.pi * cycles * times + phase)[:, None] * shake)
+        shaking = from_rotation_vector(wave(times)[:, None] * shake)
         return multiply(shaking, multiply(steady, middle))
 
     return at
+
+
+def _wave(
+    shape: str, cycles: float, phase: float, rng: np.random.Generator
+) -> Callable[[FloatArray], FloatArray]:
+    """Return a vibration of unit amplitude as a function of time in exposures, (m,) to (m,)."""
+    turn = 2.0 * np.pi * cycles
+    if shape == "two sines":
+        return lambda t: 0.6 * np.sin(turn * t + phase) + 0.4 * np.sin(1.7 * turn * t + 2.0 * phase)
+    if shape == "decaying":
+        return lambda t: np.exp(-2.0 * (t + 0.5)) * np.sin(turn * t + phase)
+    if shape == "noise":
+        share, phases = np.linspace(0.5, 1.5, 6)[:, None], rng.uniform(0.0, 2.0 * np.pi, (6, 1))
+        return lambda t: np.asarray(np.sum(np.sin(turn * share * t + phases), axis=0)) / np.sqrt(6.0)
+    return lambda t: np.sin(turn * t + phase)
 
 
 def expose(case: Case, imperfection: Imperfection) -> tuple[Image, FloatArray]:
