@@ -92,7 +92,7 @@ def test_a_motion_with_a_vibration_has_an_exact_time_reversal() -> None:
 @pytest.mark.parametrize(("cycles", "amplitude"), [(1.6, 0.8), (4.3, 0.6)])
 def test_a_resolved_vibration_leaves_no_error_in_the_rate(cycles: float, amplitude: float) -> None:
     """Without the vibration in the model, the first rate is wrong by up to 1 % and is refused."""
-    frame = _frame(cycles, amplitude, 1)
+    frame = _frame(cycles, amplitude, 0)
     found = frame.motion()
     assert found.status is StreakStatus.RATE
     assert _sigmas(frame, found) < 4.0
