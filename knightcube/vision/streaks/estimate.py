@@ -818,8 +818,8 @@ def _candidate(
     """Return the joint fit that starts from the preliminary fit `first`, or None, and its motion."""
     last, faint = final_fit(camera, first)
     if last is not None and last.scene.motion.vibration.exists:
-        whole = last
-        last = fit_vibration(camera, whole, lambda scene: refit(camera, replace(whole, scene=scene)))
+        done = last
+        last = fit_vibration(camera, done, lambda scene: refit(camera, replace(done, scene=scene)))
     middles, excess = np.empty((0, 2)), np.empty(0)
     if last is None:
         return None, _Candidate(seen, first.scene.motion.rotation, StreakVerdict.REJECTED, middles, excess)

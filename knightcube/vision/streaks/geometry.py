@@ -133,7 +133,7 @@ class Vibration:
     @property
     def amplitude(self) -> FloatArray:
         """The largest rotation (k,), rad, by each sinusoid, for a vibration about one axis."""
-        return np.sqrt(np.sum(self.sine**2 + self.cosine**2, axis=1))
+        return np.asarray(np.sqrt(np.sum(self.sine**2 + self.cosine**2, axis=1)))
 
     def with_frequency(self, frequency: float) -> Vibration:
         """Return the vibration with one more sinusoid of zero amplitude."""

@@ -21,7 +21,7 @@ from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
 from knightcube.vision.streaks.geometry import StreakScene, Vibration, image_flow, path_lengths, paths
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
 from knightcube.vision.streaks.normal_equations import model_images
-from knightcube.vision.streaks.streak_model import LINES
+from knightcube.vision.streaks.path_pixels import LINES
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0

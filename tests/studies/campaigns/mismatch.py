@@ -100,17 +100,17 @@ def attitudes_of(parameters: dict[str, Any], camera: StarCameraModel, rng: np.ra
         * np.array([np.cos(way), np.sin(way), 0.0])
     )
     cycles = parameters.get("frequency", 0.0) * parameters["exposure"]
-    wave = _wave(parameters.get("shape", SHAPES[0]), cycles, float(phase), rng)
+    wave_of_time = wave(parameters.get("shape", SHAPES[0]), cycles, float(phase), rng)
 
     def at(times: FloatArray) -> FloatArray:
         steady = from_rotation_vector(times[:, None] * turn)
-        shaking = from_rotation_vector(wave(times)[:, None] * shake)
+        shaking = from_rotation_vector(wave_of_time(times)[:, None] * shake)
         return multiply(shaking, multiply(steady, middle))
 
     return at
 
 
-def _wave(
+def wave(
     shape: str, cycles: float, phase: float, rng: np.random.Generator
 ) -> Callable[[FloatArray], FloatArray]:
     """Return a vibration of unit amplitude as a function of time in exposures, (m,) to (m,)."""

@@ -71,6 +71,15 @@ def test_cases_cover_every_imperfection_at_both_turns_and_do_not_depend_on_how_m
     assert mismatch.vibration_cases(2, _SEED) == mismatch.vibration_cases(4, _SEED)[:2]
 
 
+def test_vibrations_have_every_exposure_amplitude_and_shape() -> None:
+    shaking = [case.parameters for case in mismatch.vibration_cases(64, _SEED)]
+    assert len({one["row"] for one in shaking}) == 4
+    assert {one["shape"] for one in shaking} == set(mismatch.SHAPES)
+    for shape in mismatch.SHAPES:
+        wave = mismatch.wave(shape, 10.0, 0.3, np.random.default_rng(1))(np.linspace(-0.5, 0.5, 1001))
+        assert 0.2 < float(np.sqrt(np.mean(wave**2))) < 0.8
+
+
 def _case(row: str, run: int) -> Case:
     return next(c for c in mismatch.mismatch_cases(run + 1, _SEED) if c.key == f"{row} 10 {run}")
 

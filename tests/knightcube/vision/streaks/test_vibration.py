@@ -95,6 +95,7 @@ def test_a_resolved_vibration_leaves_no_error_in_the_rate(cycles: float, amplitu
     frame = _frame(cycles, amplitude, 0)
     found = frame.motion()
     assert found.status is StreakStatus.RATE
+    assert found.rate is not None
     assert _sigmas(frame, found) < 4.0
     assert np.linalg.norm(found.rate - frame.rate) < 2e-3 * np.linalg.norm(frame.rate)
 
