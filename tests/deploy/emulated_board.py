@@ -48,7 +48,7 @@ def serve(path: Path, world: Path, folder: Path) -> None:
     bus = I2cServer(server.hardware.wires.i2c(), bus_socket)
     try:
         for name, line in server.lines.items():
-            Path(name).symlink_to(line)
+            Path(name).resolve().symlink_to(line)  # a link may stand at the name where only root can write
         server.attend(bus.fileno(), partial(bus.serve, 0.0))
         facts: dict[str, Any] = {
             "socket": str(server.socket_path),

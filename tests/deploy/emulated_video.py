@@ -1,15 +1,16 @@
-"""Checks and starts a flight with Video for Linux cameras whose frames are those of emulated cameras.
+"""Runs commands of the flight software with Video for Linux cameras whose frames are rendered.
 
-`python -m tests.deploy.emulated_video CONFIG SOCKET WORDS...` runs `knightcube check CONFIG --json`, and then
-`knightcube WORDS...`. The cameras of CONFIG are those of the device server at SOCKET, numbered in the order
-of CONFIG. Only the kernel's side of /dev/videoN is replaced, which answers the ioctls of the driver; the
-memory maps of the driver are real.
+`python -m tests.deploy.emulated_video CONFIG SOCKET WORDS... [-- WORDS...]` runs `knightcube WORDS...`, and
+after a success the next command. The cameras of CONFIG are those of the device server at SOCKET, numbered in
+the order of CONFIG. Only the kernel's side of /dev/videoN is replaced, which answers the ioctls of the
+driver; the memory maps of the driver are real.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +41,12 @@ class ServedVideo(IoctlCamera):
     """
 
     def __init__(self, camera: Camera | WideCamera, source: RemoteFrameSource, clock: SystemClock) -> None:
-        """Appear at the device file of `camera`, in an existing folder."""
+        """Appear at the device file of `camera`, which is named `camera` in a folder of its own."""
         device = camera.device
         assert isinstance(device, V4l2Device)
-        super().__init__(Path(device.path).parent, clock.now_ns)
+        folder = Path(device.path).parent
+        folder.resolve().mkdir(exist_ok=True)  # the folder may be a link, where only root can write
+        super().__init__(folder, clock.now_ns)
         assert str(self.path) == device.path
         self.sizes = {device.pixel_format: (camera.columns, camera.rows)}
         self.knobs[v4l2.EXPOSURE_ABSOLUTE] = Knob(1, 50_000, 157)
@@ -93,6 +96,15 @@ def plug(path: Path, socket: Path) -> None:
     vars(v4l2)["ioctl"] = ioctl  # the kernel's side
 
 
+def run(words: Sequence[str]) -> int:
+    """Run commands that are separated by "--", and return the exit status of the last one."""
+    first, rest = list(words), []
+    if "--" in words:
+        at = list(words).index("--")
+        first, rest = first[:at], first[at + 1 :]
+    return main(first) or (run(rest) if rest else 0)
+
+
 if __name__ == "__main__":
     plug(Path(sys.argv[1]), Path(sys.argv[2]))
-    raise SystemExit(main(["check", sys.argv[1], "--json"]) or main(sys.argv[3:]))
+    raise SystemExit(run(sys.argv[3:]))

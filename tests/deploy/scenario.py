@@ -198,4 +198,9 @@ def void(_: object) -> None:
 if __name__ == "__main__":
     place = Path(sys.argv[1])
     facts_seen = play(Path(sys.argv[2]))
+    systemctl("stop", "knightcube-devices.service")
+    from tests.deploy.board_flight import WORLDS
+    from tests.deploy.board_scenario import fly_board
+
+    facts_seen["boards"] = {name: fly_board(name) for name in WORLDS}
     (place / "seen.json").write_text(json.dumps(facts_seen, indent=1), encoding="utf-8")

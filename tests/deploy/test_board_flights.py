@@ -27,12 +27,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
-from flight.link.telemetry.packets import PacketArray
-from ground.telemetry import Run, read_run
+from ground.telemetry import Run
 from hal.buses import smbus_byte
 from sim_hal.serving.device_link import RemoteI2cBus, open_bus
+from tests.deploy.board_flight import (
+    WORLDS,
+    board_text,
+    everything_arrived,
+    frames_with_rate,
+    has_arrived,
+    newest,
+)
 from tests.deploy.scripts import DEPLOY, ROOT, dropin
 
 pytestmark = [
@@ -45,8 +51,6 @@ pytestmark = [
 ]
 PATIENCE_S = 120.0
 """Longest time (s) until every device has been read, on a busy machine."""
-WORLDS = {"board_testbed": "step_demo", "board_orbit": "orbit"}
-"""Configurations with the worlds in which the devices of the boards are emulated."""
 DEVICES = {
     "board_testbed": {"inertial_unit", "coils", "power_monitor", "camera", "commands.socket"},
     "board_orbit": {
@@ -78,25 +82,6 @@ class Flown:
     currents: list[float]
     statuses: list[int]
     said: str
-
-
-def board_text(name: str, folder: Path) -> str:
-    """Return a board's configuration for devices in `folder`, a busy machine and a short flight.
-
-    The inhibit after separation is shortened. The testbed turns to another angle every 10 s, so that the
-    frames have streaks.
-    """
-    text = (ROOT / "config" / f"{name}.yaml").read_text(encoding="utf-8")
-    text = re.sub(r"/dev/knightcube-(camera|wide-\d)", rf"{folder}/knightcube-\1/camera", text)
-    text = re.sub(r"/dev/knightcube-(imu|gps|i2c)", rf"{folder}/knightcube-\1", text)
-    tree = yaml.safe_load(text.replace("/run/knightcube/", f"{folder}/"))
-    tree["camera"] |= {"vision_slow_after": 10.0, "max_age": 60.0}
-    tree["executive"] = {"planner_timeout": 60.0, "vision_timeout": 60.0}
-    if "separation" in tree:
-        tree["separation"] = {"inhibit": 0.5}
-    if "steps" in tree:
-        tree["steps"] = [{"at": 10.0 * k, "q2": 0.3 * (-1) ** k} for k in range(60)]
-    return yaml.safe_dump(tree, sort_keys=False)
 
 
 def unit_words(config: Path, runs: Path) -> list[str]:
@@ -135,31 +120,10 @@ def emulated(config: Path, name: str, folder: Path) -> Iterator[dict[str, Any]]:
             process.terminate()
 
 
-def newest(archive: Path) -> Run:
-    """Return the packets of the run in an archive."""
-    (folder,) = (path for path in archive.iterdir() if path.is_dir())
-    return read_run(folder)
-
-
-def everything_arrived(run: Run, orbit: bool) -> bool:
-    """Return whether readings of every device have arrived, with a rate and an attitude from a frame."""
-    of_body = ("fix", "directions") if orbit else ("plan",)
-    every = all(len(run[name]) for name in ("imu", "housekeeping", *of_body))
-    return every and len(frames_with_rate(run)) > 0 and b"solved" in run["stars"]["status"]
-
-
-def frames_with_rate(run: Run) -> PacketArray:
-    """Return the packets of the frames whose streaks gave a rate, of which the sign may be unknown."""
-    frames = run["streak"]
-    found: PacketArray = frames[np.isfinite(frames["rate"]).all(axis=1)]
-    return found
-
-
 def fly(name: str, folder: Path) -> Flown:
     """Start a board's configuration as the unit does, wait for its devices, and end the flight."""
     devices, runs, config = folder / "d", folder / "runs", folder / "flight.yaml"
-    for video in ("camera", "wide-1", "wide-2"):
-        (devices / f"knightcube-{video}").mkdir(parents=True)
+    devices.mkdir()
     config.write_text(board_text(name, devices), encoding="utf-8")
     coils_off = [shutil.copy(DEPLOY / "coils-off", folder)]
     shutil.copy(str(smbus_byte.__file__), folder)
@@ -172,10 +136,10 @@ def fly(name: str, folder: Path) -> Flown:
         bus = open_bus(facts["socket"])
         stack.callback(bus.close)
         before = subprocess.run(coils_off, env=environment, capture_output=True, check=False)
-        words = ["tests.deploy.emulated_video", str(config), facts["socket"], *unit_words(config, runs)]
+        words = ["tests.deploy.emulated_video", str(config), facts["socket"], "check", str(config), "--json"]
         flight = stack.enter_context(
             subprocess.Popen(
-                [sys.executable, "-m", *words],
+                [sys.executable, "-m", *words, "--", *unit_words(config, runs)],
                 cwd=ROOT,
                 env=environment,
                 stdout=subprocess.PIPE,
@@ -205,7 +169,7 @@ def watch(
         if select.select([notifications], [], [], 0.5)[0]:
             ready |= "READY=1" in notifications.recv(4096).decode().split("\n")
         driven |= any(bus.call("currents"))
-        if ready and driven and everything_arrived(newest(runs), orbit):
+        if ready and driven and has_arrived(runs, orbit):
             break
     return driven
 

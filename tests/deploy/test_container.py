@@ -10,7 +10,7 @@ import pytest
 from tests.deploy import container
 
 REASON = container.why_not()
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(700)]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(1200)]
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +81,14 @@ def test_a_polite_stop_is_a_success(seen: dict[str, Any]) -> None:
 
 def test_without_its_release_it_is_given_up_and_the_safe_state_tries_it_again(seen: dict[str, Any]) -> None:
     assert seen["broken"] == {"tried_again": True, "safe_state_ended": True}
+
+
+@pytest.mark.parametrize("name", ["board_testbed", "board_orbit"])
+def test_a_boards_configuration_flies_in_the_sandbox_with_frames_rates_and_every_device(
+    seen: dict[str, Any], name: str
+) -> None:
+    ended = {"active": "active", "driven": True, "arrived": True, "at_zero": True, "result": "success"}
+    assert seen["boards"][name] == ended
 
 
 def test_a_second_installation_changes_nothing(seen: dict[str, Any], folder: Path) -> None:
