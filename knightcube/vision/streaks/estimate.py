@@ -27,7 +27,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 from knightcube.vision.frame import saturation_count
-from knightcube.vision.streaks.faint_stars import FaintStars, find_faint, frame_angles, polar_grid
+from knightcube.vision.streaks.faint_stars import FaintStars, find_faint, frame_angles
 from knightcube.vision.streaks.first_guess import (
     SCANNED_STARS,
     Circles,
@@ -67,6 +67,7 @@ from knightcube.vision.streaks.joint_fit import (
     true_ends,
     unbroken,
 )
+from knightcube.vision.streaks.polar_grid import polar_grid
 from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
 from knightcube.vision.streaks.streak_result import (
     REASONS,

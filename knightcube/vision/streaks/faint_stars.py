@@ -16,239 +16,25 @@ box. The box length with the largest sum of squared significances is the length 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtr
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import less_boxes
 from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import CameraMotion, paths
-
-# Spacing (px) of neighbouring circles of the polar grid.
-_ACROSS = 1.8
-# Spacing (px) of the samples along a circle of the polar grid.
-_ALONG = 4.0
-# Number of circles processed at once, small enough for the samples to fit into the processor's cache.
-_CHUNK = 64
-# Smallest angle (rad) between a circle of the polar grid and the rotation axis.
-_NEAREST = 0.003
-# Spacing (px) of the points that trace the border of the detector.
-_BORDER_STEP = 8.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PolarGrid:
-    """A polar grid of c samples on each of r circles about the rotation axis.
-
-    Attributes:
-        frame: matrix (3, 3) whose rows are two unit vectors normal to the rotation axis, and the rotation
-            axis.
-        polar: angle between each circle and the rotation axis (r,), rad.
-        azimuth: azimuth about the rotation axis of each sample on a circle (c,), rad.
-        length: length of a streak, as a number of samples along a circle.
-        angle: rotation angle over the exposure, rad.
-        speed: image displacement per radian of azimuth on each circle (r,), px/rad.
-    """
-
-    frame: FloatArray
-    polar: FloatArray
-    azimuth: FloatArray
-    length: float
-    angle: float
-    speed: FloatArray
-
-    @property
-    def full(self) -> bool:
-        """Whether the circles of the polar grid are complete, with azimuths from 0 to 2 pi."""
-        return abs(float(self.azimuth[-1] - self.azimuth[0])) > 2.0 * np.pi - 0.05
-
-    @property
-    def off_centre(self) -> float:
-        """Offset (samples) of a running sum's centre from a sample: 0.5 for an even number of samples."""
-        return 0.0 if round(self.length) % 2 else 0.5
-
-    def pixels(self, pinhole: Pinhole, row: FloatArray, column: FloatArray) -> FloatArray:
-        """Return the pixel coordinates (k, 2) at fractional rows and columns (k,) of the polar grid."""
-        polar = self.polar[0] + row * (self.polar[1] - self.polar[0])
-        azimuth = self.azimuth[0] + column * (self.azimuth[1] - self.azimuth[0])
-        local = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
-        return pinhole.project((self.frame.T @ local).T)
-
-
-def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarGrid:
-    """Return a polar grid of the circles that cross the detector, thinned to one in `every` circles."""
-    angle = float(np.linalg.norm(motion.rotation))
-    axis = motion.rotation / angle
-    middle = np.array([0.0, 0.0, 1.0])
-    if axis @ middle < 0.0:
-        axis = -axis
-    first = middle - (middle @ axis) * axis
-    inside_field = float(np.arccos(np.clip(axis[2], -1.0, 1.0)))
-    if np.linalg.norm(first) < 1e-6:
-        first = np.array([1.0, 0.0, 0.0])
-    first = first / np.linalg.norm(first)
-    frame = np.stack([first, np.cross(axis, first), axis])
-    half = pinhole.half_diagonal
-    spacing = every * _ACROSS / pinhole.focal_length
-    polar = np.arange(max(inside_field - half, _NEAREST), inside_field + half, spacing)
-    fastest = float(np.max(np.sin(polar))) * pinhole.focal_length
-    step = min(_ALONG / fastest, angle / 6.0)
-    widest = (
-        np.pi if inside_field <= half else float(np.arcsin(min(np.sin(half) / np.sin(inside_field), 1.0)))
-    )
-    widest = min(widest + 0.5 * angle, np.pi)
-    azimuth = np.arange(-widest, widest, step)
-    return PolarGrid(frame, polar, azimuth, angle / step, angle, np.sin(polar) * pinhole.focal_length)
-
-
-def sampled(
-    sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, room: int, unit: float
-) -> Iterator[tuple[slice, slice, Float32Array, BoolArray]]:
-    """Yield the polar grid by groups of circles: rows, columns, samples, and a mask of usable samples.
-
-    The samples are values of the 3 x 3 pixel sums `sums`, which must be zero along the border of the frame.
-    The samples are rounded to integer multiples of `unit`, so that sums of them are fast and exact. The mask
-    excludes samples beside the detector. If the circles are complete, a margin of `room` samples is included
-    on both sides of the detector.
-    """
-    # A direction divided by the sine of its polar angle is the sum of an azimuth term and a polar term.
-    turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
-    rising = grid.frame[2][:, None] / np.tan(grid.polar)
-    around, aloft = turning.astype(np.float32), rising.astype(np.float32)
-    last = np.int32(pinhole.columns - 1), np.int32(pinhole.rows - 1)
-    flat = sums.reshape(-1)
-    for part, crossing in _groups(pinhole, grid, room):
-        depth = around[2, crossing] + aloft[2, part, None]
-        np.maximum(depth, np.float32(1e-3), out=depth)
-        np.divide(np.float32(pinhole.focal_length), depth, out=depth)
-        places = []
-        for axis, limit in ((0, last[0]), (1, last[1])):
-            place = around[axis, crossing] + aloft[axis, part, None]
-            place *= depth
-            # With the added 0.5, truncation to an integer rounds to the nearest integer.
-            place += np.float32(pinhole.centre[axis] + 0.5)
-            np.maximum(place, np.float32(0.0), out=place)
-            np.minimum(place, np.float32(limit), out=place)
-            places.append(place.astype(np.int32))
-        column, row = places
-        inside = (column > 0) & (column < last[0]) & (row > 0) & (row < last[1])
-        index = row * np.int32(pinhole.columns)
-        index += column
-        samples = flat.take(index)
-        samples *= np.float32(1.0 / unit)
-        yield part, crossing, np.rint(samples, out=samples), inside
-
-
-def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slice, slice]]:
-    """Yield groups of circles with the range of azimuths in which they cross the detector."""
-    x, y = pinhole.columns - 1.0, pinhole.rows - 1.0
-    sides = np.arange(0.0, x, _BORDER_STEP), np.arange(0.0, y, _BORDER_STEP)
-    along = np.concatenate([sides[0], np.full_like(sides[1], x), x - sides[0], np.zeros_like(sides[1])])
-    down = np.concatenate([np.zeros_like(sides[0]), sides[1], np.full_like(sides[0], y), y - sides[1]])
-    local = pinhole.unit_vectors(np.stack([along, down], axis=-1)) @ grid.frame.T
-    polar, azimuth = np.arccos(np.clip(local[:, 2], -1.0, 1.0)), np.arctan2(local[:, 1], local[:, 0])
-    column = (azimuth - grid.azimuth[0]) / (grid.azimuth[1] - grid.azimuth[0])
-    count, margin = len(grid.azimuth), _BORDER_STEP / pinhole.focal_length
-    for start in range(0, len(grid.polar), _CHUNK):
-        part = slice(start, min(start + _CHUNK, len(grid.polar)))
-        near = (polar > grid.polar[start] - margin) & (polar < grid.polar[part.stop - 1] + margin)
-        # The direction of azimuth pi points from the rotation axis away from the image centre.
-        behind = grid.pixels(pinhole, np.array([start]), np.zeros(1))
-        if grid.full and pinhole.contains(behind, margin=2.0)[0]:
-            yield part, slice(0, count)
-        elif near.any():
-            beside = margin / max(np.sin(grid.polar[start]), margin) / (grid.azimuth[1] - grid.azimuth[0])
-            low, high = column[near].min() - beside, column[near].max() + beside + 1.0
-            if grid.full and (low < room or high > count - room):
-                low, high = 0.0, count
-            yield part, slice(max(int(low), 0), min(int(np.ceil(high)), count))
-
-
-Int32Array = npt.NDArray[np.int32]
-
-# Side (px) of the square of pixels whose sum is one sample of the polar grid.
-_BOX = 3.0
-# Largest cumulative sum of samples that can be represented, in units of the rounding step.
-_HIGHEST = 2.0**30
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RunningSums:
-    """Running sums of the samples along the circles, over the length of a streak.
-
-    Attributes:
-        light: (r, c) counts.
-        count: number of samples on the detector in each running sum (r, c).
-        span: indices of the first and last column of each circle that lie on the detector (r, 2). The range
-            `span` is unlimited, from -inf to inf, if the samples of a circle on the detector are not
-            contiguous.
-        excess: noise of the running sums on each circle, relative to the noise for independent samples (r,).
-    """
-
-    light: Float32Array
-    count: Int32Array
-    span: FloatArray
-    excess: FloatArray
-
-
-def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: float) -> RunningSums:
-    """Return the running sums over one streak length, centred on each sample of the polar grid.
-
-    The pixel sums `sums` must be zero along the border of the frame, because samples outside the frame take
-    the border's value. The samples are rounded to multiples of `unit` counts.
-    """
-    width = max(round(grid.length), 1)
-    before, after = width // 2, width - width // 2
-    rows, columns = len(grid.polar), len(grid.azimuth)
-    # Elements off the detector are never written, so that no memory is allocated for them.
-    response, count = np.zeros((rows, columns), dtype=np.float32), np.zeros((rows, columns), dtype=np.int32)
-    span = np.tile([-np.inf, np.inf], (rows, 1))
-    unit = max(unit, float(sums.max()) * width / _HIGHEST)
-    for part, crossing, samples, inside in sampled(sums, pinhole, grid, width, unit):
-        wide = samples.shape[1]
-        # The samples and their mask are padded by one streak length on both sides.
-        padded = np.zeros((2, len(samples), wide + 2 * width + 1), dtype=np.int32)
-        middle = slice(width + 1, width + 1 + wide)
-        padded[0, :, middle] = samples
-        padded[1, :, middle] = inside
-        if grid.full and wide == columns:
-            padded[:, :, : width + 1] = padded[:, :, wide : wide + width + 1]
-            padded[:, :, middle.stop :] = padded[:, :, middle.start : middle.start + width]
-        total = np.cumsum(padded, axis=2, dtype=np.int32)
-        low, high = max(crossing.start - after + 1, 0), min(crossing.stop + before, columns)
-        first = low - crossing.start + width - before
-        last = first + high - low
-        held = total[:, :, first + width : last + width] - total[:, :, first:last]
-        np.multiply(held[0], np.float32(unit), out=response[part, low:high], casting="same_kind")
-        count[part, low:high] = held[1]
-        begin, end = inside.argmax(axis=1), wide - 1 - inside[:, ::-1].argmax(axis=1)
-        whole = inside.sum(axis=1) == end - begin + 1
-        # The centre of a running sum of an even number n of samples lies half a sample before the sample n/2.
-        edges = np.stack([begin - 0.5, end + 0.5], axis=1) + crossing.start + grid.off_centre
-        span[part] = np.where(whole[:, None], edges, span[part])
-    # On circles near the rotation axis, neighbouring samples share pixels, so that their noise is correlated.
-    spacing = grid.speed * (grid.azimuth[1] - grid.azimuth[0])
-    slow = np.flatnonzero(spacing < _BOX)
-    steps = np.arange(1, width)
-    common = np.maximum(1.0 - spacing[slow, None] * steps / _BOX, 0.0)
-    excess = np.ones(len(spacing))
-    excess[slow] = np.sqrt(1.0 + 2.0 * common @ (1.0 - steps / width))
-    return RunningSums(response, count, span, excess)
-
-
-def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Float32Array:
-    """Return the cumulative sums (r, c + 1) of all samples on a circle before each sample."""
-    out = np.zeros((len(grid.polar), len(grid.azimuth) + 1), dtype=np.float32)
-    for part, crossing, samples, _ in sampled(sums, pinhole, grid, 0, 1.0):
-        out[part, crossing.start + 1 : crossing.stop + 1] = np.cumsum(samples, axis=1, dtype=np.float64)
-        out[part, crossing.stop + 1 :] = out[part, crossing.stop, None]
-    return out
-
+from knightcube.vision.streaks.polar_grid import (
+    ACROSS,
+    PolarGrid,
+    RunningSums,
+    cumulative_sums,
+    polar_grid,
+    running_sums,
+)
 
 # Minimum fraction of a faint star's streak that must lie on the detector.
 _LEAST_SEEN = 0.35
@@ -335,20 +121,39 @@ def standing_peaks(
     """
     row, column = _local_maxima(significance, place)
     value, spans = significance[row, column].astype(np.float64), span[row]
+    kept = _unshaded(row, column, value, spans, grid.length, sigmas, ACROSS)
+    row, column = row[kept], column[kept]
+    return _refined(significance, row, column, 0), _refined(significance, row, column, 1)
+
+
+def _unshaded_numpy(
+    row: IntArray,
+    column: IntArray,
+    value: FloatArray,
+    spans: FloatArray,
+    length: float,
+    sigmas: float,
+    across: float,
+) -> BoolArray:
+    """Return which peaks (k,), strongest first, stronger peaks do not explain.
+
+    The arguments are grid indices and heights `value` of the peaks, the ranges `spans` (k, 2) of columns on
+    the detector, the streak length in samples, the least height, and the spacing of the circles, px.
+    """
     by_row = np.argsort(row, kind="stable")
     first = np.searchsorted(row[by_row], row - _FARTHEST + 1)
     count = np.searchsorted(row[by_row], row + _FARTHEST) - first
     stronger = np.repeat(np.arange(len(row)), count)
     weaker = by_row[np.arange(len(stronger)) + np.repeat(first - np.cumsum(count) + count, count)]
     # A crowded frame has hundreds of thousands of pairs of peaks, most of which are too far apart to overlap.
-    near = np.flatnonzero((stronger < weaker) & (np.abs(column[stronger] - column[weaker]) < grid.length))
+    near = np.flatnonzero((stronger < weaker) & (np.abs(column[stronger] - column[weaker]) < length))
     stronger, weaker = stronger[near], weaker[near]
     there = column.astype(np.float64)
-    share = overlap_of(there[stronger], there[weaker], spans[stronger], grid.length)
-    share /= np.maximum(overlap_of(there, there, spans, grid.length), _LEAST_SEEN)[stronger]
+    share = overlap_of(there[stronger], there[weaker], spans[stronger], length)
+    share /= np.maximum(overlap_of(there, there, spans, length), _LEAST_SEEN)[stronger]
     shading = np.flatnonzero(share > 0.0)
     stronger, weaker = stronger[shading], weaker[shading]
-    share = share[shading] * profile((row[stronger] - row[weaker]) * _ACROSS)
+    share = share[shading] * profile((row[stronger] - row[weaker]) * across)
     begin = np.searchsorted(stronger, np.arange(len(row) + 1))
     own = value.copy()
     kept = np.zeros(len(row), dtype=np.bool_)
@@ -358,21 +163,70 @@ def standing_peaks(
         kept[k] = True
         shaded = slice(begin[k], begin[k + 1])
         own[weaker[shaded]] -= own[k] * share[shaded]
-    row, column = row[kept], column[kept]
-    return _refined(significance, row, column, 0), _refined(significance, row, column, 1)
+    return kept
+
+
+@compiled_form_of(_unshaded_numpy)
+def _unshaded(
+    row: IntArray,
+    column: IntArray,
+    value: FloatArray,
+    spans: FloatArray,
+    length: float,
+    sigmas: float,
+    across: float,
+) -> BoolArray:
+    """See `_unshaded_numpy`."""
+    own, kept = value.copy(), np.zeros(len(row), dtype=np.bool_)
+    for k in range(len(row)):
+        if own[k] < sigmas or own[k] < _OWN_SHARE * value[k]:
+            continue
+        kept[k] = True
+        low, high = spans[k]
+        whole = max(min(column[k] + 0.5 * length, high) - max(column[k] - 0.5 * length, low), 0.0) / length
+        for w in range(k + 1, len(row)):
+            if abs(row[w] - row[k]) >= _FARTHEST or abs(column[w] - column[k]) >= length:
+                continue
+            first = max(max(column[k], column[w]) - 0.5 * length, low)
+            last = min(min(column[k], column[w]) + 0.5 * length, high)
+            share = max(last - first, 0.0) / length / max(whole, _LEAST_SEEN)
+            aside = int(min(abs(row[k] - row[w]) * across * _PER_PX + 0.5, len(_PROFILE) - 1.0))
+            own[w] -= own[k] * share * _PROFILE[aside]
+    return kept
 
 
 def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntArray]:
     """Return grid rows and columns of local maxima among the flat indices `place` (p,), highest first."""
-    flat, columns = values.reshape(-1), values.shape[1]
-    value = flat[place]
-    # If the circles are complete, the first column of a circle is a neighbour of the last column.
-    for down, beside in _NEIGHBOURS:
-        summit = flat.take(place + (down * columns + beside), mode="wrap") <= value
-        place, value = place[summit], value[summit]
-    place = place[np.argsort(-value, kind="stable")[:_MOST_PEAKS]]
+    columns = values.shape[1]
+    place = place[_summits(values.reshape(-1), place, columns)]
+    place = place[np.argsort(-values.reshape(-1)[place], kind="stable")[:_MOST_PEAKS]]
     row, column = np.divmod(place, columns)
     return row, column
+
+
+def _summits_numpy(flat: Float32Array, place: IntArray, columns: int) -> BoolArray:
+    """Return which of the flat indices `place` (p,) are local maxima of a grid with `columns` columns."""
+    kept = np.arange(len(place))
+    # If the circles are complete, the first column of a circle is a neighbour of the last column.
+    for down, beside in _NEIGHBOURS:
+        at = place[kept]
+        kept = kept[flat.take(at + (down * columns + beside), mode="wrap") <= flat[at]]
+    out = np.zeros(len(place), dtype=np.bool_)
+    out[kept] = True
+    return out
+
+
+@compiled_form_of(_summits_numpy)
+def _summits(flat: Float32Array, place: IntArray, columns: int) -> BoolArray:
+    """See `_summits_numpy`."""
+    out = np.ones(len(place), dtype=np.bool_)
+    for p in range(len(place)):
+        value = flat[place[p]]
+        for down in range(-1, 2):
+            for beside in range(-2, 3):
+                if out[p] and flat[(place[p] + down * columns + beside) % len(flat)] > value:
+                    out[p] = False
+    return out
 
 
 def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: int) -> FloatArray:
@@ -532,21 +386,41 @@ def _responses(
     height: FloatArray,
 ) -> FloatArray:
     """Return the sum of the filter responses of all stars at the ascending flat indices `place` (p,)."""
-    rows, columns = held.light.shape
+    out = np.zeros(len(place))
+    _add_responses(out, place, held.span, held.light.shape, grid.length, row, column, height, ACROSS)
+    return out
+
+
+def _add_responses_numpy(
+    out: FloatArray,
+    place: IntArray,
+    span: FloatArray,
+    shape: tuple[int, int],
+    length: float,
+    row: FloatArray,
+    column: FloatArray,
+    height: FloatArray,
+    across: float,
+) -> None:
+    """Add the filter responses of stars at grid indices `row` and `column` to `out` (p,).
+
+    The other arguments are those of `_responses`, the shape of the grid, the streak length in samples, and
+    the spacing of the circles, px.
+    """
+    rows, columns = shape
     # On each neighbouring circle, the filter response of a star covers a contiguous range of columns.
     circle = row.astype(np.int64)[:, None] + np.arange(1 - _FARTHEST, _FARTHEST + 1)
-    weight = height[:, None] * profile((circle - row[:, None]) * _ACROSS)
+    weight = height[:, None] * profile((circle - row[:, None]) * across)
     weight = np.where((circle >= 0) & (circle < rows), weight, 0.0)
     circle = np.clip(circle, 0, rows - 1)
-    low = np.maximum(np.ceil(column - grid.length), 0.0).astype(np.int64)
-    high = np.minimum(np.floor(column + grid.length), columns - 1.0).astype(np.int64)
+    low = np.maximum(np.ceil(column - length), 0.0).astype(np.int64)
+    high = np.minimum(np.floor(column + length), columns - 1.0).astype(np.int64)
     first = np.searchsorted(place, (circle * columns + low[:, None]).reshape(-1))
     count = np.searchsorted(place, (circle * columns + high[:, None]).reshape(-1), side="right") - first
     reached = np.flatnonzero((count > 0) & (weight.reshape(-1) > 0.0))
     first, count = first[reached], count[reached]
     circle, weight = circle.reshape(-1)[reached], weight.reshape(-1)[reached]
     star = reached // (2 * _FARTHEST)
-    out = np.zeros(len(place))
     # The ranges of columns are processed in groups, which limits the memory.
     cuts = np.searchsorted(np.cumsum(count), np.arange(_SOME_PLACES, int(count.sum()), _SOME_PLACES))
     for some in np.split(np.arange(len(reached)), np.unique(cuts)):
@@ -556,12 +430,44 @@ def _responses(
         common = overlap_of(
             at,
             np.repeat(column[star[some]], many),
-            np.repeat(held.span[circle[some]], many, axis=0),
-            grid.length,
+            np.repeat(span[circle[some]], many, axis=0),
+            length,
         )
         common *= np.repeat(weight[some], many)
         np.add.at(out, which, common)
-    return out
+
+
+@compiled_form_of(_add_responses_numpy)
+def _add_responses(
+    out: FloatArray,
+    place: IntArray,
+    span: FloatArray,
+    shape: tuple[int, int],
+    length: float,
+    row: FloatArray,
+    column: FloatArray,
+    height: FloatArray,
+    across: float,
+) -> None:
+    """See `_add_responses_numpy`."""
+    rows, columns = shape
+    for star in range(len(row)):
+        low = int(max(math.ceil(column[star] - length), 0))
+        high = int(min(math.floor(column[star] + length), columns - 1))
+        middle = int(row[star])
+        for circle in range(max(middle + 1 - _FARTHEST, 0), min(middle + _FARTHEST + 1, rows)):
+            aside = int(min(abs(circle - row[star]) * across * _PER_PX + 0.5, len(_PROFILE) - 1.0))
+            weight = height[star] * _PROFILE[aside]
+            if weight <= 0.0:
+                continue
+            begin = np.searchsorted(place, circle * columns + low)
+            for p in range(begin, len(place)):
+                at = place[p] - circle * columns
+                if at > high:
+                    break
+                first = max(max(at, column[star]) - 0.5 * length, span[circle, 0])
+                last = min(min(at, column[star]) + 0.5 * length, span[circle, 1])
+                out[p] += weight * max(last - first, 0.0) / length
 
 
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
@@ -580,7 +486,7 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
         [np.maximum(span[one, 0], span[other, 0]), np.minimum(span[one, 1], span[other, 1])], axis=-1
     )
     overlap = overlap_of(column[one], column[other], common, grid.length) * profile(
-        (row[one] - row[other]) * _ACROSS
+        (row[one] - row[other]) * ACROSS
     )
     # The factor on the right-hand side cancels the effect of the regularisation for isolated stars.
     overlap[one == other] *= 1.0 + _RIDGE

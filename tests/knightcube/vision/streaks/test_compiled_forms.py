@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from knightcube.vision.streaks import fit_windows, normal_equations, path_pixels
+from knightcube.vision.streaks import faint_stars, fit_windows, normal_equations, path_pixels, polar_grid
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, taken, turn_of
@@ -19,6 +19,10 @@ _FUNCTIONS = (
     (path_pixels, "_select_pixels", 1e-9),
     (fit_windows, "_numbered", 1e-9),
     (fit_windows, "_frame_values", 1e-6),
+    (polar_grid, "_sum_along", 1e-6),
+    (faint_stars, "_unshaded", 1e-9),
+    (faint_stars, "_summits", 1e-9),
+    (faint_stars, "_add_responses", 1e-9),
     (normal_equations, "_sum_products", 2e-5),
     (normal_equations, "_light_changes", 2e-5),
     (normal_equations, "_add_coupling", 2e-5),
