@@ -524,7 +524,24 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | 
 
     The mask `free` (SHARED,) selects those shared parameters that are fitted.
     """
-    alone = evaluation.information[:, SHARED:, SHARED:].copy()
+    kept = np.flatnonzero(free)
+    own, gain, normal = _eliminated(evaluation.information, kept)
+    scale = np.sqrt(np.diag(normal).clip(min=0.0))
+    if not np.all(np.isfinite(normal)) or not np.all(scale > 0.0):
+        return None
+    scaled = normal / np.outer(scale, scale)
+    least, most = np.linalg.eigvalsh(scaled)[[0, -1]]
+    if most > 1e10 * least:
+        return None
+    return EliminatedEquations(kept, own, gain, np.linalg.inv(scaled) / np.outer(scale, scale))
+
+
+def _eliminated_numpy(information: FloatArray, kept: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return `own` and `gain` of `EliminatedEquations`, and the information (k, k) on the fitted parameters.
+
+    The arguments are the information of `Evaluation` and the indices `kept` (k,) of the fitted parameters.
+    """
+    alone = information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
     diagonal += PRIOR
     # For a star outside the frame, a diagonal element of 1 for the flux keeps the star's block invertible.
@@ -534,18 +551,59 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | 
     unit = alone / outer
     unit[:, range(ALONE), range(ALONE)] += 1e-9
     own = np.asarray(np.linalg.inv(unit) / outer)
-    kept = np.flatnonzero(free)
-    cross = evaluation.information[:, kept, SHARED:]
+    cross = information[:, kept, SHARED:]
     gain = cross @ own
-    normal = (evaluation.information[:, kept[:, None], kept] - gain @ cross.swapaxes(1, 2)).sum(axis=0)
-    scale = np.sqrt(np.diag(normal).clip(min=0.0))
-    if not np.all(np.isfinite(normal)) or not np.all(scale > 0.0):
-        return None
-    scaled = normal / np.outer(scale, scale)
-    least, most = np.linalg.eigvalsh(scaled)[[0, -1]]
-    if most > 1e10 * least:
-        return None
-    return EliminatedEquations(kept, own, gain, np.linalg.inv(scaled) / np.outer(scale, scale))
+    normal = (information[:, kept[:, None], kept] - gain @ cross.swapaxes(1, 2)).sum(axis=0)
+    return own, gain, normal
+
+
+@compiled_form_of(_eliminated_numpy)
+def _eliminated(information: FloatArray, kept: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """See `_eliminated_numpy`."""
+    n, count = len(information), len(kept)
+    own, gain = np.empty((n, ALONE, ALONE)), np.empty((n, count, ALONE))
+    normal, unit, root = np.zeros((count, count)), np.empty((ALONE, 2 * ALONE)), np.empty(ALONE)
+    for star in range(n):
+        for i in range(ALONE):
+            diagonal = information[star, SHARED + i, SHARED + i] + PRIOR[i]
+            root[i] = math.sqrt(diagonal if diagonal > 0.0 else 1.0 + diagonal)
+        for i in range(ALONE):
+            for j in range(ALONE):
+                unit[i, j] = information[star, SHARED + i, SHARED + j] / (root[i] * root[j])
+                unit[i, ALONE + j] = 0.0
+            unit[i, i] = 1.0 + 1e-9
+            unit[i, ALONE + i] = 1.0
+        _invert(unit)
+        for i in range(ALONE):
+            for j in range(ALONE):
+                own[star, i, j] = unit[i, ALONE + j] / (root[i] * root[j])
+        for i in range(count):
+            for j in range(ALONE):
+                gain[star, i, j] = 0.0
+                for k in range(ALONE):
+                    gain[star, i, j] += information[star, kept[i], SHARED + k] * own[star, k, j]
+            for j in range(count):
+                normal[i, j] += information[star, kept[i], kept[j]]
+                for k in range(ALONE):
+                    normal[i, j] -= gain[star, i, k] * information[star, kept[j], SHARED + k]
+    return own, gain, normal
+
+
+@loop_helper
+def _invert(pair: FloatArray) -> None:
+    """Replace the right half of a matrix (m, 2 m) by the inverse of the left half times the right half.
+
+    The left half is symmetric and positive definite, so that no pivot is zero.
+    """
+    for i in range(len(pair)):
+        factor = 1.0 / pair[i, i]
+        for j in range(i, pair.shape[1]):
+            pair[i, j] *= factor
+        for k in range(len(pair)):
+            if k != i:
+                share = pair[k, i]
+                for j in range(i, pair.shape[1]):
+                    pair[k, j] -= share * pair[i, j]
 
 
 def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: int) -> Solution | None:

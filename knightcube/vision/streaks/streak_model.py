@@ -534,15 +534,31 @@ def coefficients(
     if shutter.delay_per_row != 0.0:
         rows = strips.rows(slice(None))[:, LINES // 2].mean(axis=1).astype(np.float64)
         delay, ending, spread = np.asarray(shutter.delay(rows)), of_block, np.arange(len(centre))
-    times = (centre - _STEP, centre + _STEP, delay - 0.5, delay + 0.5)
-    shift, side, speed = _displacements(
-        pinhole, motion, np.concatenate([of_block, of_block, ending, ending]), np.concatenate(times), growing
+    times = np.concatenate([centre - _STEP, centre + _STEP, delay - 0.5, delay + 0.5])
+    points = np.concatenate([of_block, of_block, ending, ending])
+    change, velocity = sensitivities_and_velocity(pinhole, motion, points, times, growing)
+    return _mixtures(np.ascontiguousarray(change), np.ascontiguousarray(velocity), spread)
+
+
+def _mixtures_numpy(change: FloatArray, velocity: FloatArray, spread: IntArray) -> FloatArray:
+    """Return the coefficients (b, IMAGES, 8) of `coefficients` from derivatives of star positions.
+
+    The derivatives `change` (m, 2, 8) and velocities (m, 2) are those shortly before and after the centre of
+    each block, and then at the starts and stops of the exposure. The index of the start and stop of each
+    block is `spread` (b,).
+    """
+    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
+    tx, ty = (velocity / speed[:, None]).T[:, :, None]
+    shift, side = (
+        (change[:, 0] * tx + change[:, 1] * ty) / speed[:, None],
+        change[:, 1] * tx - change[:, 0] * ty,
     )
-    cuts = np.cumsum([len(part) for part in times])[:-1]
+    blocks, ends = len(spread), len(change) // 2 - len(spread)
+    cuts = [blocks, 2 * blocks, 2 * blocks + ends]
     shift_a, shift_b, shift_first, shift_last = np.split(shift, cuts)
     side_a, side_b, _, _ = np.split(side, cuts)
     _, fast, fast_first, fast_last = np.split(speed, cuts)
-    out = np.zeros((len(centre), IMAGES, 8))
+    out = np.zeros((blocks, IMAGES, 8))
     out[:, 0] = (shift_a - shift_b) / (2.0 * _STEP)
     out[:, 1] = 0.5 * (side_a + side_b)
     out[:, 2] = (side_b - side_a) / (2.0 * _STEP * fast[:, None])
@@ -551,12 +567,30 @@ def coefficients(
     return out
 
 
-def _displacements(
-    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the displacements along and across paths per unit of each parameter, and the star speeds."""
-    change, velocity = sensitivities_and_velocity(pinhole, motion, stars, time, growing)
-    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
-    tx, ty = (velocity / speed[:, None]).T[:, :, None]
-    along = change[:, 0] * tx + change[:, 1] * ty
-    return along / speed[:, None], change[:, 1] * tx - change[:, 0] * ty, speed
+@compiled_form_of(_mixtures_numpy)
+def _mixtures(change: FloatArray, velocity: FloatArray, spread: IntArray) -> FloatArray:
+    """See `_mixtures_numpy`."""
+    blocks, ends = len(spread), len(change) // 2 - len(spread)
+    out = np.zeros((blocks, IMAGES, 8))
+    for b in range(blocks):
+        first = 2 * blocks + spread[b]
+        tx, ty, speed = _tangent(velocity[b])
+        ux, uy, fast = _tangent(velocity[blocks + b])
+        vx, vy, _ = _tangent(velocity[first])
+        wx, wy, _ = _tangent(velocity[first + ends])
+        for k in range(8):
+            before, after = change[b, :, k], change[blocks + b, :, k]
+            shift = (before[0] * tx + before[1] * ty) / speed - (after[0] * ux + after[1] * uy) / fast
+            side, later = before[1] * tx - before[0] * ty, after[1] * ux - after[0] * uy
+            out[b, 0, k], out[b, 1, k] = shift / (2.0 * _STEP), 0.5 * (side + later)
+            out[b, 2, k] = (later - side) / (2.0 * _STEP * fast)
+            out[b, 3, k] = -(change[first, 0, k] * vx + change[first, 1, k] * vy)
+            out[b, 4, k] = change[first + ends, 0, k] * wx + change[first + ends, 1, k] * wy
+    return out
+
+
+@loop_helper
+def _tangent(velocity: FloatArray) -> _Three:
+    """Return the direction (x, y) of a velocity (2,), and its magnitude."""
+    speed = max(math.sqrt(velocity[0] ** 2 + velocity[1] ** 2), _SLOWEST)
+    return velocity[0] / speed, velocity[1] / speed, speed

@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from knightcube.vision.streaks import faint_stars, fit_windows, normal_equations, path_pixels, polar_grid
+from knightcube.vision.streaks import (
+    faint_stars,
+    fit_windows,
+    normal_equations,
+    path_pixels,
+    polar_grid,
+    streak_model,
+)
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, taken, turn_of
@@ -24,6 +31,8 @@ _FUNCTIONS = (
     (faint_stars, "_summits", 1e-9),
     (faint_stars, "_add_responses", 1e-9),
     (normal_equations, "_sum_products", 2e-5),
+    (normal_equations, "_eliminated", 1e-6),
+    (streak_model, "_mixtures", 1e-9),
     (normal_equations, "_light_changes", 2e-5),
     (normal_equations, "_add_coupling", 2e-5),
 )
