@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.frame import BrightRegions, ReducedFrame
 from knightcube.vision.streaks.geometry import CameraMotion, image_flow, path_lengths, positions
@@ -90,7 +91,7 @@ def scan_angles(
     longest = boxes.total.shape[1] - 2
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
     widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
-    gain = np.array([boxes.best(int(width)).gain for width in widths])
+    gain = boxes.best(widths).gain
     # The weight of a bright star is limited, because it may be a blend of two stars.
     scale = np.minimum(_ENOUGH**2 / np.maximum(gain.max(axis=0), 1.0), 1.0)
     score = gain @ scale
@@ -107,7 +108,14 @@ def scan_angles(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BestBoxes:
-    """The best box along the circle of each region (n,): chi-square, start, flux and samples in the frame."""
+    """The best box of each of w widths along the circle of each of n regions, arrays (w, n).
+
+    Attributes:
+        gain: chi-square that the box explains.
+        first: index of the first sample of the box.
+        light: sum of the samples.
+        seen: number of samples in the frame.
+    """
 
     gain: FloatArray
     first: IntArray
@@ -129,17 +137,51 @@ class _Boxes:
     begin: float
     step: float
 
-    def best(self, width: int) -> _BestBoxes:
-        """Return the box of `width` samples with the largest chi-square along the circle of each region."""
-        last = self.total.shape[1] - 1
-        first = self.middle[:, None] - np.arange(width + 1)
+    def best(self, widths: IntArray) -> _BestBoxes:
+        """Return the box of each of `widths` (w,) samples with the largest chi-square for each region."""
+        return _BestBoxes(*_best_boxes(self.total, self.exist, self.variance, self.middle, widths))
+
+
+_Best = tuple[FloatArray, IntArray, FloatArray, FloatArray]
+
+
+def _best_boxes_numpy(
+    total: FloatArray, exist: FloatArray, variance: FloatArray, middle: IntArray, widths: IntArray
+) -> _Best:
+    """Return the values of `_BestBoxes` for boxes of `widths` (w,) samples, from the values of `_Boxes`."""
+    last = total.shape[1] - 1
+    each = np.arange(len(middle))[:, None]
+    shape = len(widths), len(middle)
+    most, place, light, seen = np.empty(shape), np.empty(shape, np.int64), np.empty(shape), np.empty(shape)
+    for w, width in enumerate(widths.tolist()):
+        first = middle[:, None] - np.arange(width + 1)
         start, stop = np.clip(first, 0, last), np.clip(first + width, 0, last)
-        each = np.arange(len(self.middle))[:, None]
-        light = self.total[each, stop] - self.total[each, start]
-        seen = self.exist[each, stop] - self.exist[each, start]
-        gain = np.maximum(light, 0.0) ** 2 / (np.maximum(seen, 1.0) * self.variance[:, None])
+        counts, number = total[each, stop] - total[each, start], exist[each, stop] - exist[each, start]
+        gain = np.maximum(counts, 0.0) ** 2 / (np.maximum(number, 1.0) * variance[:, None])
         pick = each[:, 0], np.argmax(gain, axis=1)
-        return _BestBoxes(gain[pick], first[pick], light[pick], seen[pick])
+        most[w], place[w], light[w], seen[w] = gain[pick], first[pick], counts[pick], number[pick]
+    return most, place, light, seen
+
+
+@compiled_form_of(_best_boxes_numpy)
+def _best_boxes(
+    total: FloatArray, exist: FloatArray, variance: FloatArray, middle: IntArray, widths: IntArray
+) -> _Best:
+    """See `_best_boxes_numpy`."""
+    last = total.shape[1] - 1
+    shape = len(widths), len(middle)
+    most, place, light, seen = np.empty(shape), np.empty(shape, np.int64), np.empty(shape), np.empty(shape)
+    for w in range(len(widths)):
+        width = widths[w]
+        for n in range(len(middle)):
+            most[w, n] = -1.0
+            for first in range(middle[n], middle[n] - width - 1, -1):
+                start, stop = min(max(first, 0), last), min(max(first + width, 0), last)
+                counts, number = total[n, stop] - total[n, start], exist[n, stop] - exist[n, start]
+                gain = max(counts, 0.0) ** 2 / (max(number, 1.0) * variance[n])
+                if gain > most[w, n]:
+                    most[w, n], place[w, n], light[w, n], seen[w, n] = gain, first, counts, number
+    return most, place, light, seen
 
 
 def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
@@ -181,26 +223,25 @@ def _refined_angle(
     """Return the best rotation angle near `width` samples, with the stars found for this angle."""
     room = max(2, round(_FACTOR * width) - width + 1)
     widths = np.arange(max(width - room, 2), width + room + 1)
-    held = [boxes.best(int(each)) for each in widths]
-    score = np.array([each.gain @ scale for each in held])
-    best = int(np.argmax(score))
-    chosen, across = held[best], int(widths[best])
-    certain = (chosen.gain > _CERTAIN**2) & (chosen.seen > _LEAST_SEEN * across)
+    held = boxes.best(widths)
+    best = int(np.argmax(held.gain @ scale))
+    across, first, light, seen = int(widths[best]), held.first[best], held.light[best], held.seen[best]
+    certain = (held.gain[best] > _CERTAIN**2) & (seen > _LEAST_SEEN * across)
     # The position of a star along its path is determined only if at least one streak end is in the frame.
     bounded = np.zeros(len(certain), dtype=np.bool_)
-    for sample in (chosen.first, chosen.first + across):
+    for sample in (first, first + across):
         here = np.clip(sample, 0, boxes.exist.shape[1] - 2)
         each = np.arange(len(here))
         bounded |= (here == sample) & (boxes.exist[each, here + 1] > boxes.exist[each, here])
     certain &= bounded
-    azimuth = boxes.begin + (chosen.first[certain] + 0.5 * across - 0.5) * boxes.step
+    azimuth = boxes.begin + (first[certain] + 0.5 * across - 0.5) * boxes.step
     height = circles.height[certain]
     sine = np.sqrt(np.maximum(1.0 - height**2, 0.0))
     local = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), height])
     pixel = pinhole.project((circles.frame.T @ local).T)
     spacing = boxes.step * pinhole.focal_length * sine
     # A sample of 3 x 3 pixels contains 83 % of the flux of a streak segment of 3 px.
-    light = chosen.light[certain] * spacing / (3.0 * 0.83) * across / np.maximum(chosen.seen[certain], 1.0)
+    light = light[certain] * spacing / (3.0 * 0.83) * across / np.maximum(seen[certain], 1.0)
     good = np.isfinite(pixel).all(axis=1)
     order = np.flatnonzero(good)[np.argsort(-light[good], kind="stable")]
     near = np.linalg.norm(pixel[order, None] - pixel[order], axis=2) < 4.0 * _STEP

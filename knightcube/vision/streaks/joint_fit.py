@@ -12,13 +12,15 @@ length.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import fdtri
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
 from knightcube.vision.streaks.fit_windows import FitWindows, cut_windows, window_areas
@@ -438,19 +440,70 @@ def brightness(
     """
     frame, pinhole, samples = camera.frame, camera.pinhole, time.shape[1]
     there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time.reshape(-1))
-    way = there.velocity / np.maximum(np.linalg.norm(there.velocity, axis=1, keepdims=True), 1e-3)
-    normal = np.stack([-way[:, 1], way[:, 0]], axis=-1)
-    points = there.position[:, None] + _ASIDE[:, None] * normal[:, None]
-    pixel = np.rint(points).astype(np.int64)
-    seen = pinhole.contains(pixel.astype(float))
-    index = np.where(seen, pixel[..., 1] * pinhole.columns + pixel[..., 0], 0)
-    seen &= ~frame.bad[index]
-    count = seen.reshape(len(stars), -1).sum(axis=1)
+    points = np.ascontiguousarray(there.position.T), np.ascontiguousarray(there.velocity.T)
+    of_frame = frame.signal, frame.floor, frame.bad
+    return _band_means(*points, *of_frame, (pinhole.columns, pinhole.rows), samples)
+
+
+def _band_means_numpy(
+    position: FloatArray,
+    velocity: FloatArray,
+    signal: Float32Array,
+    floor: Float32Array,
+    bad: BoolArray,
+    shape: tuple[int, int],
+    samples: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Return means and standard errors (n,) of `brightness` for positions and velocities (2, n * samples).
+
+    The frame has the `shape` columns and rows, and the flat arrays `signal`, `floor` and `bad`.
+    """
+    columns, rows = shape
+    way = velocity / np.maximum(np.hypot(velocity[0], velocity[1]), 1e-3)
+    x = np.rint(position[0] - _ASIDE[:, None] * way[1]).astype(np.int64)
+    y = np.rint(position[1] + _ASIDE[:, None] * way[0]).astype(np.int64)
+    seen = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+    index = np.where(seen, y * columns + x, 0)
+    seen &= ~bad[index]
+
+    def summed(values: FloatArray | BoolArray | Float32Array) -> FloatArray:
+        by_segment = values.reshape(len(_ASIDE), -1, samples)
+        return np.asarray(by_segment.sum(axis=(0, 2), dtype=np.float64))
+
+    count = summed(seen)
     enough = count >= _LEAST_VALID * samples * len(_ASIDE)
-    total = np.where(seen, frame.signal[index], 0.0).reshape(len(stars), -1).sum(axis=1)
-    variance = np.where(seen, frame.floor[index], 0.0).reshape(len(stars), -1).sum(axis=1)
-    count = np.maximum(count, 1)
+    total, variance = summed(np.where(seen, signal[index], 0.0)), summed(np.where(seen, floor[index], 0.0))
+    count = np.maximum(count, 1.0)
     return np.where(enough, total / count, np.nan), np.sqrt(variance) / count
+
+
+@compiled_form_of(_band_means_numpy)
+def _band_means(
+    position: FloatArray,
+    velocity: FloatArray,
+    signal: Float32Array,
+    floor: Float32Array,
+    bad: BoolArray,
+    shape: tuple[int, int],
+    samples: int,
+) -> tuple[FloatArray, FloatArray]:
+    """See `_band_means_numpy`."""
+    columns, rows = shape
+    segments = position.shape[1] // samples
+    mean, deviation = np.empty(segments), np.empty(segments)
+    for n in range(segments):
+        total, variance, count = 0.0, 0.0, 0
+        for m in range(n * samples, (n + 1) * samples):
+            speed = max(math.sqrt(velocity[0, m] ** 2 + velocity[1, m] ** 2), 1e-3)
+            for side in range(len(_ASIDE)):
+                x = round(position[0, m] - _ASIDE[side] * (velocity[1, m] / speed))
+                y = round(position[1, m] + _ASIDE[side] * (velocity[0, m] / speed))
+                if 0 <= x < columns and 0 <= y < rows and not bad[y * columns + x]:
+                    total, variance = total + signal[y * columns + x], variance + floor[y * columns + x]
+                    count += 1
+        enough = count >= _LEAST_VALID * samples * len(_ASIDE)
+        mean[n], deviation[n] = total / count if enough else np.nan, math.sqrt(variance) / max(count, 1)
+    return mean, deviation
 
 
 # Half length of the search range for a streak end around the modelled end, relative to the path length.
