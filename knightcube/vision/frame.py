@@ -19,6 +19,7 @@ A frame that shows no scene is dead (all pixels are equal) or overexposed. Count
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -56,11 +57,72 @@ class Background:
 
     def map(self, grid: FloatArray) -> Image:
         """Return the block values `grid`, interpolated bilinearly to all pixels of a frame, as float32."""
-        down, across = (
-            interpolation_weights(pixels, blocks).astype(np.float32)
-            for pixels, blocks in zip(self.shape, grid.shape, strict=True)
-        )
-        return np.asarray((down @ grid.astype(np.float32)) @ across.T)
+        return _interpolated(grid, self.shape)
+
+    def subtracted(self, pixels: Image) -> tuple[Image, Image]:
+        """Return the counts of `pixels` (rows, columns) above the level, and the noise variances, float32."""
+        return _subtracted(pixels, self.level, np.square(self.noise))
+
+
+def _interpolated(grid: FloatArray, shape: tuple[int, int]) -> Image:
+    """Return block values, interpolated bilinearly to all pixels of a frame of `shape`."""
+    down, across = (
+        interpolation_weights(pixels, blocks).astype(np.float32)
+        for pixels, blocks in zip(shape, grid.shape, strict=True)
+    )
+    return np.asarray((down @ grid.astype(np.float32)) @ across.T)
+
+
+def _subtracted_numpy(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple[Image, Image]:
+    """Return `pixels` minus the interpolated `level`, and the interpolated `variance`, both of blocks."""
+    signal = _interpolated(level, (pixels.shape[0], pixels.shape[1]))
+    # Arrays are changed in place, because allocating large arrays takes more time than the arithmetic.
+    np.subtract(pixels, signal, out=signal)
+    return signal, _interpolated(variance, signal.shape)
+
+
+@compiled_form_of(_subtracted_numpy)
+def _subtracted(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple[Image, Image]:
+    """See `_subtracted_numpy`."""
+    (rows, columns), (down, across) = pixels.shape, level.shape
+    signal, floor = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
+    height, width = rows // down, columns // across
+    of_row = np.empty((2, across + 1), np.float32)
+    for row in range(rows):
+        place = min(max((row - 0.5 * (height - 1)) / height, 0.0), down - 1.0)
+        top = int(place)
+        bottom, share = min(top + 1, down - 1), place - top
+        for block in range(across + 1):
+            of = min(block, across - 1)
+            of_row[0, block] = (1.0 - share) * level[top, of] + share * level[bottom, of]
+            of_row[1, block] = (1.0 - share) * variance[top, of] + share * variance[bottom, of]
+        for block in range(-1, across):
+            # The columns from this block's centre to the next one, and those before the first centre.
+            first = max(math.ceil(block * width + 0.5 * (width - 1)), 0)
+            last = columns if block == across - 1 else math.ceil((block + 1) * width + 0.5 * (width - 1))
+            _fill_row(signal[row], floor[row], pixels[row], of_row, max(block, 0), width, first, last)
+    return signal, floor
+
+
+@loop_helper
+def _fill_row(
+    signal: Image,
+    floor: Image,
+    pixels: Image,
+    of_row: Image,
+    block: int,
+    width: int,
+    first: int,
+    last: int,
+) -> None:
+    """Compute the columns from `first` to `last` of a row of `_subtracted` from the block values `of_row`."""
+    centre, scale = np.float32(block * width + 0.5 * (width - 1)), np.float32(1.0 / width)
+    level, slope = of_row[0, block], of_row[0, block + 1] - of_row[0, block]
+    variance, rise = of_row[1, block], of_row[1, block + 1] - of_row[1, block]
+    for column in range(first, last):
+        share = max((np.float32(np.int32(column)) - centre) * scale, np.float32(0.0))
+        signal[column] = np.float32(pixels[column]) - (level + share * slope)
+        floor[column] = variance + share * rise
 
 
 def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Background:
@@ -268,7 +330,12 @@ _STRETCH = 32_768
 
 def box_sum(image: Image) -> Image:
     """Return the sums over the 3 x 3 pixels around each pixel (rows, columns), with zeros at the border."""
-    columns, flat = image.shape[1], np.ascontiguousarray(image).reshape(-1)
+    return _box_sum(np.ascontiguousarray(image))
+
+
+def _box_sum_numpy(image: Image) -> Image:
+    """See `box_sum`; the image is contiguous."""
+    columns, flat = image.shape[1], image.reshape(-1)
     total = np.empty(image.shape, dtype=image.dtype)
     sums = total.reshape(-1)
     # In the flat array, successive rows join, which falsifies only the sums at the border.
@@ -281,6 +348,19 @@ def box_sum(image: Image) -> Image:
         inner += down[2:]
     total[[0, -1]] = 0
     total[:, [0, -1]] = 0
+    return total
+
+
+@compiled_form_of(_box_sum_numpy)
+def _box_sum(image: Image) -> Image:
+    """See `box_sum`; the image is contiguous."""
+    rows, columns = image.shape
+    total, down = np.zeros_like(image), np.empty_like(image[0])
+    for row in range(1, rows - 1):
+        for column in range(columns):
+            down[column] = image[row - 1, column] + image[row, column] + image[row + 1, column]
+        for column in range(1, columns - 1):
+            total[row, column] = down[column - 1] + down[column] + down[column + 1]
     return total
 
 
@@ -430,11 +510,53 @@ def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]
 
     The array `variance` (rows, columns) is the noise variance of each pixel.
     """
-    row, column = positions(signal > np.float32(_HOT_SIGMAS * np.sqrt(variance.min())))
+    return _hot_places(signal, variance, float(variance.min()))
+
+
+def _hot_places_numpy(signal: Image, variance: Image, least: float) -> tuple[IntArray, IntArray]:
+    """See `find_hot_pixels`; `least` is the least variance."""
+    row, column = positions(signal > np.float32(_HOT_SIGMAS * np.sqrt(least)))
     noise = np.sqrt(variance[row, column])
     bright = signal[row, column] > _HOT_SIGMAS * noise
     row, column, _ = _hot(signal, row[bright], column[bright], noise[bright])
     return row, column
+
+
+@compiled_form_of(_hot_places_numpy)
+def _hot_places(signal: Image, variance: Image, least: float) -> tuple[IntArray, IntArray]:
+    """See `_hot_places_numpy`."""
+    rows, columns = signal.shape
+    found, count = np.empty((2, rows * columns), dtype=np.int64), 0
+    lowest = np.float32(_HOT_SIGMAS * math.sqrt(least))
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            own = signal[row, column]
+            if own > lowest and _is_hot(signal, row, column, math.sqrt(variance[row, column])):
+                found[0, count], found[1, count] = row, column
+                count += 1
+    return found[0, :count].copy(), found[1, :count].copy()
+
+
+@loop_helper
+def _is_hot(signal: Image, row: int, column: int, noise: float) -> bool:
+    """Return whether a pixel inside the frame is hot, see `are_hot` and `_hot`."""
+    own = signal[row, column]
+    if own <= _HOT_SIGMAS * noise:
+        return False
+    brighter, highest, second, third = 0, -np.inf, -np.inf, -np.inf
+    for r in range(row - 1, row + 2):
+        for c in range(column - 1, column + 2):
+            value = float(signal[r, c])
+            brighter += value > own
+            if value > highest:
+                highest, second, third = value, highest, second
+            elif value > second:
+                second, third = value, second
+            elif value > third:
+                third = value
+    alone = second < min(_SHARPNESS * highest + _NOISE * noise, _MOST * highest)
+    pair = highest > _PAIR * noise and third < _SHARPNESS * highest + _PAIR_NOISE * noise
+    return brighter <= 1 and (alone or pair)
 
 
 def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[IntArray, IntArray]:

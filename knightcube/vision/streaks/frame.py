@@ -7,11 +7,13 @@ camera's raw pixels are equalised, and extended sources such as the Earth's limb
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
+from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import (
     at_least,
@@ -64,11 +66,7 @@ def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> Reduce
     top = saturation_count(pixels) if saturation is None else saturation
     pixels, step, offset = in_steps(pixels)
     top, gain = (top - offset) / step, gain * step
-    background = estimate_background(pixels)
-    # Arrays are changed in place, because allocating large arrays takes more time than the arithmetic.
-    signal = background.map(background.level)
-    np.subtract(pixels, signal, out=signal)
-    floor = background.map(np.square(background.noise))
+    signal, floor = estimate_background(pixels).subtracted(pixels)
     bad = at_least(pixels, top)
     hot = find_hot_pixels(signal, floor)
     signal[hot] = 0.0
@@ -126,9 +124,7 @@ class BrightRegions:
 
 def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> BrightRegions:
     """Return the brightest regions, at most `most`, whose 3 x 3 sums exceed `sigmas` standard deviations."""
-    threshold = 3.0 * sigmas
-    pixel = np.flatnonzero(frame.sums > np.float32(threshold * np.sqrt(frame.floor.min())))
-    pixel = pixel[frame.sums[pixel] > np.float32(threshold) * np.sqrt(frame.floor[pixel])]
+    pixel = _significant(frame.sums, frame.floor, float(frame.floor.min()), 3.0 * sigmas)
     number, count = label_pixels(pixel, frame.shape[1])
     light = np.maximum(frame.signal[pixel], 0.0).astype(np.float64)
     area = np.bincount(number, minlength=count)
@@ -156,6 +152,27 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
         light,
         len(pixel) / frame.signal.size,
     )
+
+
+def _significant_numpy(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
+    """Return the ascending indices of `sums` that exceed `threshold` times the root of their `floor`.
+
+    The least floor of all sums is `least`.
+    """
+    pixel = np.flatnonzero(sums > np.float32(threshold * np.sqrt(least)))
+    return np.asarray(pixel[sums[pixel] > np.float32(threshold) * np.sqrt(floor[pixel])])
+
+
+@compiled_form_of(_significant_numpy)
+def _significant(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
+    """See `_significant_numpy`."""
+    found, count = np.empty(len(sums), dtype=np.int64), 0
+    lowest = np.float32(threshold * math.sqrt(least))
+    for pixel in range(len(sums)):
+        if sums[pixel] > lowest and sums[pixel] > threshold * math.sqrt(floor[pixel]):
+            found[count] = pixel
+            count += 1
+    return found[:count].copy()
 
 
 # Minimum mean width (px) of a limb or a reflection, which is twice the width of the brightest stars.

@@ -219,7 +219,7 @@ def admit(
     A frame equal to the previous frame indicates a frozen camera, because noise makes any two exposures
     differ.
     """
-    checksum = zlib.crc32(pixels.tobytes())
+    checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
     state = frame_state(pixels, saturation, saturated_fraction)
     if state is not FrameState.USABLE:
         return checksum, StreakStatus(state.value)

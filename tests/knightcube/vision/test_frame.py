@@ -9,6 +9,7 @@ import pytest
 from scipy import ndimage
 
 from knightcube.astro.arrays import BoolArray
+from knightcube.vision import frame
 from knightcube.vision.frame import (
     FrameState,
     _bright_indices,
@@ -304,3 +305,25 @@ def test_the_compiled_search_of_bright_pixels_equals_that_in_numpy(dtype: type[n
     pixels = draw.integers(0, 200, (50, 37)).astype(dtype)
     assert_forms_agree(_bright_indices, pixels, draw.integers(150, 199, (3, 2)).astype(dtype))
     assert_forms_agree(_bright_indices, pixels, np.full((1, 1), 255, dtype=dtype))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_the_compiled_reduction_of_a_frame_equals_that_in_numpy(dtype: type[np.generic]) -> None:
+    draw = np.random.default_rng(8)
+    pixels = np.clip(draw.normal(60.0, 6.0, (43, 70)), 0.0, 255.0).astype(dtype)
+    pixels.reshape(-1)[draw.integers(0, pixels.size, 60)] = 250
+    level, variance = draw.uniform(40.0, 80.0, (3, 4)), draw.uniform(30.0, 50.0, (3, 4))
+    assert_forms_agree(frame._subtracted, pixels, level, variance, relative=1e-5)
+    assert_forms_agree(frame._subtracted, pixels, level[:1, :1], variance[:1, :1], relative=1e-5)
+    signal, floor = frame._subtracted_numpy(pixels, level, variance)
+    assert len(frame._hot_places_numpy(signal, floor, 30.0)[0]) > 20
+    assert_forms_agree(frame._hot_places, signal, floor, 30.0)
+    assert_forms_agree(frame._box_sum, signal, relative=1e-6)
+
+
+def test_the_compiled_hot_pixels_are_those_of_numpy_among_pairs_and_squares() -> None:
+    draw = np.random.default_rng(9)
+    signal = draw.normal(0.0, 1.0, (60, 50)).astype(np.float32)
+    signal[draw.random(signal.shape) < 0.05] += 60.0
+    signal[draw.random(signal.shape) < 0.05] += 25.0
+    assert_forms_agree(frame._hot_places, signal, np.ones_like(signal), 1.0)

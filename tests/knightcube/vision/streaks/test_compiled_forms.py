@@ -19,6 +19,7 @@ from knightcube.vision.streaks import (
     polar_grid,
     streak_model,
 )
+from knightcube.vision.streaks import frame as streak_frame
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, taken, turn_of
@@ -28,6 +29,7 @@ _FUNCTIONS = (
     (path_pixels, "_select_pixels", 1e-9),
     (fit_windows, "_numbered", 1e-9),
     (fit_windows, "_frame_values", 1e-6),
+    (streak_frame, "_significant", 1e-9),
     (first_guess, "_best_boxes", 1e-9),
     (joint_fit, "_band_means", 1e-6),
     (polar_grid, "_sum_along", 1e-6),
