@@ -440,9 +440,9 @@ def brightness(
     """
     frame, pinhole, samples = camera.frame, camera.pinhole, time.shape[1]
     there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time.reshape(-1))
-    points = np.ascontiguousarray(there.position.T), np.ascontiguousarray(there.velocity.T)
-    of_frame = frame.signal, frame.floor, frame.bad
-    return _band_means(*points, *of_frame, (pinhole.columns, pinhole.rows), samples)
+    position, velocity = np.ascontiguousarray(there.position.T), np.ascontiguousarray(there.velocity.T)
+    shape = pinhole.columns, pinhole.rows
+    return _band_means(position, velocity, frame.signal, frame.floor, frame.bad, shape, samples)
 
 
 def _band_means_numpy(
