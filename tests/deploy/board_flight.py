@@ -12,6 +12,7 @@ import yaml
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry import Run, read_run
 from knightcube.errors import UsageError
+from sim_hal.serving.device_link import RemoteI2cBus
 from tests.deploy.scripts import ROOT
 
 WORLDS = {"board_testbed": "step_demo", "board_orbit": "orbit"}
@@ -63,3 +64,12 @@ def frames_with_rate(run: Run) -> PacketArray:
     frames = run["streak"]
     found: PacketArray = frames[np.isfinite(frames["rate"]).all(axis=1)]
     return found
+
+
+def coil_currents(bus: RemoteI2cBus) -> list[float]:
+    """Return the currents (A) of the emulated coils, which a busy machine may answer late."""
+    for _ in range(100):
+        with suppress(TimeoutError):
+            found: list[float] = bus.call("currents")
+            return found
+    raise TimeoutError("the emulated devices do not answer")

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sim_hal.serving.device_link import open_bus
-from tests.deploy.board_flight import WORLDS, board_text, has_arrived
+from tests.deploy.board_flight import WORLDS, board_text, coil_currents, has_arrived
 from tests.deploy.scenario import SERVICE, systemctl, wait
 from tests.deploy.scripts import ROOT
 
@@ -50,7 +49,6 @@ def fly_board(name: str) -> dict[str, Any]:
         link.symlink_to(_FOLDER / device)
     accepted = subprocess.run(
         [str(ROOT / "deploy/install.sh"), "--accept"],
-        env={**os.environ, "PATH": f"{_without_udev()}:{os.environ['PATH']}"},
         capture_output=True,
         text=True,
         check=False,
@@ -73,12 +71,12 @@ def fly_board(name: str) -> dict[str, Any]:
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline and not (driven and arrived):
         time.sleep(1.0)
-        driven |= any(bus.call("currents"))
+        driven |= any(coil_currents(bus))
         if set(_RUNS.iterdir()) > before:
             arrived = has_arrived(_RUNS, name == "board_orbit")
     active = systemctl("show", "--value", "-p", "ActiveState", SERVICE).strip()
     systemctl("stop", SERVICE)
-    currents = bus.call("currents")
+    currents = coil_currents(bus)
     result = systemctl("show", "--value", "-p", "Result", SERVICE).strip()
     bus.close()
     systemctl("stop", _BOARD)
@@ -91,13 +89,3 @@ def fly_board(name: str) -> dict[str, Any]:
         "at_zero": not any(currents),
         "result": result,
     }
-
-
-def _without_udev() -> Path:
-    """Return a folder with a program `udevadm` that does nothing, because the container has no udev."""
-    folder = Path("/run/without-udev")
-    folder.mkdir(exist_ok=True)
-    program = folder / "udevadm"
-    program.write_text("#!/bin/sh\n", encoding="ascii")
-    program.chmod(0o755)
-    return folder

@@ -34,6 +34,7 @@ from sim_hal.serving.device_link import RemoteI2cBus, open_bus
 from tests.deploy.board_flight import (
     WORLDS,
     board_text,
+    coil_currents,
     everything_arrived,
     frames_with_rate,
     has_arrived,
@@ -151,7 +152,7 @@ def fly(name: str, folder: Path) -> Flown:
         driven = watch(flight, notifications, bus, runs, name == "board_orbit")
         flight.send_signal(signal.SIGTERM)
         said = flight.communicate(timeout=60.0)[0]
-        currents = bus.call("currents")
+        currents = coil_currents(bus)
         after = subprocess.run(coils_off, env=environment, capture_output=True, check=False)
     checked = json.loads(said.partition("\n")[0])
     found = {device["name"] for device in checked["devices"] if device["found"]}
@@ -168,7 +169,7 @@ def watch(
     while time.monotonic() < deadline and flight.poll() is None:
         if select.select([notifications], [], [], 0.5)[0]:
             ready |= "READY=1" in notifications.recv(4096).decode().split("\n")
-        driven |= any(bus.call("currents"))
+        driven |= any(coil_currents(bus))
         if ready and driven and has_arrived(runs, orbit):
             break
     return driven
