@@ -157,9 +157,9 @@ class StarLight:
         along = np.flatnonzero(line > 0.05 * line.max())
         if not len(along):
             return Explanation(chi_square, np.inf, np.inf, 0.0)
-        target, stars = self._target[along], self._stars[along]
-        missed = target - stars @ brightness[:-1] - line[along] * brightness[-1]
-        by_stars = target - stars @ self._brightness
+        target, stars = self._target[along], self._stars.T[:, along]
+        missed = target - brightness[:-1] @ stars - line[along] * brightness[-1]
+        by_stars = target - self._brightness @ stars
         misfit, of_stars = (float(each @ each) / len(each) for each in (missed, by_stars))
         return Explanation(chi_square, misfit, of_stars, float(brightness[-1]))
 
@@ -205,8 +205,10 @@ class StarLight:
 
     def _with_line(self, line: FloatArray) -> tuple[FloatArray, float]:
         """Return the brightnesses (k + 1,) of k stars and of a weighted image `line` (p,), and chi-square."""
-        beside = (self._stars.T @ line)[:, None]
-        normal = np.block([[self._normal, beside], [beside.T, np.array([[line @ line]])]])
+        stars = len(self._normal)
+        normal = np.empty((stars + 1, stars + 1))
+        normal[:stars, :stars], normal[stars, stars] = self._normal, line @ line
+        normal[stars, :stars] = normal[:stars, stars] = self._stars.T @ line
         right = np.append(self._right, line @ self._target)
         brightness, chi_square = _brightnesses(normal, right, self._power)
         # Rounding errors do not make chi-square larger than without the line.
@@ -246,9 +248,11 @@ def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[
     Raises:
         FlightError: if the solver does not converge.
     """
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scale = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    scaled = normal / scale / scale[:, None]
     # The ridge permits images that are equal or empty.
-    factor = np.linalg.cholesky(normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale)))
+    scaled.reshape(-1)[:: len(scale) + 1] += _RIDGE
+    factor = np.linalg.cholesky(scaled)
     # A triangular system of k rows has the same solutions as the system of all pixels.
     reduced = np.linalg.solve(factor, right / scale)
     try:
@@ -261,14 +265,16 @@ def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[
 def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole, per_length: int) -> FloatArray:
     """Return trial star paths (n, m, 2), px, that begin or end at a corner, or cover the whole region."""
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-    extent = float(np.linalg.norm(np.ptp(corners, axis=0)))
-    one = star_path(pinhole.unit_vectors(middle[None])[0], rotation, 0.5, pinhole)
-    length = float(np.hypot(*np.diff(one, axis=0).T).sum())
-    chain = np.clip(extent / max(length, 1.0), 1.0, _LONGEST_CHAIN)
-    starts = 0.5 + 0.5 * np.linspace(-chain, chain, round(per_length * chain) + 1)
-    anchors = np.concatenate([np.repeat(corners, 2, axis=0), np.repeat(middle[None], len(starts), axis=0)])
+    extent = float(np.hypot(*(corners.max(axis=0) - corners.min(axis=0))))
+    directions = pinhole.unit_vectors(np.concatenate([corners, middle[None]]))
+    # The points of a path are 1 px apart.
+    length = star_paths(directions[-1:], rotation, np.array([0.5]), pinhole).shape[1]
+    chain = min(max(extent / length, 1.0), _LONGEST_CHAIN)
+    number = round(per_length * chain) + 1
+    starts = 0.5 + chain * (np.arange(number) / (number - 1) - 0.5)
+    anchors = np.concatenate([np.repeat(np.arange(len(corners)), 2), np.full(number, len(corners))])
     starts = np.concatenate([np.tile([0.0, 1.0], len(corners)), starts])
-    paths = star_paths(pinhole.unit_vectors(anchors), rotation, starts, pinhole)
+    paths = star_paths(directions[anchors], rotation, starts, pinhole)
     return np.asarray(paths[np.isfinite(paths).all(axis=(1, 2))])
 
 
@@ -317,11 +323,6 @@ class Patch:
     def __post_init__(self) -> None:
         """Smooth the signal, which the search for stars and the search for objects use."""
         object.__setattr__(self, "seen", _smoothed(self.signal, self.psf_sigma))
-
-    def image_and_slopes(self, path: FloatArray, shares: FloatArray) -> list[FloatArray]:
-        """Return image and derivatives of a streak along `path` (m, 2), px, in the frame, on the patch."""
-        rows, columns = self.signal.shape
-        return spread_with_slopes(path - self.corner, shares, columns, rows, self.psf_sigma)
 
     def smoothed(self, light: FloatArray) -> FloatArray:
         """Return `light` (rows, columns) convolved with the PSF, which is the matched filter of a point."""
@@ -513,11 +514,12 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
         left: counts of the rectangle after its stars are subtracted (rows, columns).
     """
     seen = patch.smoothed(left)
-    error = np.hypot(patch.smoothed_noise, SHAPE_ERROR * np.maximum(patch.seen, 0.0))
-    pixel = np.flatnonzero(seen > _LEFT_SIGMAS * error)
+    pixel = np.flatnonzero(seen > _LEFT_SIGMAS * patch.smoothed_noise)
+    light, whole = seen.reshape(-1)[pixel], np.maximum(patch.seen.reshape(-1)[pixel], 0.0)
+    pixel = pixel[light > _LEFT_SIGMAS * np.hypot(patch.smoothed_noise, SHAPE_ERROR * whole)]
     owner, count = label_pixels(pixel, seen.shape[1])
-    inside = np.where(patch.mask, np.maximum(left, 0.0), 0.0)
-    flux = np.bincount(owner, inside.reshape(-1)[pixel], count)
+    inside = patch.mask.reshape(-1)[pixel] * np.maximum(left.reshape(-1)[pixel], 0.0)
+    flux = np.bincount(owner, inside, count)
     if flux.max(initial=0.0) <= 0.0:
         return None
     y, x = np.divmod(pixel[owner == int(np.argmax(flux))], seen.shape[1])
@@ -566,13 +568,18 @@ def _fit_line(patch: Patch, left: FloatArray, ends: FloatArray) -> FloatArray:
     """Return the ends (2, 2), px, of a line fitted by Gauss-Newton to the light `left` by the stars."""
     if np.any(ends[0] != ends[1]):
         return fitted_line(left, patch.weight, ends - patch.corner, patch.psf_sigma) + patch.corner
-    weights, lights = patch.weight.reshape(-1), left.reshape(-1)
+    size, reach = np.array(left.shape[::-1]), int(np.ceil(_WIDE_REACH * patch.psf_sigma))
     for _ in range(_FITS):
-        images = patch.image_and_slopes(straight_path(ends), np.ones((1, 1)))
-        lit = np.flatnonzero(images[0] > 1e-3 * images[0].max())
-        shape = np.stack([image.reshape(-1)[lit] for image in images])
-        weight = weights[lit]
-        solution = least_squares((shape * weight).T, lights[lit] * weight)
+        # Only the pixels near the point are used.
+        middle = np.floor(ends[0] - patch.corner).astype(int)
+        low, high = np.clip([middle - reach, middle + reach + 1], 0, size)
+        near = slice(low[1], high[1]), slice(low[0], high[0])
+        columns, rows = high - low
+        path = straight_path(ends) - patch.corner - low
+        images = spread_with_slopes(path, np.ones((1, 1)), columns, rows, patch.psf_sigma)
+        weight = patch.weight[near] * (images[0] > 1e-3 * images[0].max(initial=0.0))
+        shape = np.stack([(image * weight).reshape(-1) for image in images])
+        solution = least_squares(shape.T, (left[near] * weight).reshape(-1))
         if solution[0] <= 0.0:
             break
         step = np.clip(solution[1:] / solution[0], -_LARGEST_STEP, _LARGEST_STEP)

@@ -439,23 +439,35 @@ def _correlate(
     rows, columns = image.shape
     high, wide = len(down) // 2, len(across) // 2
     for row in range(rows):
-        first, last = max(spans[row, 0] - wide, 0), min(spans[row, 1] + wide, columns - 1)
-        for column in range(first, last + 1):
-            scratch[row, column] = 0.0
+        first, stop = max(spans[row, 0] - wide, 0), min(spans[row, 1] + wide + 1, columns)
+        if first >= stop:
+            continue
+        line = scratch[row, first:stop]
+        line[:] = 0.0
         for tap in range(2 * high + 1):
-            other, factor = min(max(row + tap - high, 0), rows - 1), down[tap]
-            for column in range(first, last + 1):
-                scratch[row, column] += factor * image[other, column]
+            _add_scaled(image[min(max(row + tap - high, 0), rows - 1), first:stop], down[tap], line)
     for row in range(rows):
-        for column in range(spans[row, 0], spans[row, 1] + 1):
-            total = 0.0
-            if column >= wide and column + wide < columns:
-                for tap in range(2 * wide + 1):
-                    total += across[tap] * scratch[row, column + tap - wide]
-            else:
-                for tap in range(2 * wide + 1):
-                    total += across[tap] * scratch[row, min(max(column + tap - wide, 0), columns - 1)]
-            out[row, column] = total
+        first, stop = spans[row, 0], spans[row, 1] + 1
+        if first >= stop:
+            continue
+        line = out[row, first:stop]
+        line[:] = 0.0
+        for tap in range(2 * wide + 1):
+            step, factor = tap - wide, across[tap]
+            # Columns from `low` up to `end` need no pixels beyond the border.
+            low, end = min(max(first, -step), stop), max(min(stop, columns - step), first)
+            for column in range(first, low):
+                out[row, column] += factor * scratch[row, 0]
+            if low < end:
+                _add_scaled(scratch[row, low + step : end + step], factor, out[row, low:end])
+            for column in range(max(end, low), stop):
+                out[row, column] += factor * scratch[row, columns - 1]
+
+
+@loop_helper
+def _add_scaled(values: FloatArray, factor: float, total: FloatArray) -> None:
+    for k in range(len(total)):
+        total[k] += factor * values[k]
 
 
 @loop_helper

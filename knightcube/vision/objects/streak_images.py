@@ -138,8 +138,7 @@ def path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) -
     steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
     parts = (np.arange(steps) + 0.5) / steps
     at = first + parts[:, None] * (last - first)
-    turns = attitude_matrix(from_rotation_vector((parts - 0.5)[:, None] * rotation))
-    return pinhole.project(np.einsum("mij,mj->mi", turns, at))
+    return pinhole.project(_rotated(at, rotation, (parts - 0.5)[:, None])[:, 0])
 
 
 def at_mid_exposure(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -362,7 +361,7 @@ def streak_images(pixels: IntArray, paths: FloatArray, sigma: float, slopes: boo
     the images of its points.
 
     Args:
-        pixels: pixels (p, 2) on which the images are computed.
+        pixels: pixels (p, 2), row by row, on which the images are computed.
         paths: points of the paths (k, m, 2), px.
         sigma: standard deviation of the PSF, px.
         slopes: whether the derivatives of the image, 1/px, for displacements of the whole path along x and
@@ -466,11 +465,25 @@ def _nodes_of(path: FloatArray, x: float, y: float) -> FloatArray:
 
 
 @loop_helper
+def _first_from(pixels: IntArray, row: float) -> int:
+    """Return the index of the first of the pixels (p, 2), which are given row by row, from a row on."""
+    low, high = 0, len(pixels)
+    while low < high:
+        middle = (low + high) // 2
+        if pixels[middle, 1] < row:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@loop_helper
 def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: float) -> None:
     """Add the light of one count along a nearly straight `path` (m, 2), px, to `image` (1 or 3, p)."""
     m, width = len(path), math.sqrt(sigma**2 + 1.0 / 12.0)
     room, narrow = _FARTHEST * width, 1.0 / width
-    x, y = path[m - 1, 0] - path[0, 0], path[m - 1, 1] - path[0, 1]
+    x0, y0, light = path[0, 0], path[0, 1], image[0]
+    x, y = path[m - 1, 0] - x0, path[m - 1, 1] - y0
     length = math.hypot(x, y)
     x, y = x / length, y / length
     nodes = _nodes_of(path, x, y)
@@ -479,8 +492,9 @@ def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: fl
     rate, share = last / along[last], narrow / m
     low, high = nodes[1].min() - room - 1.0, nodes[1].max() + room + 1.0
     begin, end = 0.5 * nodes[5, 0], nodes[2, last] + 0.5 * nodes[5, last - 1]
-    for p in range(len(pixels)):
-        dx, dy = pixels[p, 0] - path[0, 0], pixels[p, 1] - path[0, 1]
+    top, bottom = path[:, 1].min() - room - 2.0, path[:, 1].max() + room + 2.0
+    for p in range(_first_from(pixels, top), _first_from(pixels, bottom)):
+        dx, dy = pixels[p, 0] - x0, pixels[p, 1] - y0
         u, v = dx * x + dy * y, dy * x - dx * y
         if u <= -room - 1.0 or u >= length + room + 1.0 or v <= low or v >= high:
             continue
@@ -499,7 +513,7 @@ def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: fl
         cosine = 1.0 / root
         n = off * cosine
         s = nodes[2, k] + nodes[6, k] * step + beyond * root + off * bend * cosine
-        light = _bell(n * narrow) * share / pace
+        whole = _bell(n * narrow) * share / pace
         covered, sloping = 1.0, 0.0
         if s + begin < room:
             covered, sloping = _area((s + begin) * narrow), _bell((s + begin) * narrow) * narrow
@@ -507,11 +521,11 @@ def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: fl
             part = _area((end - s) * narrow)
             sloping = sloping * part - covered * _bell((end - s) * narrow) * narrow
             covered *= part
-        image[0, p] += light * covered
+        light[p] += whole * covered
         if len(image) == 3:
             aside = covered * n / width**2
-            image[1, p] -= light * cosine * (aside * (y + bend * x) + sloping * (x - bend * y))
-            image[2, p] += light * cosine * (aside * (x - bend * y) - sloping * (y + bend * x))
+            image[1, p] -= whole * cosine * (aside * (y + bend * x) + sloping * (x - bend * y))
+            image[2, p] += whole * cosine * (aside * (x - bend * y) - sloping * (y + bend * x))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
