@@ -245,7 +245,7 @@ class Answers:
         name = question.name
         if name == "eccentricity" and name in self.values:
             raise UsageError(f"--{name} {texts[-1]}: --altitude has perigee and apogee: omit this option")
-        found: Values = {}
+        found: dict[str, Any] = {}
         for text in texts:
             value = read_value(name, text)
             if isinstance(value, Apsides):

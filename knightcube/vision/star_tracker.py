@@ -19,9 +19,10 @@ from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.earth.sun import J2000, earth_velocity, julian_date
 from knightcube.errors import InputError
 from knightcube.vision.camera.images import grey_image
-from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Pinhole
+from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.frame_job import found_in_image
 from knightcube.vision.lens_knowledge import LensKnowledge
+from knightcube.vision.startracker.detection import FrameKind
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex, load_once
 from knightcube.vision.startracker.sky_map import ASPECT, Pointing, SkyMap
@@ -36,6 +37,9 @@ from knightcube.vision.streaks.streak_result import StreakStatus
 
 UNKNOWN_FOV_DEG = 4.0, 60.0
 """Range of the field of view (deg) that is searched if the field of view is unknown."""
+_SQUARES, _LEAST_COARSE_PX = (3, 5), 330
+"""Sizes (px) of the squares in which the pixels of large images are summed if the image was not solved, and
+shortest side of an image of sums."""
 FOV_TOLERANCE = 0.05
 """Default uncertainty of a given field of view, relative to the field of view."""
 
@@ -260,11 +264,29 @@ class StarTracker:
         found = found_in_image(image, camera, scale, seconds, sky, settings, attitudes, rates, self.lens)
         self.lens, frame = found.lens, found.solution
         assert frame is not None  # the settings of the star tracker are given
+        if frame.fix is None and exposure is None and self._camera is None and not self._learn:
+            frame = self._solved_coarser(image, sky, settings) or frame
         if frame.status is SolveStatus.NO_MATCH and scale[0] < scale[1]:
             low, high = (math.degrees(field_of_view(camera.rescaled(1.0 / limit))) for limit in scale)
             searched = f"fields of view of {low:.3g} to {high:.3g} deg were searched"
             frame = replace(frame, reason=f"{frame.reason}; {searched}")
         return _solution(frame, sky, settings.velocity, exposure is not None)
+
+    def _solved_coarser(self, image: Image, sky: SkyIndex, settings: SolveSettings) -> FrameSolution | None:
+        """Return the solution of a large image whose pixels are summed in squares, or None.
+
+        The stars of large photographs are often several pixels wide, and compression or interpolation makes
+        the noise of neighbouring pixels alike, so that the uncertainties of their positions are too small.
+        """
+        for size in _SQUARES:
+            if min(image.shape) < _LEAST_COARSE_PX * size:
+                return None
+            coarse = _summed(image, size)
+            camera, scale = camera_of_field(self._fov_deg, self._fov_error_deg, coarse.shape)
+            found = found_in_image(coarse, camera, scale, 1.0, sky, settings).solution
+            if found is not None and found.fix is not None and found.kind is FrameKind.POINTS:
+                return _in_whole_image(found, size, image.shape)
+        return None
 
     def _described(self, camera: CameraModel, scale: tuple[float, float]) -> LensKnowledge:
         """Return the knowledge of the lens before the first image."""
@@ -290,6 +312,46 @@ class StarTracker:
         if self._fov_error_deg is None:
             return camera, (1.0, 1.0)
         return camera, camera_of_field(math.degrees(field_of_view(camera)), self._fov_error_deg, shape)[1]
+
+
+def _summed(image: Image, size: int) -> Image:
+    """Return an image (rows, columns) whose pixels are the sums of squares of `size` x `size` px.
+
+    The squares are centred in the image. `size` is odd, so that the margins can be equal on both sides.
+    """
+    rows, columns = (_squares(length, size) for length in image.shape)
+    top, left = (
+        (length - size * count) // 2 for length, count in zip(image.shape, (rows, columns), strict=True)
+    )
+    inner = image[top : top + size * rows, left : left + size * columns]
+    total = np.float32 if image.dtype.kind == "f" else np.int64 if image.dtype.kind == "i" else np.uint32
+    return np.asarray(inner.reshape(rows, size, columns, size).sum(axis=(1, 3), dtype=total))
+
+
+def _squares(length: int, size: int) -> int:
+    """Return the largest number of squares of odd `size` px that leaves equal margins in `length` px."""
+    count = length // size
+    return count - (length - size * count) % 2
+
+
+def _in_whole_image(found: FrameSolution, size: int, shape: tuple[int, ...]) -> FrameSolution:
+    """Return a solution of summed pixels (`_summed`) in the pixels of the image of `shape`."""
+    rows, columns = shape
+    margin = [0.5 * (length - size * _squares(length, size)) for length in (columns, rows)]
+    offset = np.array(margin) + 0.5 * (size - 1)
+    camera, focal_length = found.camera, size * found.camera.focal_length
+    whole: CameraModel = Pinhole(columns, rows, focal_length)
+    if isinstance(camera, Lens):
+        x, y = (offset + size * np.array(camera.centre)).tolist()
+        whole = replace(camera, columns=columns, rows=rows, focal_length=focal_length, centre=(x, y))
+    return replace(
+        found,
+        camera=whole,
+        points=offset + size * found.points,
+        expected=offset + size * found.expected,
+        covariance=size**2 * found.covariance,
+        psf_sigma=size * found.psf_sigma,
+    )
 
 
 def field_of_view(camera: CameraModel) -> float:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from knightcube.astro.quaternion import angle_between, conjugate, multiply, to_rotation_vector
 from knightcube.errors import InputError
@@ -142,6 +143,29 @@ def test_a_colour_image_has_the_solution_of_its_luminance(resting: SkyFrame) -> 
     grey = tracker.solve(resting.pixels)
     for image in (colours, colours[..., :3], colours[..., :1]):
         np.testing.assert_array_equal(tracker.solve(image).quaternion, grey.quaternion)
+
+
+def test_wide_stars_of_a_large_image_are_solved_in_sums_of_pixels(
+    resting: SkyFrame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Photographs of many pixels have stars of several pixels, and the noise of neighbours is alike."""
+    spread = gaussian_filter(np.kron(resting.pixels.astype(float), np.ones((3, 3))), 3.0)
+    image = np.rint(spread[1:-1, 1:-1]).astype(np.uint16)
+    tracker = StarTracker(fov_deg=12.0)
+    solution = tracker.solve(image)
+    assert solution, "the sums of 3 x 3 px leave two pixels at each side"
+    error = to_rotation_vector(multiply(solution.quaternion, conjugate(resting.attitude)))
+    assert error @ np.linalg.solve(solution.covariance, error) < 16.3  # chi-square of 3, 0.1 %
+    assert solution.sky_map is not None
+    places = solution.sky_map.pixels(solution.stars.directions)
+    np.testing.assert_allclose(places, solution.stars.points - solution.stars.residuals, atol=1e-6)
+    assert np.abs(solution.stars.residuals).max() < 3.0
+    brightest = resting.stars[
+        np.argsort(np.linalg.norm(3.0 * resting.stars - solution.stars.points[0], axis=1))[0]
+    ]
+    np.testing.assert_allclose(solution.stars.points[0], 3.0 * brightest, atol=1.5)
+    monkeypatch.setattr("knightcube.vision.star_tracker._SQUARES", ())
+    assert not tracker.solve(image)
 
 
 def test_a_predicted_attitude_is_used_and_a_wrong_one_does_no_harm(resting: SkyFrame) -> None:
