@@ -54,7 +54,7 @@ from knightcube.vision.startracker.solve import (
     solve_points,
 )
 from knightcube.vision.startracker.verification import PRIOR_SIGMAS
-from knightcube.vision.streaks.geometry import streak_pinhole
+from knightcube.vision.streaks.distorted_pinhole import streak_pinhole
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 

@@ -27,6 +27,7 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_motion,
 )
+from knightcube.vision.streaks.distorted_pinhole import streak_pinhole
 from knightcube.vision.streaks.estimate import StreakVerdict, with_rate, with_stars
 from knightcube.vision.streaks.frame import ReducedFrame, reduce_frame
 from knightcube.vision.streaks.geometry import (
@@ -38,7 +39,6 @@ from knightcube.vision.streaks.geometry import (
     path_lengths,
     polar_angles,
     positions,
-    streak_pinhole,
 )
 from knightcube.vision.streaks.joint_fit import FitProblem, joint_fit
 from knightcube.vision.streaks.normal_equations import light_of

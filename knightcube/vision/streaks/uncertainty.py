@@ -17,10 +17,10 @@ from scipy.special import chdtri
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks.distorted_pinhole import DistortedPinhole
 from knightcube.vision.streaks.geometry import (
     PIXEL_VARIANCE,
     CameraMotion,
-    DistortedPinhole,
     StreakScene,
     path_lengths,
     positions,

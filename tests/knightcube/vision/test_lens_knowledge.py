@@ -27,7 +27,8 @@ from knightcube.vision.startracker.solve import (
     SolveSettings,
     SolveStatus,
 )
-from knightcube.vision.streaks.geometry import CameraMotion, DistortedPinhole, positions
+from knightcube.vision.streaks.distorted_pinhole import DistortedPinhole
+from knightcube.vision.streaks.geometry import CameraMotion, positions
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 

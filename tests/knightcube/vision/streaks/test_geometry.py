@@ -9,7 +9,8 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.streaks import geometry
-from knightcube.vision.streaks.geometry import CameraMotion, DistortedPinhole, paths, positions, sensitivities
+from knightcube.vision.streaks.distorted_pinhole import DistortedPinhole
+from knightcube.vision.streaks.geometry import CameraMotion, paths, positions, sensitivities
 from tests.support.compiled_forms import assert_forms_agree
 
 _LENS = DistortedPinhole(1024, 1024, 2903.0, (3.0, -2.0), 0.002, 0.01)
