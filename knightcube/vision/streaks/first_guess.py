@@ -20,6 +20,7 @@ pixels converges only from within a few point-spread widths.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -371,7 +372,6 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     if found is None:
         return None
     axis, agree = found
-    n, owner, light = len(regions), regions.owner, regions.light
     middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
     # Azimuth zero is the direction of the image centre, and is arbitrary if the rotation axis is there.
     first = middle - (middle @ axis) * axis
@@ -380,18 +380,12 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
         first = first - (first @ axis) * axis
     first = first / np.linalg.norm(first)
     frame = np.stack([first, np.cross(axis, first), axis])
-    points = np.stack([regions.column, regions.row], axis=-1).astype(float)
-    x, y, z = frame @ pinhole.unit_vectors(points).T
     centre = np.einsum("ij,nj->ni", frame, pinhole.unit_vectors(regions.centre))
     reference = np.arctan2(centre[:, 1], centre[:, 0])
-    azimuth = np.arctan2(y, x) - reference[owner]
-    azimuth = np.remainder(azimuth + np.pi, 2.0 * np.pi) - np.pi
-    flux = np.bincount(owner, light, n)
-    mean = np.bincount(owner, light * azimuth, n) / flux
-    square = np.bincount(owner, light * azimuth**2, n) / flux - mean**2
-    height = np.bincount(owner, light * z, n) / flux
+    view = (float(pinhole.focal_length), *pinhole.centre)
+    pixels = regions.column, regions.row, regions.light, regions.owner
+    (mean, square, height), (low, high), bounds = _arcs(*pixels, frame, reference, view)
     speed = np.linalg.norm(image_flow(pinhole, regions.centre) @ axis, axis=-1)
-    low, high = _outermost(azimuth, owner, n)
     # The brightness variance along a uniform arc is length^2 / 12 plus the variance of the point spread.
     width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
     return AxisGuess(
@@ -399,8 +393,8 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
         frame,
         height,
         mean + reference,
-        azimuth[low] + reference,
-        azimuth[high] + reference,
+        bounds[0] + reference,
+        bounds[1] + reference,
         width,
         np.maximum(speed, 1.0),
         _at_border(regions, pinhole, low),
@@ -469,6 +463,37 @@ def motions_by_scan(
             yield MotionGuess(motion, candidate.stars[:most], candidate.light[:most], 0.0)
 
 
+_Arcs = tuple[FloatArray, IntArray, FloatArray]
+
+
+def _arcs_numpy(
+    column: IntArray,
+    row: IntArray,
+    light: FloatArray,
+    owner: IntArray,
+    frame: FloatArray,
+    reference: FloatArray,
+    view: tuple[float, float, float],
+) -> _Arcs:
+    """Return moments (3, n), outermost pixels (2, n) and their azimuths (2, n) of n regions about an axis.
+
+    The moments are mean and variance of the azimuth, relative to the azimuths `reference` (n,), and the mean
+    cosine of the angle from the axis. The pixels of the regions are those of `BrightRegions`, the matrix
+    `frame` (3, 3) is that of `Circles`, and the camera has the focal length and centre `view`.
+    """
+    n, (focal, centre_x, centre_y) = len(reference), view
+    v = np.stack([(column - centre_x) / focal, (row - centre_y) / focal, np.ones(len(row))])
+    x, y, z = frame @ (v / np.sqrt(np.sum(v * v, axis=0)))
+    azimuth = np.arctan2(y, x) - reference[owner]
+    azimuth = np.remainder(azimuth + np.pi, 2.0 * np.pi) - np.pi
+    flux = np.bincount(owner, light, n)
+    mean = np.bincount(owner, light * azimuth, n) / flux
+    square = np.bincount(owner, light * azimuth**2, n) / flux - mean**2
+    outermost = np.stack(_outermost(azimuth, owner, n))
+    moments = np.stack([mean, square, np.bincount(owner, light * z, n) / flux])
+    return moments, outermost, azimuth[outermost]
+
+
 def _outermost(azimuth: FloatArray, owner: IntArray, n: int) -> tuple[IntArray, IntArray]:
     """Return the pixels with the lowest and the highest azimuth of each of `n` regions, both (n,)."""
     order = np.argsort(owner.astype(np.int16), kind="stable")
@@ -479,6 +504,44 @@ def _outermost(azimuth: FloatArray, owner: IntArray, n: int) -> tuple[IntArray, 
         pixel = np.flatnonzero(theirs == extreme[whose])
         found.append(order[pixel[np.searchsorted(whose[pixel], np.arange(n))]])
     return found[0], found[1]
+
+
+@compiled_form_of(_arcs_numpy)
+def _arcs(
+    column: IntArray,
+    row: IntArray,
+    light: FloatArray,
+    owner: IntArray,
+    frame: FloatArray,
+    reference: FloatArray,
+    view: tuple[float, float, float],
+) -> _Arcs:
+    """See `_arcs_numpy`."""
+    focal, centre_x, centre_y = view
+    n = len(reference)
+    moments, outermost, bounds = np.zeros((3, n)), np.zeros((2, n), np.int64), np.empty((2, n))
+    flux = np.zeros(n)
+    bounds[0], bounds[1] = np.inf, -np.inf
+    for p in range(len(owner)):
+        region, weight = owner[p], light[p]
+        u, v = (column[p] - centre_x) / focal, (row[p] - centre_y) / focal
+        x = frame[0, 0] * u + frame[0, 1] * v + frame[0, 2]
+        y = frame[1, 0] * u + frame[1, 1] * v + frame[1, 2]
+        z = (frame[2, 0] * u + frame[2, 1] * v + frame[2, 2]) / math.sqrt(u * u + v * v + 1.0)
+        azimuth = (math.atan2(y, x) - reference[region] + math.pi) % (2.0 * math.pi) - math.pi
+        flux[region] += weight
+        moments[0, region] += weight * azimuth
+        moments[1, region] += weight * azimuth * azimuth
+        moments[2, region] += weight * z
+        if azimuth < bounds[0, region]:
+            bounds[0, region], outermost[0, region] = azimuth, p
+        if azimuth > bounds[1, region]:
+            bounds[1, region], outermost[1, region] = azimuth, p
+    for region in range(n):
+        for k in range(3):
+            moments[k, region] /= flux[region]
+        moments[1, region] -= moments[0, region] ** 2
+    return moments, outermost, bounds
 
 
 def _at_border(regions: BrightRegions, pinhole: Pinhole, pixel: IntArray) -> BoolArray:
