@@ -250,25 +250,37 @@ def _sum_products(
     (signal, floor, ceiling), (gain, clip) = levels, limits
     blocks, count, size = images.shape
     gram, weighted = np.empty((count, count)), np.empty(size, dtype=np.float32)
+    model, least = np.empty(size, dtype=np.float32), np.float32(0.0)
+    per_count, margin, unresolved = np.float32(1.0 / gain), np.float32(_MARGIN), np.float32(_UNRESOLVED)
+    share, room = np.float32(clip), np.float32(0.0 if clip > 0.0 else np.inf)
     for b in range(blocks):
-        owner, left = star[b], images[b, count - 1]
+        owner, left, weights = star[b], images[b, count - 1], weight[b]
+        variance, off, full = floor[b], signal[b], ceiling[b]
         for p in range(size):
-            model = total[slot[b, p]]
-            variance = max(model, np.float32(0.0)) / gain + floor[b, p]
-            off, deviation = signal[b, p] - model, math.sqrt(variance)
-            good = inside[b, p] and model + _MARGIN * deviation < ceiling[b, p]
-            if clip > 0.0 and abs(off) > clip * deviation + _UNRESOLVED * model:
-                good = False
-            weight[b, p], left[p] = (1.0 / variance, off) if good else (0.0, 0.0)
-            pixels[owner] += good
+            model[p] = total[slot[b, p]]
+        for p in range(size):
+            expected = max(model[p], least) * per_count + variance[p]
+            residual, deviation = off[p] - model[p], np.float32(math.sqrt(expected))
+            good = (model[p] + margin * deviation < full[p]) & inside[b, p]
+            good &= abs(residual) <= share * deviation + unresolved * model[p] + room
+            weights[p] = np.float32(1.0) / expected if good else least
+            left[p] = residual if good else least
+        for p in range(size):
+            pixels[owner] += weights[p] > 0.0
         for i in range(count):
             for p in range(size):
-                weighted[p] = weight[b, p] * images[b, i, p]
+                weighted[p] = weights[p] * images[b, i, p]
             for k in range(i, count):
                 gram[i, k] = _scalar_product(weighted, images[b, k])
                 gram[k, i] = gram[i, k]
         _add_block(information[owner], gradient[owner], gram, matrix[b])
         chi2[owner] += gram[count - 1, count - 1]
+    for b in range(blocks):
+        of_star = information[star[b]]
+        if b == 0 or star[b] != star[b - 1]:
+            for q in range(len(of_star)):
+                for r in range(q):
+                    of_star[r, q] = of_star[q, r]
 
 
 @loop_helper
@@ -282,21 +294,24 @@ def _scalar_product(a: Float32Array, b: Float32Array) -> np.floating[Any]:
 
 @loop_helper
 def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, matrix: FloatArray) -> None:
-    """Add the products `gram` of images to information and gradient of the parameters of one star."""
+    """Add the products `gram` of images to gradient and lower half of the information of one star."""
     images, count = matrix.shape
     along = np.empty(images)
     for q in range(count):
+        used = False
         for i in range(images):
             along[i] = 0.0
         for k in range(images):
             share = matrix[k, q]
             if share != 0.0:
+                used = True
                 gradient[q] += share * gram[k, images]
                 for i in range(images):
                     along[i] += share * gram[k, i]
-        for r in range(count):
-            for i in range(images):
-                information[r, q] += matrix[i, r] * along[i]
+        if used:
+            for r in range(q + 1):
+                for i in range(images):
+                    information[q, r] += along[i] * matrix[i, r]
 
 
 def _shared_pixels(
