@@ -394,7 +394,7 @@ class Judge:
         """Return whether stars explain all light of a region, so that no object can be merged with stars."""
         if judged.light is None:
             return False
-        return judged.light.excess(self._pixels_of(label)) < self.objects.improvement
+        return judged.light.excess(self._pixels_of(label)) < self.objects.crossing_improvement
 
     def _stars_fill(self, label: int) -> bool:
         """Return whether few stars near the axis of a region explain all light of the region."""
@@ -408,8 +408,8 @@ class Judge:
             light = self._light(ends, per_length=_FEW_PATHS)
         except FlightError:
             return False
-        only_stars = self._only_stars(light, self.objects.crossing_improvement)
-        return only_stars and light.excess(region) < self.objects.improvement
+        enough = self.objects.crossing_improvement
+        return self._only_stars(light, enough) and light.excess(region) < enough
 
     def _pixels_of(self, label: int) -> IntArray:
         """Return the pixels (x, y) of a region (m, 2), row by row."""
@@ -421,10 +421,10 @@ class Judge:
     def merged(self, settled: IntArray, strange: IntArray, explained: IntArray) -> list[SpaceObject]:
         """Return the objects in regions in which objects and stars may be merged.
 
-        If few stars do not explain all light of a region, the light of its stars is subtracted, and the
-        brightest remainder is tested. Regions whose label is in `settled` are not examined. Regions whose
-        label is in `strange` are examined first. Regions whose label is in `explained` contain only stars,
-        and count as examined.
+        If few stars do not explain all light of a region, its stars are fitted. If the fitted stars do not
+        explain it either, the brightest light of the region with and without its stars is tested. Regions
+        whose label is in `settled` are not examined. Regions whose label is in `strange` are examined first.
+        Regions whose label is in `explained` contain only stars, and count as examined.
         """
         regions = self.segmented.regions
         noise = self.segmented.background.typical_noise
@@ -449,11 +449,12 @@ class Judge:
                 self.settings.gain,
                 self.settings.saturation or np.inf,
             )
+            stars, left = fit_stars(patch, self.rotation, self.pinhole)
+            if patch.excess(left) < self.objects.crossing_improvement:
+                continue
             found = self._remaining_object(brightest_left(patch, patch.signal), ())
-            if found is None:
-                stars, left = fit_stars(patch, self.rotation, self.pinhole)
-                # Without stars, the light is the same as before.
-                found = self._remaining_object(brightest_left(patch, left), stars) if stars else None
+            if found is None and stars:
+                found = self._remaining_object(brightest_left(patch, left), stars)
                 enough = self.objects.least_share * float(regions.flux[index])
                 found = found if found is not None and found.flux >= enough else None
             objects += [found] if found is not None else []

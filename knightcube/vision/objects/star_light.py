@@ -308,6 +308,7 @@ class Patch:
         beyond: counts assumed beyond the rectangle, as ((above, below), (left, right)); infinite outside the
             frame, because streaks may continue there.
         psf_sigma: standard deviation of the PSF, px.
+        gain: electrons per count.
         seen: signal convolved with the PSF (rows, columns).
     """
 
@@ -318,11 +319,22 @@ class Patch:
     mask: BoolArray
     beyond: tuple[tuple[float, float], tuple[float, float]]
     psf_sigma: float
+    gain: float = 1.0
     seen: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         """Smooth the signal, which the search for stars and the search for objects use."""
         object.__setattr__(self, "seen", _smoothed(self.signal, self.psf_sigma))
+
+    def excess(self, left: FloatArray) -> float:
+        """Return by how much chi-square of the counts `left` in the region exceeds its expected value.
+
+        The array `left` (rows, columns) is the signal without the light of a model. No model of the light
+        decreases chi-square by more than about the returned value.
+        """
+        weight = self.weight[self.mask]
+        variance = self.noise**2 + np.maximum(self.signal[self.mask], 0.0) / self.gain
+        return float(np.sum((left[self.mask] ** 2 - variance) * weight**2))
 
     def smoothed(self, light: FloatArray) -> FloatArray:
         """Return `light` (rows, columns) convolved with the PSF, which is the matched filter of a point."""
@@ -353,7 +365,7 @@ def cut_patch(
         np.inf if off else 0.0 for off in (top == 0, bottom == rows, left == 0, right == columns)
     )
     beyond = ((above, below), (before, after))
-    return Patch(signal, weight, segmented.background.typical_noise, corner, mask, beyond, psf_sigma)
+    return Patch(signal, weight, segmented.background.typical_noise, corner, mask, beyond, psf_sigma, gain)
 
 
 def _smoothed(light: FloatArray, psf_sigma: float) -> FloatArray:

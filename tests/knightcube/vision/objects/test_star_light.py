@@ -13,9 +13,11 @@ from knightcube.vision.objects.star_light import (
     _brightest_path,
     _fit_line,
     brightest_left,
+    cut_patch,
     fit_stars,
 )
 from knightcube.vision.objects.streak_ends import segment_frame
+from knightcube.vision.objects.streak_images import star_path
 from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_frames import deposit, rate_at, rotate, star_camera
 
@@ -96,6 +98,27 @@ def test_pure_noise_contains_neither_star_nor_object() -> None:
     assert paths == []
     np.testing.assert_array_equal(left, patch.signal)
     assert brightest_left(patch, left) is None
+
+
+@pytest.mark.parametrize("crossed", [False, True])
+def test_an_object_in_a_region_exceeds_the_expected_chi_square(crossed: bool) -> None:
+    """A star of 50 px is alone in its region, or is crossed by an object of 15,000 counts."""
+    middle = _CAMERA.pinhole.unit_vectors(np.array([[245.0, 240.0]]))[0]
+    path = star_path(middle, _ROTATION, 0.5, _CAMERA.pinhole)
+    ends = np.array([[240.0, 225.0], [252.0, 255.0]])
+    image = np.zeros((512, 512))
+    deposit(image, path, 40_000.0, 1.0)
+    if crossed:
+        deposit(image, ends[0] + np.linspace(0.0, 1.0, 501)[:, None] * np.diff(ends, axis=0), 15_000.0, 1.0)
+    noisy = 500.0 + image + np.random.default_rng(8).normal(0.0, np.sqrt(_NOISE**2 + image))
+    segmented = segment_frame(np.rint(noisy).astype(np.uint16), EndpointSettings())
+    light = StarLight(segmented, path[[0, -1]], _ROTATION, _CAMERA.pinhole, 1.0, 1.0, 65_535.0)
+    label = segmented.regions.labels[240, 245]
+    row, column = np.nonzero(segmented.regions.labels == label)
+    patch = cut_patch(segmented, segmented.regions, 0, 1.0, 1.0, 65_535.0)
+    _, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
+    for excess in (light.excess(np.stack([column, row], axis=-1)), patch.excess(left)):
+        assert (excess > 1000.0) if crossed else (excess < 200.0)
 
 
 @pytest.mark.parametrize(("beyond", "lit"), [(0.0, True), (1.5, True), (12.0, False), (30.0, False)])
