@@ -39,11 +39,15 @@ _ROUNDING_VARIANCE = 1.0 / 12.0
 
 @dataclass(frozen=True)
 class Background:
-    """Background level and noise (counts) of blocks of pixels on a regular grid over a frame of `shape`."""
+    """Background level and noise (counts) of blocks of pixels on a regular grid over a frame of `shape`.
+
+    Under `stray_light`, the blocks have half of the usual side length.
+    """
 
     level: FloatArray
     noise: FloatArray
     shape: tuple[int, int]
+    stray_light: bool = False
 
     @functools.cached_property
     def typical_level(self) -> float:
@@ -125,13 +129,32 @@ def _fill_row(
         floor[column] = variance + share * rise
 
 
-def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Background:
+# Minimum fraction of blocks whose level differs from a neighbouring block by more than the noise, under stray
+# light.
+_LEAST_UNEVEN = 0.25
+
+
+def estimate_background(
+    pixels: Image, block: int = 64, stride: int = 4, *, stray_light: bool | None = None
+) -> Background:
     """Return background level and noise of `pixels` (rows, columns) in blocks of `block` x `block` pixels.
 
     For speed, only every `stride`-th pixel of every `stride`-th row is used. With the defaults, 256 samples
     per block give the level with an error of 6 % of the noise, and the noise with an error of 5 %. A block
     that is filled by a bright object gets the median noise of the surrounding 3 x 3 blocks.
+
+    Stray light changes the level within a block. Blocks and stride are then halved, and the moments are those
+    of the differences from the level that is interpolated between the centres of the larger blocks. Stray
+    light is assumed if many neighbouring blocks differ, unless `stray_light` states it.
     """
+    coarse = _of_blocks(pixels, block, stride, None)
+    if not (_is_uneven(coarse) if stray_light is None else stray_light):
+        return coarse
+    return _of_blocks(pixels, max(1, block // 2), max(1, stride // 2), coarse)
+
+
+def _of_blocks(pixels: Image, block: int, stride: int, coarse: Background | None) -> Background:
+    """Return the background in blocks, by differences from the interpolated background `coarse` if given."""
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
     rows, columns = pixels.shape
@@ -139,10 +162,31 @@ def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Back
     height, width = rows // down, columns // across
     sample = pixels[: down * height, : across * width].reshape(down, height, across, width)
     sample = sample[:, stride // 2 :: stride, :, stride // 2 :: stride].transpose(0, 2, 1, 3)
-    values = sample.reshape(down, across, -1).astype(np.float64)
+    values, known = sample.reshape(down, across, -1).astype(np.float64), np.zeros((down, across))
+    if coarse is not None:
+        blocks = [np.arange(count)[:, None] * side for count, side in ((down, height), (across, width))]
+        row, column = (
+            first + np.arange(stride // 2, side, stride)
+            for first, side in zip(blocks, (height, width), strict=True)
+        )
+        place = row[:, None, :, None], column[None, :, None, :]
+        light = among_blocks(coarse.level, coarse.shape, *np.broadcast_arrays(place[1], place[0]))
+        values -= light.reshape(values.shape)
+        middle = [first + 0.5 * (side - 1) for first, side in zip(blocks, (height, width), strict=True)]
+        known = among_blocks(coarse.level, coarse.shape, *np.broadcast_arrays(middle[1].T, middle[0]))
     level, variance = _clipped_moments(values)
     noise = np.sqrt(np.maximum(variance / _CLIPPED_SIGMA**2, _ROUNDING_VARIANCE))
-    return Background(level, ndimage.median_filter(noise, size=3, mode="nearest"), (rows, columns))
+    noise = ndimage.median_filter(noise, size=3, mode="nearest")
+    return Background(known + level, noise, (rows, columns), coarse is not None)
+
+
+def _is_uneven(background: Background) -> bool:
+    """Return whether many blocks differ from a neighbouring block by more than their noise."""
+    level, noise = background.level, background.noise
+    steep = np.zeros(level.shape, dtype=np.bool_)
+    steep[1:] |= np.abs(np.diff(level, axis=0)) > noise[1:]
+    steep[:, 1:] |= np.abs(np.diff(level, axis=1)) > noise[:, 1:]
+    return float(np.mean(steep)) > _LEAST_UNEVEN
 
 
 def _clipped_moments_numpy(values: FloatArray) -> tuple[FloatArray, FloatArray]:

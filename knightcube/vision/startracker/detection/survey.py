@@ -142,7 +142,7 @@ def measure_sky(pixels: Image, single: Background | None = None) -> SkyBackgroun
     level = Surface(single.level, shape)
     row, column = np.arange(2, shape[0] - 1, _STRIDE), np.arange(2, shape[1] - 1, _STRIDE)
     sample = _smoothed_at(pixels, row, column)
-    smooth = estimate_background(sample, _SKY_BLOCK // _STRIDE, 1)
+    smooth = estimate_background(sample, _SKY_BLOCK // _STRIDE, 1, stray_light=single.stray_light)
     # Rounding to whole counts causes noise even if all counts of the sky are zero.
     smooth_noise = np.maximum(smooth.noise, KERNEL_NORM * _ROUNDING)
     lone = pixels[2::_STRIDE, 2::_STRIDE].astype(np.float32)
