@@ -129,9 +129,10 @@ def _fill_row(
         floor[column] = variance + share * rise
 
 
-# Minimum fraction of blocks whose level differs from a neighbouring block by more than the noise, under stray
-# light.
+# Minimum fraction of blocks whose level changes smoothly by more than the noise, under stray light.
 _LEAST_UNEVEN = 0.25
+# Largest ratio of second to first differences of the levels of blocks, for a smooth change.
+_SMOOTH = 0.5
 
 
 def estimate_background(
@@ -181,11 +182,20 @@ def _of_blocks(pixels: Image, block: int, stride: int, coarse: Background | None
 
 
 def _is_uneven(background: Background) -> bool:
-    """Return whether many blocks differ from a neighbouring block by more than their noise."""
-    level, noise = background.level, background.noise
-    steep = np.zeros(level.shape, dtype=np.bool_)
-    steep[1:] |= np.abs(np.diff(level, axis=0)) > noise[1:]
-    steep[:, 1:] |= np.abs(np.diff(level, axis=1)) > noise[:, 1:]
+    """Return whether the level of many blocks changes by more than their noise, and does so smoothly.
+
+    The levels of blocks with bright stars or the limb of a planet change, too, but not smoothly.
+    """
+    steep = np.zeros(background.level.shape, dtype=np.bool_)
+    for axis in (0, 1):
+        level = np.moveaxis(background.level, axis, 0)
+        if len(level) < 3:
+            return False
+        slope, bend = 0.5 * (level[2:] - level[:-2]), level[2:] - 2.0 * level[1:-1] + level[:-2]
+        smooth = (np.abs(slope) > np.moveaxis(background.noise, axis, 0)[1:-1]) & (
+            np.abs(bend) < _SMOOTH * np.abs(slope)
+        )
+        np.moveaxis(steep, axis, 0)[1:-1] |= smooth
     return float(np.mean(steep)) > _LEAST_UNEVEN
 
 

@@ -44,8 +44,33 @@ def test_a_sloping_background_is_followed_within_its_sampling_error() -> None:
     error = background.map(background.level) - slope
     # The error is 12/16 counts for 256 samples per block. The worst of 64 blocks may have six times as much.
     assert np.abs(error[:, 32:-32]).max() < 4.5
-    # The slope spans 12.8 counts within a block, so that the noise is sqrt(12^2 + 12.8^2/12) = 12.6.
-    assert background.noise.mean() == pytest.approx(12.6, rel=0.03)
+    # The slope spans 12.8 counts within a block of 64 px, which would make the noise sqrt(12^2 + 12.8^2/12).
+    assert background.stray_light
+    assert background.noise.mean() == pytest.approx(12.0, rel=0.03)
+
+
+def test_stray_light_is_followed_to_less_than_its_noise() -> None:
+    row, column = np.indices((640, 640)) - 300.0
+    light = 100.0 + 800.0 * np.exp(-0.5 * (row**2 + column**2) / 200.0**2)
+    noise = np.sqrt(25.0 + light / 5.0)
+    pixels = np.rint(light + noise * np.random.default_rng(3).normal(size=light.shape)).astype(np.uint16)
+    background = estimate_background(pixels)
+    inner = np.s_[16:-16, 16:-16]
+    error = (background.map(background.level) - light) / noise
+    assert np.sqrt(np.mean(error[inner] ** 2)) < 0.25
+    ratio = background.map(background.noise) / noise
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
+    coarse = estimate_background(pixels, stray_light=False)
+    assert np.sqrt(np.mean(((coarse.map(coarse.level) - light) / noise)[inner] ** 2)) > 0.5
+
+
+def test_a_bright_limb_and_a_flat_sky_are_not_stray_light() -> None:
+    rng = np.random.default_rng(4)
+    flat = 100.0 + rng.normal(0.0, 10.0, (512, 512))
+    row, column = np.indices(flat.shape)
+    limb = flat + 3000.0 * (np.hypot(row - 700.0, column - 256.0) < 400.0)
+    for scene in (flat, limb):
+        assert not estimate_background(np.rint(np.clip(scene, 0.0, None)).astype(np.uint16)).stray_light
 
 
 def test_streaks_hardly_move_level_and_noise() -> None:

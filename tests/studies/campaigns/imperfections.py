@@ -95,6 +95,14 @@ def _gradient(electrons: float) -> Stage:
     return add
 
 
+def _wide_light(electrons: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return the light with stray light of 5,000 e- around a random place, whose sigma is 250 px."""
+    row, column = np.indices(electrons.shape)
+    place = rng.uniform(0.0, electrons.shape)
+    away = np.square(row - place[0]) + np.square(column - place[1])
+    return np.asarray(electrons + 5000.0 * np.exp(-0.5 * away / 250.0**2))
+
+
 def _blob(image: FloatArray, rng: np.random.Generator) -> FloatArray:
     y, x = np.indices(image.shape)
     column, row = rng.uniform(100.0, 900.0, 2)
@@ -221,4 +229,5 @@ IMPERFECTIONS: dict[str, Imperfection] = {
     "sigma 3 px told": Imperfection(Optics((gaussian(3.0),), radius=18.0), known={"psf_sigma": 3.0}),
     "ring 8 px, hole 4 px": Imperfection(Optics((ring(8.0, 4.0),), radius=9.0)),
     "ring 8 px, hole 6 px": Imperfection(Optics((ring(8.0, 6.0),), radius=9.0)),
+    "stray light, wide": Imperfection(electrons=_wide_light, gain=5.0, known={"gain": 5.0}),
 }

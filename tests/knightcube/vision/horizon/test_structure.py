@@ -96,7 +96,7 @@ def test_a_lit_panel_hides_no_limb_with_its_mask_and_makes_none_alone() -> None:
     assert not mask[tuple(np.rint(found.points).astype(int).T[::-1])].any()
     blind = find_nadir(picture, MODEL.lens, knowledge, settings, np.ones_like(mask))
     assert blind.status is HorizonStatus.NO_HORIZON
-    with pytest.raises(ValueError, match="give \\(rows, columns\\)"):
+    with pytest.raises(ValueError, match="give \\(512, 512\\)"):
         find_nadir(picture, MODEL.lens, knowledge, settings, mask[:100])
 
 
