@@ -329,8 +329,8 @@ def _corners_of_regions(
     """
     largest, most = 0, 0
     for number in range(len(boxes)):
-        size = boxes[number, 1] - boxes[number, 0] + 2 * _PADDING
-        size *= boxes[number, 3] - boxes[number, 2] + 2 * _PADDING
+        height, width = boxes[number, 1] - boxes[number, 0], boxes[number, 3] - boxes[number, 2]
+        size = (height + 2 * _PADDING) * (width + 2 * _PADDING)
         largest, most = max(largest, size), most + size // 4
     # Peaks of the response are not adjacent, so that a region has fewer peaks than a quarter of its pixels.
     corners, counts, total = np.empty((most, 2)), np.zeros(len(label), dtype=np.int64), 0
@@ -344,9 +344,7 @@ def _corners_of_regions(
         wanted = _widened(spans, max(half_width, 1), right - left)
         response = _response(light, around, label[number], wanted, smooth, slope, window, k, scratch)
         found = _peaks(response, around, label[number], spans, relative, half_width, corners[total:])
-        for place in range(total, total + found):
-            corners[place, 0] += left
-            corners[place, 1] += top
+        corners[total : total + found] += np.array([left, top])
         counts[number] = found
         total += found
     return corners[:total].copy(), counts
