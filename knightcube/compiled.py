@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import logging
 import os
 import pickle
 from collections.abc import Callable
@@ -31,6 +32,10 @@ Result = TypeVar("Result")
 _SWITCH = "KNIGHTCUBE_COMPILED"
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
 """Options of LLVM for helpers: sums may be computed in any order, which lets them use vector instructions."""
+_COMPILING = (
+    "numba compiles the star tracker and the streak fit for this machine; this takes up to a minute, once "
+    f"({_SWITCH}=0 avoids it)"
+)
 _helpers: list[Callable[..., Any]] = []
 """Functions that loop forms call, until numba knows them."""
 
@@ -73,6 +78,7 @@ class HotFunction(Generic[Parameters, Result]):
         Raises ImportError if numba is not installed, or does not fit the installed numpy.
         """
         numba = importlib.import_module("numba")
+        _announce_compilation()
         while _helpers:
             numba.extending.register_jitable(error_model="numpy", fastmath=_ANY_ORDER)(_helpers.pop())
         try:
@@ -115,6 +121,22 @@ def _numba_is_usable() -> bool:
     except ImportError:
         return False
     return True
+
+
+@functools.cache
+def _announce_compilation() -> None:
+    """Make the first compilation of this process log a warning; code that is read from a file needs none."""
+    event = importlib.import_module("numba.core.event")
+
+    class FirstCompilation(event.Listener):  # type: ignore[misc, name-defined]  # numba has no types
+        def on_start(self, _: object) -> None:
+            event.unregister("numba:compile", self)
+            logging.getLogger(__name__).warning(_COMPILING)
+
+        def on_end(self, _: object) -> None:
+            pass
+
+    event.register("numba:compile", FirstCompilation())
 
 
 def use_numpy_forms() -> None:

@@ -51,7 +51,7 @@ def test_without_a_usable_numba_the_numpy_form_is_used(numba: str, tmp_path: Pat
     subprocess.run([sys.executable, "-c", code], env=environment, timeout=100, check=True)
 
 
-def test_a_damaged_file_of_machine_code_is_left_aside(tmp_path: Path) -> None:
+def test_compilation_is_announced_and_a_damaged_file_of_machine_code_is_left_aside(tmp_path: Path) -> None:
     """The file is truncated in any way that a full disk or a lost supply may leave."""
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     environment = {
@@ -64,14 +64,22 @@ def test_a_damaged_file_of_machine_code_is_left_aside(tmp_path: Path) -> None:
         "import numpy as np\nfrom tests.support.compiled_forms import sum_of_squares as hot\n"
         "assert hot(np.arange(5.0)) == 30.0"
     )
-    for damage in ("", "index", "code", "folder"):
+    for damage in ("", "none", "index", "code", "folder"):
         for file in tmp_path.rglob("*.nbi" if damage == "index" else "*.nbc"):
-            if damage:
+            if damage not in {"", "none"}:
                 file.write_bytes(file.read_bytes()[:40])
             if damage == "folder":
                 file.unlink()
                 file.mkdir()
-        subprocess.run([sys.executable, "-c", code], env=environment, timeout=100, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env=environment,
+            timeout=100,
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        assert done.stderr.count("numba compiles") == (damage == "")
         assert list(tmp_path.rglob("*.nbc"))
 
 
