@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,9 +105,15 @@ def test_the_mean_rate_over_an_exposure_is_the_integral_of_the_truth() -> None:
 
 def test_rates_from_streaks_are_compared_with_the_truth_over_their_exposure() -> None:
     truth = [(float(t), {"rate": [0.1, 0.0, 0.0]}) for t in range(4)]
-    good = {"exposure_start_ns": 1_000_000_000, "exposure": 1.0, "status": "rate", "accepted": 1,
-            "rate": [0.13, 0.04, 0.0], "covariance": [9e-4, 16e-4, 1e-4, 0.0, 0.0, 0.0]}  # fmt: skip
-    bad = {"status": "too-few", "rate": [math.nan] * 3, "covariance": [math.nan] * 6}
+    good: dict[str, Any] = {
+        "exposure_start_ns": 1_000_000_000,
+        "exposure": 1.0,
+        "status": "rate",
+        "accepted": 1,
+        "rate": [0.13, 0.04, 0.0],
+        "covariance": [9e-4, 16e-4, 1e-4, 0.0, 0.0, 0.0],
+    }
+    bad: dict[str, Any] = {"status": "too-few", "rate": [math.nan] * 3, "covariance": [math.nan] * 6}
     reversed_sign = {**good, "rate": [-0.1, 0.0, 0.0], "status": "ambiguous", "accepted": 0}
     frames = [(1.0, good), (1.5, reversed_sign), (2.0, bad), (3.0, bad)]
     found = signals.streaks(packed_run(truth=truth, streak=frames))

@@ -17,12 +17,12 @@ from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScen
 from knightcube.vision.streaks.joint_fit import FitProblem, brightest_fit
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.uncertainty import (
-    StreakResiduals,
     apparent_rates,
     correct,
     end_displacement,
     side_displacement,
 )
+from knightcube.vision.streaks.vibration import StreakResiduals
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky, turn_of
 from tests.support.scenes import FIELD, RandomSlew
