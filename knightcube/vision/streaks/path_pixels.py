@@ -66,10 +66,6 @@ class Strips:
     index: IntArray
     inside: BoolArray
 
-    def rows(self, of: IntArray | slice) -> Float32Array:
-        """Return the frame's row indices (.., LINES, k) of the pixels in the blocks that `of` selects."""
-        return pixel_rows(self.corner[of], self.step[of], self.index.shape[2])
-
 
 def pixel_rows(corner: IntArray, step: IntArray, count: int) -> Float32Array:
     """Return the row indices (b, LINES, count) of the pixels on lines, see `Strips`."""

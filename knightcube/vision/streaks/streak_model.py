@@ -532,7 +532,8 @@ def coefficients(
     delay = np.zeros(len(stars))
     ending, spread = stars, strips.star
     if shutter.delay_per_row != 0.0:
-        rows = strips.rows(slice(None))[:, LINES // 2].mean(axis=1).astype(np.float64)
+        last = strips.index.shape[2] - 1
+        rows = strips.corner[:, LINES // 2, 1] + 0.5 * last * strips.step[:, 1]
         delay, ending, spread = np.asarray(shutter.delay(rows)), of_block, np.arange(len(centre))
     times = np.concatenate([centre - _STEP, centre + _STEP, delay - 0.5, delay + 0.5])
     points = np.concatenate([of_block, of_block, ending, ending])
