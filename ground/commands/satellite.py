@@ -35,7 +35,7 @@ from flight.link.commands import (
     problem_of,
     words_of,
 )
-from flight.link.files.store import Store, ground_files_folder
+from flight.link.files.store import Store
 from flight.link.files.transfer import Progress
 from flight.link.modes import Mode
 from flight.link.process import directives
@@ -79,6 +79,7 @@ from ground.link.commanding import (
     exchange,
     explained,
     failed,
+    ground_files_folder,
     obeyed,
     sha256_of,
     terminal_of,

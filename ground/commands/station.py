@@ -18,11 +18,10 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from flight.app.service import EndingSignals
-from flight.link.files.store import ground_files_folder
 from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.log import find_runs
 from ground.commands.options import positive
-from ground.link.commanding import add_link_options, terminal_of
+from ground.link.commanding import add_link_options, ground_files_folder, terminal_of
 from ground.link.gateway import ADDRESS, Gateway, new_token, token_file, token_path
 from ground.link.terminal import make_keys
 from ground.watch import (

@@ -125,6 +125,16 @@ def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExc
     )
 
 
+def ground_files_folder(keys: Path) -> Path:
+    """Return the ground's folder for transferred files, such as keys/ground-files for the keys keys/ground.
+
+    The folder differs from the satellite's (`files_folder` of `flight.link.files.store`), so that both ends
+    can run on one machine.
+    """
+    folder = keys.absolute()
+    return folder.with_name(f"{folder.name}-files")
+
+
 def terminal_of(options: argparse.Namespace) -> Terminal:
     """Return the terminal for the link options.
 

@@ -63,6 +63,10 @@ class Background:
         """Return the block values `grid`, interpolated bilinearly to all pixels of a frame, as float32."""
         return _interpolated(grid, self.shape)
 
+    def level_at(self, column: FloatArray | IntArray, row: FloatArray | IntArray) -> FloatArray:
+        """Return the level, interpolated bilinearly at pixels whose columns and rows broadcast together."""
+        return among_blocks(self.level, self.shape, *np.broadcast_arrays(column, row))
+
     def subtracted(self, pixels: Image) -> tuple[Image, Image]:
         """Return the counts of `pixels` (rows, columns) above the level, and the noise variances, float32."""
         return _subtracted(pixels, self.level, np.square(self.noise))
@@ -165,16 +169,11 @@ def _of_blocks(pixels: Image, block: int, stride: int, coarse: Background | None
     sample = sample[:, stride // 2 :: stride, :, stride // 2 :: stride].transpose(0, 2, 1, 3)
     values, known = sample.reshape(down, across, -1).astype(np.float64), np.zeros((down, across))
     if coarse is not None:
-        blocks = [np.arange(count)[:, None] * side for count, side in ((down, height), (across, width))]
-        row, column = (
-            first + np.arange(stride // 2, side, stride)
-            for first, side in zip(blocks, (height, width), strict=True)
-        )
-        place = row[:, None, :, None], column[None, :, None, :]
-        light = among_blocks(coarse.level, coarse.shape, *np.broadcast_arrays(place[1], place[0]))
-        values -= light.reshape(values.shape)
-        middle = [first + 0.5 * (side - 1) for first, side in zip(blocks, (height, width), strict=True)]
-        known = among_blocks(coarse.level, coarse.shape, *np.broadcast_arrays(middle[1].T, middle[0]))
+        top, left = np.arange(down) * height, np.arange(across) * width
+        row = top[:, None, None, None] + np.arange(stride // 2, height, stride)[:, None]
+        column = left[:, None, None] + np.arange(stride // 2, width, stride)
+        values -= coarse.level_at(column, row).reshape(values.shape)
+        known = coarse.level_at(left + 0.5 * (width - 1), (top + 0.5 * (height - 1))[:, None])
     level, variance = _clipped_moments(values)
     noise = np.sqrt(np.maximum(variance / _CLIPPED_SIGMA**2, _ROUNDING_VARIANCE))
     noise = ndimage.median_filter(noise, size=3, mode="nearest")

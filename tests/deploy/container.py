@@ -19,7 +19,7 @@ from knightcube.vision.startracker.index.sky_index import PATH
 from tests.hal.guardian.live_flight import ROOT, write_config
 
 LIMIT_S = 540.0
-"""Of what runs in the container, which takes two minutes; a busy machine needs more."""
+"""Longest time (s) of the scenario in the container. It takes two minutes on an idle machine."""
 _SHARE = "/share"
 _UNITS = "etc/systemd/system"
 _FACTS = "/run/knightcube-devices/facts.json"

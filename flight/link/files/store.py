@@ -110,15 +110,6 @@ def files_folder(keys: Path) -> Path:
     return keys.absolute().parent / "files"
 
 
-def ground_files_folder(keys: Path) -> Path:
-    """Return the ground's folder for transferred files, such as keys/ground-files for the keys keys/ground.
-
-    The folder differs from `files_folder`, so that both ends can run on one machine.
-    """
-    folder = keys.absolute()
-    return folder.with_name(f"{folder.name}-files")
-
-
 class Store:
     """Folder with the state of one CFDP entity. Only one process may use the folder.
 

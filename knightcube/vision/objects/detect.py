@@ -319,7 +319,7 @@ class Judgement:
 
     Attributes:
         verdict: what the streak or region is.
-        candidate: the object, or None if there is no object.
+        candidate: the detected object, or None for any other verdict than OBJECT.
         light: the stars that explain the pixels, or None for an object and for an untested streak.
     """
 

@@ -91,7 +91,7 @@ def test_a_motion_with_a_vibration_has_an_exact_time_reversal() -> None:
 
 @pytest.mark.parametrize(("cycles", "amplitude"), [(1.6, 0.8), (4.3, 0.6)])
 def test_a_resolved_vibration_leaves_no_error_in_the_rate(cycles: float, amplitude: float) -> None:
-    """Without the vibration in the model, the first rate is wrong by up to 1 % and is refused."""
+    """Without the vibration in the model, the frame is refused."""
     frame = _frame(cycles, amplitude, 0)
     found = frame.motion()
     assert found.status is StreakStatus.RATE
@@ -101,8 +101,11 @@ def test_a_resolved_vibration_leaves_no_error_in_the_rate(cycles: float, amplitu
 
 
 def test_a_vibration_that_no_streak_resolves_is_refused_or_within_the_claim() -> None:
-    """Its width is that of a slightly wider point spread, and its ends are anywhere within the amplitude."""
-    for seed in range(3):
+    """The streaks look like those of a slightly wider point spread, but their ends have moved.
+
+    A tolerance of 5 % of the variance of the point spread left the rate of the seed 5 wrong by 5.7 sigma.
+    """
+    for seed in (2, 5, 6):
         frame = _frame(41.0, 0.45, seed)
         found = frame.motion()
         assert found.rate is None or _sigmas(frame, found) < 4.0
