@@ -60,6 +60,8 @@ class PySerialPort:
         self._pending: deque[tuple[int, bytes]] = deque()
         self._pending_bytes = 0
         self._lock = threading.Lock()
+        # Held while the port is used or replaced: the number of a closed file may belong to another file.
+        self._port_lock = threading.Lock()
         self._failure = ""
         self._closing = threading.Event()
         try:
@@ -93,7 +95,8 @@ class PySerialPort:
         if self._failure:
             raise NotResponding(self._device, self._failure)
         try:
-            self._write(data)
+            with self._port_lock:
+                self._write(data)
         except _PORT_ERRORS as error:
             message = f"writing failed ({error}): is the device still there?"
             raise NotResponding(self._device, message) from error
@@ -103,7 +106,8 @@ class PySerialPort:
         # The value is stored even if the port is lost, because the port is reopened at this baud rate.
         self.baud_rate = baud_rate
         try:
-            self._serial.baudrate = baud_rate
+            with self._port_lock:
+                self._serial.baudrate = baud_rate
         except _PORT_ERRORS as error:
             raise NotResponding(self._device, f"does not support {baud_rate} baud ({error})") from error
 
@@ -112,8 +116,8 @@ class PySerialPort:
         if self._closing.is_set():
             return
         self._closing.set()
-        if self._serial.is_open:
-            self._serial.cancel_read()
+        with self._port_lock:
+            self._serial.cancel_read()  # no effect on a closed port
         self._thread.join(timeout=2.0)
         self._serial.close()
         self._failure = self._failure or "the port was closed"
@@ -162,12 +166,15 @@ class PySerialPort:
 
         The receiving thread calls this method.
         """
-        self._serial.close()
+        with self._port_lock:
+            self._serial.close()
         while not self._closing.wait(_REOPEN_S):
             try:
-                self._serial = self._open()
+                port = self._open()
             except _PORT_ERRORS:
                 continue
+            with self._port_lock:
+                self._serial = port
             self._failure = ""
             return
 

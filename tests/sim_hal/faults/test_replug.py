@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 import tty
 from pathlib import Path
@@ -80,3 +81,48 @@ def test_a_port_that_is_gone_for_good_can_be_closed(tmp_path: Path) -> None:
     begun = time.monotonic()
     port.close()
     assert time.monotonic() - begun < 1.0
+
+
+def test_a_port_that_vanishes_is_not_closed_while_data_are_sent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = tmp_path / "imu"
+    ends = plug_in(link)
+    port = PySerialPort(str(link), 115200, SystemClock())
+    open_meanwhile = []
+
+    def vanish(data: bytes) -> None:
+        pull_out(ends)
+        time.sleep(0.1)  # the receiving thread notices that the port is lost
+        open_meanwhile.append(port._serial.is_open)
+
+    monkeypatch.setattr(port, "_write", vanish)
+    port.send(b"data")
+    port.close()
+    assert open_meanwhile == [True]
+
+
+def test_a_port_can_be_closed_while_the_thread_gives_up_the_lost_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = tmp_path / "imu"
+    ends = plug_in(link)
+    port = PySerialPort(str(link), 115200, SystemClock())
+    begun, ended = threading.Event(), threading.Event()
+    close, cancel_read = port._serial.close, port._serial.cancel_read
+
+    def close_slowly() -> None:
+        begun.set()
+        time.sleep(0.1)
+        close()
+        ended.set()
+
+    def cancel() -> None:
+        assert ended.is_set()
+        cancel_read()
+
+    monkeypatch.setattr(port._serial, "close", close_slowly)
+    monkeypatch.setattr(port._serial, "cancel_read", cancel)
+    pull_out(ends)
+    assert begun.wait(3.0)
+    port.close()
