@@ -659,7 +659,7 @@ class Renewal:
                 raise Refused("this release flies already")
             board.point("previous", trial.old)
             board.point("current", trial.new)
-        board.restart()  # before the state is stored: a kill in between only repeats this step
+        board.restart()  # if killed before the state is stored, this step is repeated
         trial.stage = "fly"
         self._save()
 
@@ -712,7 +712,7 @@ class Renewal:
         self._note(text)
         state.trial = None
         self._report(trial.request, "failed", "activate", text)
-        board.restart()  # before the state is stored: a kill in between only repeats this step
+        board.restart()  # if killed before the state is stored, this step is repeated
         self._save()
 
     def _judge(self) -> None:

@@ -534,7 +534,7 @@ def open_aravis(rig: Rig, camera: Camera | WideCamera) -> AravisCamera:
 
 def probe_v4l2(rig: Rig, camera: Camera | WideCamera) -> str:
     """Return the text about a camera that `flight.app.devices.open_camera` has opened."""
-    return "opens; `knightcube camera` shows its images"
+    return "the camera can be opened; `knightcube camera` shows its images"
 
 
 probe_aravis = probe_v4l2

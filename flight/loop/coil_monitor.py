@@ -21,9 +21,9 @@ An output leg that is stuck high is found by commanding zero currents and brakin
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
 far too large or too small, all coils are commanded to zero. If current still flows at zero commands, there is
 a fault. If current still flows at zero commands, all bridges are braked at once. If braking stops the
-current, the bridges are released one by one, and the bridge at whose release the current returns is broken.
-During the search for a stuck leg, no healthy coil carries current, and no other verdict is given. The search
-ends if neither zero commands nor braking change the current, as with a shorted coil or a wrong current
+current, the bridges are released one by one. If the current returns when a bridge is released, that bridge is
+broken. During the search for a stuck leg, no healthy coil carries current, and no other verdict is given. The
+search ends if neither zero commands nor braking change the current, as with a shorted coil or a wrong current
 monitor. If the commands change continuously, as in the windows of B-dot detumbling, the command that was in
 force during an ADC sample is ambiguous. While commands change continuously, all coils are commanded to zero
 every few seconds as a check, even without a suspicion.

@@ -10,10 +10,10 @@ standard deviation of the gain is large, and the axis is not judged. A gain larg
 physically impossible. A gain larger than `LARGEST_GAIN` shows that the model is wrong, and no axis is judged.
 
 The torques of the coils are normal to the field, so that their gains can hardly be separated from each
-other within a short time. The gain of each coil is therefore estimated with the other coils assumed
-healthy within the accuracy of their description. An axis is judged only if a fault of this axis explains the
-motion clearly better than a fault of another axis. A coil is considered reversed if this hypothesis is far
-more likely than that of healthy coils.
+other within a short time. The gain of each coil is therefore estimated under the assumption that the other
+coils are healthy. Their gains may differ from 1 by the accuracy of their description. An axis is judged only
+if a fault of this axis explains the motion clearly better than a fault of another axis. A coil is considered
+reversed if this hypothesis is far more likely than that of healthy coils.
 
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
 that an inertia error of 2 % can make healthy coils look reversed. The fit therefore subtracts the gyroscopic

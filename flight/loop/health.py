@@ -619,7 +619,7 @@ LEVELS: tuple[ShedLevel, ...] = (
     ShedLevel(False, False, 4, 4, f"{_NEWEST}, no search for objects, 1 of 4 frames and periodic plans"),
     ShedLevel(False, False, 8, 8, f"{_NEWEST}, no search for objects, 1 of 8 frames and periodic plans"),
 )
-"""Levels in the order in which work is reduced."""
+"""Levels of load shedding, from no reduction to the strongest reduction of the work."""
 
 _WINDOW_NS = 60 * SECOND_NS
 """Time (ns) in which the signs of an overload are counted."""

@@ -260,9 +260,9 @@ def _check_power(config: Config, power: Power, refuse: Refuse) -> None:
 
 
 def _connections(config: Config) -> Iterator[tuple[str, str, str]]:
-    """Yield the dotted key, the value and the place of each device file and each I2C address in use.
+    """Yield the dotted key, the value and the address of each device file and each I2C address in use.
 
-    Two devices must not have one place. An I2C bus is shared, so that its place includes the address.
+    Two devices must not have the same address. As devices share an I2C bus, an I2C address includes the bus.
     """
 
     def chip(key: str, address: int, bus: int | str | None) -> tuple[str, str, str]:

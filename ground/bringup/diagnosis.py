@@ -111,7 +111,7 @@ class UnitExpectation:
 
 
 def noise_of(values: FloatArray) -> FloatArray:
-    """Return the white noise (3,) of values (k, 3), which slow drifts do not increase."""
+    """Return the standard deviations (3,) of the white noise of values (k, 3), without slow drifts."""
     return np.asarray(np.std(np.diff(values, axis=0), axis=0) / math.sqrt(2.0))
 
 

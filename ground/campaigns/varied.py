@@ -116,7 +116,7 @@ def varied_campaign(path: Path, variations: Sequence[Variation], duration: float
     text = read_text(path)
     base = read_document(text, str(path)).values
     if "simulation" not in base:
-        raise UsageError(f"{path}: has no section `simulation`: a campaign flies simulated devices")
+        raise UsageError(f"{path}: has no section `simulation`; a campaign needs one, add it")
     for one in variations:
         _numbers_at(base, one)
 
@@ -159,7 +159,10 @@ def _case(
 
 
 def _numbers_at(values: dict[str, Any], one: Variation) -> list[tuple[Any, Any, str]]:
-    """Return container, index in the container, and full key of the numbers to draw. Raises UsageError."""
+    """Return container, index in the container, and full key of each number to draw at random.
+
+    Raises UsageError.
+    """
     steps = [int(step) if step.isdigit() else step for step in re.findall(r"\w+", one.key)]
     holder: Any = values
     for depth, step in enumerate(steps[:-1]):

@@ -76,8 +76,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     signed.add_argument("--least", type=int, default=1, metavar="N", help="lowest version of the metadata")
     signed.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder of the bundle")
     for word, purpose in (
-        ("activate", "try a bundle that was put on the satellite"),
-        ("confirm", "end the trial, the artefact stays"),
+        ("activate", "start the trial of a bundle that was uploaded to the satellite"),
+        ("confirm", "end the trial and keep the artefact"),
         ("withdraw", "end the trial, or return to the previous configuration or release"),
     ):
         placed = words.add_parser(word, help=purpose)

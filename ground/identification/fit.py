@@ -312,7 +312,7 @@ def fit(record: Record, noise: MotionNoise, progress: Callable[[int, float], Non
         return _fitted(record, noise, progress)
     except (ValueError, OverflowError) as error:
         # A diverging prediction raises an error for the cosine of infinity or an indefinite covariance.
-        raise IdentificationError("no constants explain this flight: the prediction diverges") from error
+        raise IdentificationError("the fit of the constants failed: the prediction diverges") from error
 
 
 def _fitted(record: Record, noise: MotionNoise, progress: Callable[[int, float], None] | None) -> PlantFit:
@@ -345,7 +345,7 @@ def _fitted(record: Record, noise: MotionNoise, progress: Callable[[int, float],
                 return _finished(record, constants, noise, restarts)
             restarts = gated
     raise IdentificationError(
-        f"no constants explain this flight: in iteration {_MAX_ROUNDS} they still changed by "
+        f"the fit of the constants failed: in iteration {_MAX_ROUNDS} they still changed by "
         f"{largest:.2g} standard deviations"
     )
 
@@ -379,7 +379,7 @@ def _gated(
     passed = innovations(record, constants, noise, restarts, gate, with_gradient=False)
     if len(passed.restarts) > _MAX_RESTARTS * len(record.time):
         raise IdentificationError(
-            f"no constants explain this flight: {len(passed.restarts)} of {len(record.time)} samples differ "
+            f"the fit of the constants failed: {len(passed.restarts)} of {len(record.time)} samples differ "
             f"by more than {gate:g} standard deviations from the predicted motion"
         )
     return passed.restarts

@@ -322,7 +322,7 @@ class Gateway:
     def _refuse(self, line: socket.socket, reason: str) -> None:
         """Close and count a connection, and report the reason.
 
-        Reasons for connections without the token are reported at most once a second.
+        For connections without the token, the reason is reported at most once a second.
         """
         self.refused += 1
         now = time.monotonic()

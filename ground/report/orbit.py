@@ -29,7 +29,7 @@ SUNLIT = 0.99
 JUDGED = 600
 """Number of navigation packets, one per second, over which the residual dipole is judged."""
 MIN_DIPOLE = 1e-9
-"""Lower bound (A m^2) of the residual dipole by which the dipole's error is divided."""
+"""Smallest residual dipole (A m^2) used as the reference of the relative dipole error."""
 SETTLED_AFTER_S = 600.0
 """Time after the start of pointing at a target before its pointing error is judged (s)."""
 

@@ -53,9 +53,9 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
 
 
 def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the times (n,), s, of the camera's schedule, the next times (n,), s, and flags (n,).
+    """Return the start and end times (n,), s, of the camera's intervals, and whether the body is slow (n,).
 
-    A flag states whether the body is slower than `camera.max_rate`. As in flight, an instant at which the
+    The body is slow if its rate is below `camera.max_rate`. As in flight, an instant at which the
     body is too fast does not delay the next instant.
     """
     last = min(float(seconds(run[name])[-1]) for name in ("truth", "orbit_truth"))

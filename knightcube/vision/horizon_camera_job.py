@@ -81,7 +81,7 @@ class HorizonCameraResult:
         sun, nadir: measured directions of Sun and nadir, body axes; None if there is none.
         false: reasons, by camera index, why the content of an image contradicts an accurately known attitude.
             If the attitude is not accurately known, images are not checked and `false` is None.
-        structure: maps of the spacecraft's own structure after these images, by camera index.
+        structure: maps of the spacecraft's own structure, updated with these images, by camera index.
     """
 
     sun: MeasuredDirection | None

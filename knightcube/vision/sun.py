@@ -630,7 +630,7 @@ def sun_of_cameras(
             covariance = sun.covariance + (_CUT**2 * across if sun.cut else 0.0)
             covariance = np.asarray(camera.to_camera.T @ covariance @ camera.to_camera)
             return SunOfCameras(direction, covariance, choice.index, each)
-        reason = f"camera {choice.index}: the Sun contradicts the solar strings"
+        reason = f"camera {choice.index}: its Sun direction contradicts the solar strings"
     if strings.direction is None or strings.basis is None or strings.tangent_covariance is None:
         return SunOfCameras(None, None, None, each, reason or strings.reason)
     covariance = strings.basis.T @ strings.tangent_covariance @ strings.basis

@@ -199,7 +199,7 @@ class MessageData:
         return tuple(value for read in _readers(names) for value in read(self))
 
     def text(self, names: str) -> list[str]:
-        """Return the values of named quantities as text in the unit's format."""
+        """Return the values of named quantities as text in the format of the VN-100."""
         quantities = (_QUANTITIES[name] for name in names.split())
         pairs = [(form, value) for read, form in quantities for value in read(self)]
         # The zero padding would make a text that cannot be read as a NaN.

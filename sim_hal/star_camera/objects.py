@@ -46,7 +46,10 @@ Expose = Callable[[int, FloatArray, FloatArray, Sequence[SourceTrack]], Future[I
 
 DEVICE = "resident space object"
 TRACK_ERROR = 1e-7
-"""Largest interpolation error (rad) of a track between its samples, 3e-4 px of the standard camera."""
+"""Largest interpolation error (rad) of a track between its samples.
+
+This is 3e-4 px of the standard camera.
+"""
 NEAREST = 1.0
 """Shortest distance (m) at which an object is modelled as a point."""
 _FIRST_DURATION = 1000.0

@@ -27,7 +27,7 @@ from tests.hal.cameras.ioctl_camera import IoctlCamera, Knob
 STAR_INTERVAL_NS, WIDE_INTERVAL_NS = 500_000_000, 1_000_000_000
 """Shortest intervals (ns) of the frames of a free-running star camera and wide camera.
 
-Each frame is rendered, also if the driver selects another one.
+Each frame is rendered, even if the driver selects a later frame.
 """
 PATIENCE_NS = 3_000_000_000
 """Time (ns) after an exposure at which a frame that has not arrived is given up."""

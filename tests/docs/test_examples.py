@@ -1,4 +1,4 @@
-"""The examples of the pages "Extending": they run, and change as few files as the pages say."""
+"""Tests that the examples of the pages "Extending" run, and change only the files that the pages name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ways to be led to a target: towards a goal time, at a price of time, moving, or by a step."""
+"""Tests of guidance to a target: with a goal time, a cost of time, a moving target, or by a step."""
 
 from __future__ import annotations
 

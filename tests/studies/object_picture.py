@@ -57,7 +57,8 @@ def draw(run: Run, path: Path) -> None:
 
 
 def _frame(axes: Axes, run: Run, cameras: FloatArray) -> None:
-    """Draw the third frame of the track: the object's streak beside the stars, and its way in the field."""
+    """Draw the third frame of the track with the object's streak, the stars and the object's path.
+    """
     config = as_orbit(configuration.load(CONFIG))
     camera = config.camera
     assert camera is not None

@@ -24,7 +24,7 @@ def _square(value: float) -> float:
 
 @compiled_form_of(sum_of_squares_numpy)
 def sum_of_squares(values: FloatArray) -> float:
-    """Return the sum of the squares of some values: the smallest function with two forms."""
+    """Return the sum of the squares of some values: a minimal function with a numpy and a compiled form."""
     total = 0.0
     for value in values:
         total += _square(value)

@@ -13,7 +13,7 @@ from random import Random
 from hypothesis import strategies as st
 
 Files = Mapping[str, bytes]
-"""Contents by file name, or one stretch of bytes under any name."""
+"""File contents by file name, or the content of a single file under an arbitrary name."""
 
 _HOSTILE = (
     b"-1", b"0", b"1e999", b"-1e999", b"NaN", b"Infinity", b"null", b"true", b"{}", b"[]", b'""', b"9" * 5000,

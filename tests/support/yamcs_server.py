@@ -115,11 +115,11 @@ class Yamcs:
         return found
 
     def packets(self) -> bytes:
-        """Return all packets of the archive, one behind the other."""
+        """Return all packets of the archive, concatenated."""
         return self.raw(f"/archive/{INSTANCE}:exportPackets")
 
     def values(self, names: list[str]) -> Iterator[dict[str, Any]]:
-        """Yield each archived packet's values of some parameters: name, generation time, raw value."""
+        """Yield name, generation time and raw value of each archived value of some parameters."""
         ids = [{"name": f"/{SPACE}/{name}"} for name in names]
         text = self.raw(f"/archive/{INSTANCE}:streamParameterValues", {"ids": ids}).decode()
         decoder, at = json.JSONDecoder(), 0

@@ -562,7 +562,7 @@ class OrbitFilter:
         return self.started and not self.doubts_commands
 
     def _follow_field(self, reading: ImuReading, listens: bool) -> None:
-        """Estimate the rate from the magnetometer; `listens` states whether the field is valid."""
+        """Estimate the rate from the magnetometer; the field is used only if `listens`."""
         assert self._open is not None
         since_ns, now_ns = self._open.end_ns, reading.time_ns
         self._by_field.advance(self._dipoles.mean(since_ns, now_ns), (now_ns - since_ns) / SECOND_NS)

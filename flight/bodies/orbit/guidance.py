@@ -452,7 +452,7 @@ class LearnedBody:
 ACROSS = 0.03
 """Dipole moment that slews may use across the plane of the coils, relative to the weakest coil.
 
-A dipole moment in the plane of two coils makes any torque that these coils can make, so little is lost.
+The limit costs little torque: each torque of two coils needs only moments in the plane of these coils.
 """
 
 

@@ -199,7 +199,7 @@ WORKLOAD = Packet(
         Field("level", "u1", "-", "level of the reduction; 0 if all work is done", limits=_LEVEL),
         counter("frames_shed", "frames of the star camera that were not taken since start"),
         counter("plans_shed", "periodic plans that were not made since start"),
-        counter("frames_late", "frames since start that found the worker busy or took it too long"),
+        counter("frames_late", "frames since start that met a busy worker or whose processing took too long"),
         counter("plans_late", "plans since start that took too long"),
         counter("cycles_lost", "control cycles skipped since start"),
     ),

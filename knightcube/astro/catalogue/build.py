@@ -125,7 +125,7 @@ def select(source: Source) -> dict[str, npt.NDArray[Any]]:
 
     hip = column("hip", [star.hip for star in ADDED])
     if len(np.unique(hip)) != len(hip):
-        raise UsageError("the source has positions of stars in ADDED: remove these from ADDED")
+        raise UsageError("the source has positions of stars in ADDED: remove these stars from ADDED")
     magnitude = column("magnitude", [star.magnitude for star in ADDED])
     ra = column("ra_degrees", [star.right_ascension for star in ADDED])
     dec = column("dec_degrees", [star.declination for star in ADDED])

@@ -2,9 +2,9 @@
 
 The pointing law is linear in small rotations. With a large error, the pointing law would saturate the coils
 and could make a light body rotate faster than before. A new path is therefore planned if the body leaves the
-planned path. Far from the planned path, the body is first damped until its rate is low. The damping torque,
-which removes energy in any attitude, is the component normal to the field of -2 w J rate, with bandwidth w
-and inertia J.
+planned path. Far from the planned path, the body is first damped until its rate is low. The damping torque
+removes energy in any attitude. It is the component of -2 w J rate that is normal to the magnetic field, with
+bandwidth w and inertia J.
 """
 
 from __future__ import annotations

@@ -360,8 +360,10 @@ class AttitudeFilter:
     REJECTIONS_TO_RESTART = 40
     """Number of consecutive rejections of measurements of one kind after which the filter restarts."""
     REJECTIONS_AT_THE_START = 3
-    """Smaller number of consecutive rejections that restarts the filter while few measurements have been
-    accepted, because the initial state may be wrong."""
+    """Number of consecutive rejections that restarts the filter while few measurements have been accepted.
+
+    The number is small because the initial state may be wrong.
+    """
 
     def __init__(self, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None) -> None:
         """Create a filter that has not started.

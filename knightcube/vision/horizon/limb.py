@@ -356,7 +356,7 @@ def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray)
         return 1.0
     aside = rays @ tangent_basis(nadir).T
     azimuth = np.arctan2(aside[:, 1], aside[:, 0])
-    # The points are ordered around the limb from the widest gap, across which points are not neighbours.
+    # The order around the limb starts at the widest gap: points on its two sides are not neighbours.
     order = np.argsort(azimuth)
     gaps = np.diff(azimuth[order], append=azimuth[order[0]] + 2.0 * np.pi)
     along = scaled[np.roll(order, -1 - int(np.argmax(gaps)))]

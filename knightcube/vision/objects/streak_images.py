@@ -290,7 +290,7 @@ def _streak_images_numpy(pixels: IntArray, paths: FloatArray, sigma: float, slop
 
 
 def _add_points_numpy(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: float) -> None:
-    """Add the light of one count that the `points` (m, 2), px, share to `image` (1 or 3, p)."""
+    """Add one count, divided equally among the `points` (m, 2), px, to `image` (1 or 3, p)."""
     for point in points:
         near = np.flatnonzero(np.abs(pixels - point).max(axis=1) < _FARTHEST * sigma + 1.0)
         edges = ((pixels[near] - point)[:, :, None] + np.array([-0.5, 0.5])) / sigma
@@ -405,7 +405,7 @@ def _bell(x: float) -> float:
 
 @loop_helper
 def _add_points(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: float) -> None:
-    """Add the light of one count that the `points` (m, 2), px, share to `image` (1 or 3, p)."""
+    """Add one count, divided equally among the `points` (m, 2), px, to `image` (1 or 3, p)."""
     reach, share = _FARTHEST * sigma + 1.0, 1.0 / len(points)
     for k in range(len(points)):
         for p in range(len(pixels)):

@@ -825,7 +825,7 @@ def _most_voted(votes: IntArray, wanted: int) -> IntArray:
 
 @loop_helper
 def _into_frame(corners: FloatArray) -> None:
-    """Replace unit vectors, as columns (3, 3), by the axes of the frame that `_frame` returns as rows."""
+    """Replace the unit vectors (columns of `corners`) by the axes of `_frame` (rows of `corners`)."""
     mx = corners[0, 0] + corners[0, 1] + corners[0, 2]
     my = corners[1, 0] + corners[1, 1] + corners[1, 2]
     mz = corners[2, 0] + corners[2, 1] + corners[2, 2]

@@ -736,7 +736,7 @@ class Course:
         return cls(fitted * exposure / (powers[:, None] + 1.0), exposure * float(np.hypot(sigma, missed)))
 
     def motion(self, focal_length: float) -> CameraMotion | None:
-        """Return the motion to fit, or None if it is uncertain or, at `focal_length` px, nearly uniform."""
+        """Return the motion to fit, or None if it is uncertain or nearly uniform at `focal_length`, px."""
         motion = CameraMotion(self.terms[0], 2.0 * self.terms[1], self.terms[2:])
         time = np.linspace(-0.5, 0.5, _INSTANTS)
         uneven = (motion.progress(time) - time) * float(np.linalg.norm(motion.rotation)) * focal_length

@@ -43,7 +43,7 @@ class Events(Recorder):
 
 
 class CoilJob:
-    """The coils' job, which may begin to fail."""
+    """A job of the coils that fails as soon as `broken` is set."""
 
     def __init__(self, clock: ManualClock) -> None:
         self.broken = False

@@ -47,7 +47,7 @@ class Disk(LinuxFiles):
         """The names that power loss may find: the durable ones, and those after each change since."""
 
     def start(self, stop_before: int | None, failure: int = 0) -> None:
-        """Reset the count, and fail at another call."""
+        """Reset the count of calls, and set the call that fails or stops."""
         self.calls, self._stop_before, self._failure = 0, stop_before, failure
 
     def read(self, path: Path) -> bytes | None:

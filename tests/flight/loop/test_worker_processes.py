@@ -129,7 +129,7 @@ def test_a_hung_worker_is_killed_and_replaced(processes: ProcessRunner) -> None:
 
 
 def hear(runner: ProcessRunner, name: str, change: WorkerChange) -> WorkerNews:
-    """Return the first news of a kind of a worker, as the health task would hear it."""
+    """Return the first report of the given change of a worker, as the health task receives it."""
     deadline = time.monotonic() + 20.0
     while time.monotonic() < deadline:
         for news in runner.news():

@@ -83,7 +83,7 @@ def drawn(rng: np.random.Generator) -> World:
 
 
 def fly_stack(world: World, folder: Path, duration: float = 200.0) -> Record:
-    """Fly the excitation through drivers, loop and log; the dipole's error is the resistance's."""
+    """Run the excitation with drivers, loop and log; a wrong coil resistance stands for the wrong dipole."""
     config = excitation_config(believed(), duration)
     resistance = config.coils.resistance[0] * config.plant.coil_turns * config.plant.coil_area / world.dipole
     section: Simulation = configuration.replace(

@@ -22,16 +22,16 @@ RESISTANCE, VOLTAGE, CURRENT, PULSE_S = 23.0, 3.4, 0.1, 10.0
 RELEASE_Q2 = 0.2
 TARGETS = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
 DAMPING, FREQUENCY = 0.7, 0.5
-RATE_BIAS = 1e-4  # of the estimate, rad/s
-STAR_ERROR = 3e-5  # of each star attitude about the thread, rad, alternating in sign
-STREAK_ERROR = 2e-4  # of each streak rate about the thread, rad/s, alternating in sign
+RATE_BIAS = 1e-4  # bias of the estimated rate, rad/s
+STAR_ERROR = 3e-5  # error of each star attitude about the thread, rad, alternating in sign
+STREAK_ERROR = 2e-4  # error of each streak rate about the thread, rad/s, alternating in sign
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What to fly: `duration` of `planned` s, `hold` s a target, at `rate_hz`, with or without extras.
+    """Recipe of a run: `duration` of `planned` s, a target every `hold` s, a rate `rate_hz`, and extras.
 
-    `bus_power`, W, is what a monitor in the coils' supply measures each second, None without a monitor.
+    `bus_power` (W) is measured each second by a monitor in the coils' supply; None without a monitor.
     """
 
     duration: float = 700.0

@@ -157,7 +157,7 @@ def devices_running(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def live_flight(folder: Path, duration: float = 60.0, *more: str) -> Iterator[LiveFlight]:
-    """Start a flight, with `more` words for its command line, and end it at the end."""
+    """Start a flight process with `more` command-line arguments, and end it on exit."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notifications:
         notifications.bind(str(folder / "notify"))
         flight = LiveFlight(folder, write_config(folder), notifications, duration, *more)
@@ -168,10 +168,10 @@ def live_flight(folder: Path, duration: float = 60.0, *more: str) -> Iterator[Li
 
 
 class CoilTruth:
-    """What the coils really carried, on the machine's monotonic clock; `current` (n,) A is that of coil x."""
+    """True coil currents on the machine's monotonic clock; `current` (n,), A, is the current of coil x."""
 
     def __init__(self, folder: Path, devices: Path | None = None) -> None:
-        """Read the run in `folder`; the truth of devices with a folder of their own is moved there."""
+        """Read the run in `folder`, after moving the truth there from a separate folder `devices`."""
         for path in find_segments(devices, "truth") if devices is not None else ():
             path.rename(folder / path.name)
         self.run: Run = read_run(folder)

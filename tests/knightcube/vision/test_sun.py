@@ -277,7 +277,7 @@ def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(seen: tuple[EarthS
     assert float(true @ _in_body(scene, 0)) < np.cos(0.3)
     found = sun_of_cameras({0: frame}, MOUNTED, _strings(true), JOINT_SETTINGS)
     assert found.camera is None
-    assert found.reason == "camera 0: the Sun contradicts the solar strings"
+    assert found.reason == "camera 0: its Sun direction contradicts the solar strings"
     assert found.direction is not None
     assert float(found.direction @ true) > np.cos(0.1)
 

@@ -28,7 +28,7 @@ RANGES = {
 
 
 def made(**changes: Any) -> EarthCameraModel:
-    """Return a model with a pinhole of its size."""
+    """Return a camera model with a pinhole lens for the model's image size."""
     size = changes.get("columns", 512), changes.get("rows", 512)
     return EarthCameraModel(lens=Pinhole.from_field_of_view(*size, 1.0), **changes)
 

@@ -1,10 +1,11 @@
-"""Campaign `eclipse`: what the satellite's filter knows of the attitude through an eclipse without stars.
+"""Campaign `eclipse`: accuracy of the filter's attitude during an eclipse without stars.
 
-Cells `filter`: the loop's filter (`FreeFilter`, with the noises of the configurations) on a craft that points
-to nadir in a world whose gyro walks as the filter believes. Stars each 10 s teach it the gyro's bias, for
-LEARNED s at least; from the begin of a shadow on it has gyro and magnetometer alone. Orbits without a shadow
-of SHORTEST s are drawn again. Cells `storm`, half as many: the same in a field that is off its model by STORM
-more. Cells `loop`, a tenth as many: the whole loop (`fly_loop`), whose emulated gyro keeps its bias.
+The cells `filter` run the loop's filter (`FreeFilter`, with the noises of the configurations) on a craft that
+points to nadir. The bias of the simulated gyro walks as the filter assumes. Star fixes every 10 s calibrate
+the bias for at least LEARNED s. From the start of a shadow, the filter has only gyro and magnetometer. Orbits
+without a shadow of at least SHORTEST s are replaced by new draws. The cells `storm`, half as many as
+`filter`, add a field error of STORM. The cells `loop`, a tenth as many as `filter`, run the whole loop
+(`fly_loop`), and the bias of the emulated gyro is constant.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ LIT, BLIND = 900.0, 300.0
 SETTLED, LAST = 300.0, 120.0
 """s: from the release until stars are judged; the ends of the sunlight and of the shadow that are judged."""
 NODES = (9.5, 14.5)
-"""h, mean local times of the ascending node between which each flight has its own."""
+"""Range (h) from which the mean local time of the ascending node of each run is drawn."""
 
 
 def fly_loop(given: dict[str, Any], seed: tuple[int, ...]) -> Result:
-    """Fly the loop; `lit`, `blind`, `settled`, `last` and `seconds` of what is given shorten the flight."""
+    """Run the loop; the keys `lit`, `blind`, `settled`, `last` and `seconds` of `given` shorten the run."""
     lit, blind = given.get("lit", LIT), given.get("blind", BLIND)
     spans = given.get("settled", SETTLED), lit - blind, lit, given.get("last", LAST)
     path = CONFIG.parent / CRAFT[given["craft"]]

@@ -40,9 +40,9 @@ _JULIAN = 2_440_587.5
 
 
 def config_for(mode: str, elements: str = "", replans: bool = False, wide_often: bool = False) -> OrbitConfig:
-    """Return the configuration of a flight; `elements` is "old", "none", or empty for those of the orbit.
+    """Return the configuration of a run; `elements` is "old", "none", or empty for the elements of the orbit.
 
-    `wide_often`: the wide cameras take a round each 2 s, whether it is needed or not.
+    If `wide_often`, each wide camera takes an image every 2 s, even if none is needed.
     """
     config = _orbit()
     assert config.camera is not None

@@ -24,21 +24,21 @@ CYCLE = 0.025
 REPORTED_WITHIN = 20.0
 """s after the end of a fault: later events have another cause."""
 BLIND_GRACE, FIELD_GRACE = 0.1, 5.0
-"""s within which the coils are at zero: after the last reading, and after the last good field."""
+"""Longest times (s) to zero current: after the last reading, and after the last valid field."""
 ZERO, DRIVEN = 1e-3, 6e-3
-"""A: a coil that is off carries less; a coil that drives carries more."""
+"""Largest current (A) of a coil that is off, and smallest current (A) of a driven coil."""
 SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
-"""Of its claims, and rad: an attitude that is further off than both is false."""
+"""Largest errors of a correct attitude: in claimed standard deviations, and in rad."""
 DIPOLE_PER_AMPERE = 0.648
-"""m^2, of config/orbit.yaml."""
+"""Dipole moment per current (m^2) of the coils of config/orbit.yaml."""
 LOOKED, FEW = 3.0, 3
-"""s after an upset in which its trace is looked for; samples of the unit that may lack."""
+"""Time (s) after an upset in which its effect is searched for, and largest number of missing IMU samples."""
 LAST = 12.0
-"""s at the end of a flight, in which the body must do again what its mode is for."""
+"""Time (s) at the end of a flight in which the body must fulfil the purpose of its mode again."""
 SET_UP = 0.53
-"""s: by then the PWM chip is set up; what it loses before is not missed."""
+"""Time (s) until the PWM chip is set up. Losses before this time are not counted."""
 ACTS, RATE_OFF = 2e-3, 0.0175
-"""A: of coils that steer with little torque; rad/s, of the rate by the magnetometer."""
+"""Current (A) of coils that steer with little torque, and error (rad/s) of the rate by the magnetometer."""
 
 ORBIT_OWN: Mapping[str, frozenset[str]] = {
     **OWN,

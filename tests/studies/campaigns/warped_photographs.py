@@ -1,8 +1,9 @@
 """Campaign `warped-photographs`: photographs of the sky, stretched, sheared or tangentially distorted.
 
 Each photograph of ../shared/data/sky is warped about its centre by 1 to 4 %: `stretch` along the columns or
-the rows, `shear`, `tangential` distortion (displacement of a corner relative to its distance), or `all` three
-by half as much. The truth is the attitude of the photograph itself, whose uncertainty is added to the claim.
+the rows, `shear`, or `tangential` distortion (displacement of a corner relative to its distance). In the
+cases `all`, each of the three deformations has half that size. The truth is the attitude found in the
+original photograph; its uncertainty is added to the claimed one.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from tests.studies.campaigns.nadir import NADIR, summarise
 
 @pytest.fixture(scope="module")
 def slice_() -> list[Result]:
-    """Return two frames of each view, with each air, of the campaign `nadir`."""
+    """Return the results of two frames of the campaign `nadir` for each pair of view and atmosphere model."""
     return fly_here(NADIR, 2, 20_261_121)
 
 

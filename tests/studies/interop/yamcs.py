@@ -96,19 +96,20 @@ PLANS = {
     "short": Plan("step_demo.yaml", [("mode", {"mode": "safe"}), *_BRIEF]),
 }
 _ENDED = ("TM Connection closed", "read TM socket")
-"""What Yamcs warns of when the study ends the gateway; the second where data were on the way still."""
+"""Warnings of Yamcs when the study ends the gateway; the second appears if data are still in transit."""
 _RACE = 'because "paramProcessor" is null'
-"""Of an exception in Yamcs 5.12.8: a verifier that is done unsubscribes while a packet is delivered to it.
+"""Text of an exception in Yamcs 5.12.8: a finished verifier unsubscribes while a packet is delivered to it.
 
-The packet is archived and its values are right; displays miss it. Counted apart.
+The packet is archived with correct values, but is not sent to displays. These exceptions are counted
+separately.
 """
 _LOST_S = 15.0
 """Time (s) after which a command is issued again if Yamcs has lost a report."""
 _REFUSED = ("clear", {"event": "too-hot"})
 _STEADY = LAYOUTS["health"].identifier.to_bytes(2, "big")
-"""How the packet begins that a flight writes each second once it steers."""
+"""First bytes of the packet that the flight process writes each second once it steers."""
 _LINKS_OWN = {LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION, TRANSFER)}
-"""How the packets begin that the link process makes: no flight log has them."""
+"""First bytes of the packets that the link process makes; flight logs do not contain them."""
 _EPOCH = "2026-01-01T00:00:00"
 
 

@@ -182,7 +182,7 @@ def ask(checkout: Path, answers: Answers, folder: Path) -> None:
 
 
 def _values(output: str) -> Any:
-    """Return the values of a JSON text, or the lines of another."""
+    """Return the values of a JSON text, or the lines of a text that is not JSON."""
     try:
         return json.loads(output)
     except ValueError:

@@ -471,7 +471,7 @@ def _check(
     if not 1.0 <= max_stretch <= 1e3:
         raise PlanningError(f"max_stretch is {max_stretch}: it must be 1 to 1000")
     if not (math.isfinite(reference) and abs(reference) > 1.0):
-        raise PlanningError(f"reference is {reference}: it must lie beyond the range of q2, |q_r| > 1 (5.10)")
+        raise PlanningError(f"reference is {reference}: it must lie beyond the range of q2, |q_r| > 1")
     if not NODES_RANGE[0] <= nodes <= NODES_RANGE[1]:
         raise PlanningError(f"nodes is {nodes}: it must be {NODES_RANGE[0]} to {NODES_RANGE[1]}")
 

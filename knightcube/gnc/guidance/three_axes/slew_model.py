@@ -584,7 +584,7 @@ def check(task: SlewTask) -> None:
         task.rate,
     )
     if not all(np.isfinite(part).all() for part in arrays):
-        raise PlanningError("the values of the satellite and of the start must be finite")
+        raise PlanningError("the values of the satellite and of the initial state must be finite")
     if abs(float(np.linalg.norm(task.quaternion)) - 1.0) > 1e-6:
         raise PlanningError(f"the start quaternion {task.quaternion} must have length 1")
     if not np.all(craft.limit > 0.0):

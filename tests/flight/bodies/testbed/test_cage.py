@@ -1,4 +1,5 @@
-"""The cage on the flight's side: its field against the simulator's own model, and the torque of two coils."""
+"""Tests of the flight software's cage model: its field is the simulator's, and two coils have a torque.
+"""
 
 from __future__ import annotations
 

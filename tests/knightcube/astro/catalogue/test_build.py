@@ -66,7 +66,7 @@ def test_stars_without_a_position_are_left_out() -> None:
 def test_a_star_that_would_stand_twice_is_refused() -> None:
     source = _source()
     source["hip"][0] = build.ADDED[0].hip
-    with pytest.raises(UsageError, match="remove these from ADDED"):
+    with pytest.raises(UsageError, match="remove these stars from ADDED"):
         build.select(source)
 
 

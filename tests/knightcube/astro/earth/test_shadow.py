@@ -46,7 +46,7 @@ def test_the_umbra_ends_where_hipparchus_had_it() -> None:
 @pytest.mark.parametrize("share_of_way", [0.1, 0.3, 0.5, 0.8])
 @pytest.mark.parametrize("depth", [2500e3, 42_164e3])
 def test_in_penumbra_the_share_is_that_of_rays_that_pass_the_earth(depth: float, share_of_way: float) -> None:
-    """200,000 rays to points of the Sun's disc, each met by the Earth or not: the definition."""
+    """The expected share is the share of 200,000 rays from the Sun's disc that the Earth does not block."""
     width = depth * 2.0 * SUN_RADIUS / ASTRONOMICAL_UNIT
     middle = EARTH_RADIUS + depth * EARTH_RADIUS / ASTRONOMICAL_UNIT
     position = _behind(depth, middle + (share_of_way - 0.5) * width)

@@ -13,14 +13,14 @@ FULL = VOLTAGE / RESISTANCE
 
 
 def test_the_supply_delivers_power_only_while_a_coil_is_driven_and_either_way() -> None:
-    """Off, a quarter on, half on, reversed half on, fully on: shares of 3.4^2/23 = 0.50261 W."""
+    """At the duties 0, 0.25, 0.5, -0.5 and 1, the coil takes these fractions of 3.4^2/23 = 0.50261 W."""
     duty = np.array([0.0, 0.25, 0.5, -0.5, 1.0])
     expected = [0.0, 0.12565, 0.25130, 0.25130, 0.50261]
     np.testing.assert_allclose(supply_power(duty * FULL, VOLTAGE), expected, atol=1e-5)
 
 
 def test_the_bus_delivers_the_same_current_at_its_higher_voltage() -> None:
-    """0.02 A is 68 mW at 3.4 V across the coil and 100 mW at a bus of 5 V: the bridge takes 32 mW."""
+    """A current of 0.02 A takes 68 mW at 3.4 V across the coil and 100 mW from a bus of 5 V."""
     current = np.array([0.02])
     assert supply_power(current, VOLTAGE)[0] == pytest.approx(0.068)
     assert supply_power(current, BUS_VOLTAGE)[0] == pytest.approx(0.100)
