@@ -1,5 +1,4 @@
-"""Tests of the flight software's cage model: its field is the simulator's, and two coils have a torque.
-"""
+"""Tests of the flight software's cage model: its field is the simulator's, and two coils make a torque."""
 
 from __future__ import annotations
 
