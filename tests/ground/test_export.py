@@ -1,4 +1,4 @@
-"""Exported files hold what the packets hold, to the last bit."""
+"""Tests that exported files have exactly the values of the packets."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def rich_run(tmp_path: Path) -> Run:
 
 def test_one_sqlite_file_has_a_table_for_each_packet_and_the_units(rich_run: Run, tmp_path: Path) -> None:
     file = tmp_path / "new" / "all.sqlite"
-    for _ in range(2):  # again, in the place of the first
+    for _ in range(2):  # the second export replaces the first
         assert export(rich_run, file, "sqlite") == [file]
     assert list(file.parent.iterdir()) == [file]
     with closing(sqlite3.connect(file)) as database:

@@ -1,4 +1,4 @@
-"""Predicted passes and eclipses agree with the project's own model of orbit, Earth and Sun."""
+"""Tests that predicted passes and eclipses agree with the project's model of orbit, Earth and Sun."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Marks and names are read on a bright sky as on a dark one: black stands between them and the sky."""
+"""Tests that marks and names in plots have a black outline, so that they are legible on a bright sky."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _sky(size: int, grey: int) -> Picture:
 
 
 def _stand_apart(plain: Picture, drawn: Picture) -> bool:
-    """Return whether no pixel of a colour touches one of the sky."""
+    """Return whether no pixel of a colour is adjacent to a sky pixel."""
     coloured = np.ptp(drawn.astype(int), axis=2) > 40
     around = binary_dilation(coloured, np.ones((3, 3), dtype=bool)) & ~coloured
     return bool(coloured.any() and np.all(np.any(drawn[around] != plain[around], axis=1)))

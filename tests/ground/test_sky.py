@@ -1,4 +1,4 @@
-"""Sun, Moon and planets in a picture, and its world coordinates."""
+"""Tests of Sun, Moon and planets in an image, and of its world coordinates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.support.scenes import catalogue
 
 # Julian date TT of the great conjunction, 2020 December 21, 18:20 UTC: 6.1' apart, by the almanacs.
 _CONJUNCTION = 2_459_205.264
-# Of the total eclipse of 2024 April 8: greatest at 18:17 UTC, gamma 0.3431 radii of the Earth.
+# The total eclipse of 2024 April 8 is greatest at 18:17 UTC, with a gamma of 0.3431 Earth radii.
 _ECLIPSE = 2_460_409.263
 
 
@@ -30,7 +30,7 @@ def test_jupiter_and_saturn_meet_on_the_day_of_the_great_conjunction() -> None:
 
 
 def test_the_moon_is_before_the_sun_at_an_eclipse() -> None:
-    """Seen from the Earth's centre they are gamma times the Moon's parallax, about 1 deg, apart."""
+    """From the Earth's centre, Sun and Moon are separated by gamma times the Moon's parallax, about 1 deg."""
     found = directions_of_bodies(_ECLIPSE)
     assert _apart_deg(found["Sun"], found["Moon"]) == pytest.approx(0.343 * 0.998, abs=0.05)
 
@@ -42,7 +42,7 @@ def test_a_picture_of_the_conjunction_shows_both_planets_and_no_other() -> None:
     found = bodies_in(SkyMap(camera, attitude), _CONJUNCTION)
     assert [body.name for body in found] == ["Jupiter", "Saturn"]
     assert found[0].point == pytest.approx(camera.centre, abs=0.1)
-    # In the mirrored picture, Saturn is on the other side of Jupiter.
+    # In the mirrored image, Saturn is on the opposite side of Jupiter.
     back = bodies_in(SkyMap(camera, attitude, mirrored=True), _CONJUNCTION)
     assert [body.name for body in back] == ["Jupiter", "Saturn"]
     assert back[1].point == pytest.approx([639.0 - found[1].point[0], found[1].point[1]], abs=1e-6)
@@ -51,7 +51,7 @@ def test_a_picture_of_the_conjunction_shows_both_planets_and_no_other() -> None:
 fits = pytest.importorskip("astropy.io.fits", reason="astropy is of the extra `test`")
 wcs = pytest.importorskip("astropy.wcs", reason="astropy is of the extra `test`")
 
-# A header without a picture, as other solvers write it.
+# A FITS header without an image, as some solvers write it.
 pytestmark = pytest.mark.filterwarnings("ignore:The WCS transformation has more axes")
 
 _LENS = Lens(1280, 960, 4000.0, (655.0, 470.0), k1=-0.3, k2=0.4)
@@ -65,7 +65,7 @@ def _sky(seed: int) -> SkyMap:
 def _stars(sky: SkyMap) -> tuple[FloatArray, FloatArray]:
     """Return right ascension and declination (n, 2), deg, of stars in the picture, and their pixels.
 
-    Pixels are by the camera's projection of each star, which the header's maker does not use.
+    The pixels follow from the camera's projection, which the code that makes the header does not use.
     """
     _, directions = catalogue(8.5)
     place = _LENS.project(directions @ attitude_matrix(sky.quaternion).T)
@@ -76,7 +76,7 @@ def _stars(sky: SkyMap) -> tuple[FloatArray, FloatArray]:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_astropy_finds_the_stars_where_they_are(seed: int) -> None:
-    """Within 0.1" and 0.01 px over the whole distorted picture, pixel to sky and back."""
+    """Conversions from pixel to sky and back agree to 0.1" and 0.01 px over the whole distorted image."""
     sky = _sky(seed)
     header = fits.Header.fromstring(header_text(sky))
     frame = wcs.WCS(header)
@@ -90,7 +90,7 @@ def test_astropy_finds_the_stars_where_they_are(seed: int) -> None:
 
 
 def test_a_lens_told_without_its_distortion_is_noticed() -> None:
-    """The bounds above are of the distortion's making: without SIP the corners are px off."""
+    """Without SIP, the errors at the corners are several px."""
     sky = _sky(1)
     plain = wcs.WCS(fits.Header.fromstring(header_text(sky)))
     radec, place = _stars(sky)
@@ -99,7 +99,7 @@ def test_a_lens_told_without_its_distortion_is_noticed() -> None:
 
 @pytest.mark.parametrize(("mirrored", "reversed_rows"), [(True, False), (False, True), (True, True)])
 def test_the_header_is_of_the_pixels_of_the_file(mirrored: bool, reversed_rows: bool) -> None:
-    """A mirrored picture has a CD matrix with a determinant of the other sign than the sky."""
+    """The CD matrix of a mirrored image has a determinant of the opposite sign."""
     plain = _sky(2)
     radec, place = _stars(plain)
     if mirrored:

@@ -1,4 +1,4 @@
-"""Packets are read back from bytes and from the folder of a run, with an account of the damage."""
+"""Tests of reading packets from bytes and from the folder of a run, and of the damage report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`knightcube watch`: a log that is over, one that grows, one that stands still, and a listening flight."""
+"""Tests of `knightcube watch` with a finished log, a growing log, a stalled log, and a listening flight."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def event(packer: Packer, kind: events.EventKind, time_s: float, text: str) -> b
 
 @pytest.fixture
 def growing(tmp_path: Path) -> Path:
-    """Return the folder of a flight that goes on: six seconds, then an event of severity fault."""
+    """Return the folder of an unfinished run with six seconds of packets and an event of severity fault."""
     folder = make_run(tmp_path / "run", Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
     packer = Packer()
     with (folder / "flight-0001.ccsds").open("ab") as file:
@@ -105,7 +105,7 @@ def test_an_archive_shows_its_newest_run(growing: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def watcher(growing: Path) -> Iterator[subprocess.Popen[str]]:
-    """Yield a `watch` of a log that grows, after its first lines."""
+    """Yield a `watch` process of a growing log after its first lines."""
     words = [sys.executable, "-m", "flight", "watch", str(growing), "--every", "2"]
     with subprocess.Popen(
         words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

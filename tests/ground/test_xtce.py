@@ -1,4 +1,4 @@
-"""The XTCE form is read by a client that we did not write, and holds the tables whole."""
+"""Tests that an independent client reads the XTCE file and finds the complete tables."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ XML_SCHEMA = (
     '<schema xmlns="http://www.w3.org/2001/XMLSchema" targetNamespace="http://www.w3.org/XML/1998/namespace">'
     '<attribute name="base" type="anyURI"/></schema>'
 )
-"""The only declaration that XTCE needs of the schema `xml.xsd`, whose original is on a web server."""
+"""The only declaration of the schema `xml.xsd` that XTCE needs. The original schema is on a web server."""
 
 
 @pytest.fixture(scope="module")
 def schema(tmp_path_factory: pytest.TempPathFactory) -> etree.XMLSchema:
-    """Return the OMG's schema of XTCE 1.2, a copy of which comes with space-packet-parser."""
+    """Return the OMG's schema of XTCE 1.2 from the copy in space-packet-parser."""
     original = Path(space_packet_parser.__file__).parent / "xtce" / "schemas" / "SpaceSystem.xsd"
     folder = tmp_path_factory.mktemp("schema")
     (folder / "xml.xsd").write_text(XML_SCHEMA, encoding="utf-8")
@@ -134,7 +134,7 @@ def test_names_are_plain_and_commands_carry_ranges_and_hazards() -> None:
 
 
 def test_the_states_of_the_table_are_those_of_the_code() -> None:
-    """What the link cannot import: states that the loop and the bodies number."""
+    """Names of states that the link cannot import, because the loop and the bodies define them."""
     assert tuple((int(state), state.name.lower()) for state in SteeringState) == definitions.STEERING
     streams = tuple((int(state), state.name.lower().replace("_", "-")) for state in StreamState)
     assert streams == definitions.STREAMS

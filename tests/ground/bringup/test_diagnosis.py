@@ -1,4 +1,4 @@
-"""The diagnosis of axes and coils with an inexact hand and noise, for drawn exchanges and signs."""
+"""Tests of the diagnosis of axes and coils with inexact manual rotations, noise, and random exchanges."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def rotation(vector: FloatArray) -> FloatArray:
 
 
 def by_hand(generator: np.random.Generator, axes: dict[str, FloatArray]) -> Turns:
-    """Return turns whose axis errs by 6 deg and whose angle errs by 8 deg (standard deviations)."""
+    """Return rotations with errors of the axis (6 deg) and the angle (8 deg), as standard deviations."""
     field, up, bias = (
         np.array([1.9e-5, 0.0, -4.2e-5]),
         np.array([0.0, 0.0, GRAVITY]),
@@ -72,6 +72,6 @@ def test_exchanged_and_reversed_coils_are_found(size_known: bool) -> None:
         current = 0.15 * (1.0 + 0.02 * generator.normal(size=(3, 2)))
         test = CoilTest(np.full(3, 0.15), plus, minus, current, 0.0, 1e-7)
         found = diagnose_coils(test, expected, "xyz", size_known=size_known)
-        common = -1.0 if (signs < 0).all() else 1.0  # one magnetometer, not three coils
+        common = -1.0 if (signs < 0).all() else 1.0  # faults of the magnetometer, not of three coils
         assert found.serves == order.tolist()
         assert np.array_equal(np.sign(found.strength), common * signs)

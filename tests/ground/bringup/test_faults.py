@@ -1,7 +1,7 @@
-"""A bench session with emulated devices names each wiring fault, and finds none in a sound set-up.
+"""Tests that a bench session with emulated devices names each wiring fault, and none in a correct set-up.
 
-The drivers are configured by `step_demo`; the emulated devices differ from it by one fault, as wired hardware
-does. What the devices send and receive are bytes of their real protocols.
+The drivers are configured by `step_demo`. The emulated devices differ from `step_demo` by one wiring fault.
+The devices send and receive the bytes of their real protocols.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ def fault(*names: str) -> Change:
 
 
 def coil_field(matrix: Any) -> Change:
-    """Return the field of the coils at the magnetometer, in multiples of the usual one."""
+    """Return the field of the coils at the magnetometer, in multiples of the usual field."""
     return {"simulation": {"coil_field": (FIELD * np.array(matrix)).tolist()}}
 
 
 def sensed(**matrices: Any) -> Callable[[Any], Any]:
-    """Return a fault of the unit by which sensors have other axes or scales."""
+    """Return a fault of the IMU that changes the axes or scales of sensors."""
     return lambda sample: replace(
         sample, **{name: np.array(matrix) @ getattr(sample, name) for name, matrix in matrices.items()}
     )
@@ -59,7 +59,7 @@ def sensed(**matrices: Any) -> Callable[[Any], Any]:
 
 @dataclass(frozen=True)
 class Case:
-    """A wiring fault: what differs, the steps that show it, and the expected findings as "part kind"."""
+    """A wiring fault: changed values, steps that detect it, and expected findings as "part kind"."""
 
     change: Change
     steps: str

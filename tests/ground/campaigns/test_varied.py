@@ -1,4 +1,4 @@
-"""Flights with drawn values: distributions, refusals, resuming, and the table of failed flights."""
+"""Tests of runs with random values: distributions, refusals, resuming, and the table of failed runs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ORBIT = DEMO.with_name("orbit_3u.yaml")
 
 
 def draws(text: str, value: float, count: int = 4000) -> np.ndarray[Any, Any]:
-    """Return drawn values of a variation of a configured number."""
+    """Return random values that a variation draws for a configured number."""
     one, chance = variation_of(f"key={text}"), np.random.default_rng(5)
     return np.array([one.draw(chance, value) for _ in range(count)])
 
@@ -104,7 +104,7 @@ def test_values_of_an_extended_file_and_defaults_can_be_drawn() -> None:
 
 
 def test_an_impossible_inertia_is_drawn_again() -> None:
-    """A third of the moments of a slender body violate the triangle inequality at 60 %."""
+    """At 60 %, a third of the drawn inertias of a slender body violate the triangle inequality."""
     for given in cases(ORBIT, "craft.inertia=60%", runs=8):
         moments = np.sort(yaml.safe_load(given["config"])["craft"]["inertia"][:3])
         assert moments[2] <= moments[0] + moments[1]
@@ -144,7 +144,7 @@ def test_a_campaign_continues_after_a_kill_with_the_same_result(tmp_path: Path) 
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "campaign.json").write_text((tmp_path / "whole" / "campaign.json").read_text())
-    (broken / "results.jsonl").write_text(lines[1] + lines[0][:40])  # killed while it wrote a line
+    (broken / "results.jsonl").write_text(lines[1] + lines[0][:40])  # line cut off by a kill of the campaign
     facts = json.loads(json.dumps(fly(campaign, 3, 7, broken, workers=1).facts).replace("broken", "whole"))
     assert facts == whole.facts
     again = varied_campaign(DEMO, [variation_of("plant.inertia=10%")], 2.0)
@@ -156,7 +156,7 @@ def test_a_campaign_continues_after_a_kill_with_the_same_result(tmp_path: Path) 
 def test_the_listed_command_flies_a_failed_flight_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A flight of 2 s is not long enough to keep the limit of the average power."""
+    """A run of 2 s is too short to meet the limit of the average power."""
     out = tmp_path / "campaign"
     vary = ["--vary", "simulation.release.rate=-0.3..-0.2"]
     words = ["campaign", str(DEMO), *vary, "--runs", "1", "--duration", "2", "--workers", "1"]
@@ -175,7 +175,7 @@ def test_the_listed_command_flies_a_failed_flight_again(
 
 @pytest.mark.slow
 def test_an_interrupted_flight_has_no_result() -> None:
-    """The signal comes while the flight is in progress, and ends the flight as a user's Ctrl-C does."""
+    """The signal comes during the run, and ends it like Ctrl-C."""
     code = (
         "import os, signal, sys, threading\n"
         "from pathlib import Path\n"
@@ -192,7 +192,7 @@ def test_an_interrupted_flight_has_no_result() -> None:
 
 
 def result(number: int, worst: float | None, error: str = "") -> Result:
-    """Return a hand-made result of a flight."""
+    """Return an artificial result of a run."""
     verdict = "miss" if worst is None or worst > 4.0 else "pass"
     judged = [{"quantity": "error", "worst": worst, "limit": 4.0, "unit": "deg", "verdict": verdict}]
     return {

@@ -1,6 +1,6 @@
-"""A command line typed in this process: what `knightcube` does with it, modules and sky loaded once.
+"""Runs `knightcube` command lines in the test process, which loads modules and star catalogue only once.
 
-That the same comes of a process of its own is what `test_commands.py` looks at.
+`test_commands.py` tests that a separate process gives the same output.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tests.support.places import ROOT
 
 
 def command(*arguments: str | Path, folder: Path = ROOT) -> CompletedProcess[str]:
-    """Run a command in a folder, by default the repository; return its status and outputs."""
+    """Run a command in a folder, by default the repository, and return its exit status and outputs."""
     words = [str(word) for word in arguments]
     raw, complaint = io.BytesIO(), io.StringIO()
     output = io.TextIOWrapper(raw, encoding="utf-8", write_through=True)
@@ -26,6 +26,6 @@ def command(*arguments: str | Path, folder: Path = ROOT) -> CompletedProcess[str
     ):
         try:
             status = main(words)
-        except SystemExit as end:  # argparse: help, or wrong use
+        except SystemExit as end:  # argparse exits after help or wrong use
             status = end.code if isinstance(end.code, int) else 1
     return CompletedProcess(words, status, raw.getvalue().decode(), complaint.getvalue())

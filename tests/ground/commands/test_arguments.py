@@ -1,4 +1,4 @@
-"""The arguments of the ground's commands are the published ones, with their defaults and choices."""
+"""Tests that the ground commands have the published arguments, with their defaults and choices."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ def test_the_commands_are_the_published_ones() -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_has_its_published_arguments(name: str) -> None:
-    """Scripts depend on them: an argument that changes here changes the interface."""
+    """Scripts of users depend on these arguments."""
     assert arguments_of(f"ground.commands.{COMMANDS[name][2]}") == PUBLISHED[name]

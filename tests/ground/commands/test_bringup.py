@@ -1,4 +1,4 @@
-"""The command `knightcube bringup`: kept steps, continuation, and a configuration that cures its findings."""
+"""Tests of `knightcube bringup`: stored steps, continuation, and the corrected configuration."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ONLY = [word for step in ("axes", "coils") for word in ("--only", step)]
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a session with four faults, whose results are in `bench`."""
+    """Return the folder of a session with four faults. The results are in its subfolder `bench`."""
     folder = tmp_path_factory.mktemp("bringup")
     (folder / "wired.yaml").write_text(WIRED, encoding="utf-8")
     done = command("bringup", "step_demo", "--wired", folder / "wired.yaml", "--out", folder / "bench", *ONLY)

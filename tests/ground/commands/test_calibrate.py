@@ -1,4 +1,4 @@
-"""`knightcube calibrate`: pictures of the sky in, the lens and a camera file for `knightcube solve` out."""
+"""Tests of `knightcube calibrate`: from sky images to the lens and a camera file for `knightcube solve`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def test_the_lens_found_is_the_one_that_took_the_pictures(pictures: list[Path], tmp_path: Path) -> None:
-    """The simulator's camera has no distortion and its axis in the middle: all within five of its sigmas."""
+    """The simulator's camera has no distortion and a centred axis.
+
+    All fitted values must lie within five sigmas.
+    """
     out = tmp_path / "camera.yaml"
     done = command("calibrate", *pictures, "--fov", "12.3", "--out", out, "--json")
     assert done.returncode == 0, done.stderr
@@ -39,7 +42,7 @@ def test_the_lens_found_is_the_one_that_took_the_pictures(pictures: list[Path], 
 
 
 def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path], tmp_path: Path) -> None:
-    """The middle of one picture, 7 deg across: a distortion shows at the edge, and there is none."""
+    """The central 7 deg of one image contain no edge, where a distortion would be measurable."""
     middle, out = tmp_path / "middle.png", tmp_path / "camera.yaml"
     pillow.open(pictures[0]).crop((212, 212, 812, 812)).save(middle)
     done = command("calibrate", middle, "--fov", "7.05", "--out", out)
@@ -53,7 +56,7 @@ def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path]
 
 
 def test_a_camera_file_says_how_well_the_lens_is_known(pictures: list[Path], tmp_path: Path) -> None:
-    """What `rate` claims rests on it: the error of the focal length is that of the fit."""
+    """`knightcube rate` uses the uncertainty of the focal length from the fit."""
     out = tmp_path / "camera.yaml"
     done = command("calibrate", *pictures, "--fov", "12", "--out", out, "--json")
     facts = json.loads(done.stdout)
@@ -113,7 +116,7 @@ def test_a_file_that_is_there_is_not_overwritten(pictures: list[Path], tmp_path:
 def test_mirrored_pictures_give_the_lens_of_the_pictures_as_they_are(
     pictures: list[Path], tmp_path: Path
 ) -> None:
-    """Two of three pictures are mirrored, and the third one is excluded and named."""
+    """Two of three images are mirrored; the third image is excluded and named."""
     paths = [tmp_path / path.name for path in pictures]
     for number, (path, source) in enumerate(zip(paths, pictures, strict=True)):
         pixels = np.asarray(pillow.open(source))

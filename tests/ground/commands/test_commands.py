@@ -1,4 +1,4 @@
-"""The command line: the first thing typed works, a mistake is one line, Ctrl-C loses nothing."""
+"""Tests of the command line: the examples work, an error is one line, and Ctrl-C loses no data."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def obeyed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
-    """Return status, output and error output of a command that this process runs."""
+    """Return exit status, output and error output of a command that the test process runs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
         try:
@@ -113,7 +113,7 @@ def test_a_device_that_is_not_there_is_one_line_and_exit_status_1(tmp_path: Path
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_flight_with_its_log_whole(tmp_path: Path, number: signal.Signals) -> None:
     words = [sys.executable, "-m", "flight", "run", str(DEMO), "--out", str(tmp_path / "run")]
-    # A SIGHUP that is ignored, as under nohup, stays ignored: the tests themselves may run so.
+    # If SIGHUP is ignored, as under nohup, it must stay ignored. The tests themselves may run under nohup.
     heed = f"signal.signal({int(number)}, signal.SIG_DFL)"
     begin = f"import os, signal; {heed}; os.execv({words[0]!r}, {words!r})"
     flight = subprocess.Popen(
@@ -186,7 +186,7 @@ def test_a_file_whose_name_is_not_valid_text_is_named_all_the_same(
 
 
 def test_on_board_nothing_is_imported_that_a_board_does_not_need() -> None:
-    """Plots, the simulator and the general optimisers stay away from the flight application."""
+    """The flight application must not import plot libraries, the simulator or general optimisers."""
     script = (
         "import sys, flight.app.flight, flight.app.cli; "
         "away = ('matplotlib', 'PIL', 'ground', 'sim_hal', 'pytest', 'hypothesis'); "

@@ -1,4 +1,4 @@
-"""Ctrl-C, closed pipes and pictures too small to show anything: a status and at most a line, no traceback."""
+"""Tests that Ctrl-C, closed pipes and too small images give an exit status and at most one line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shell(line: str) -> subprocess.CompletedProcess[str]:
-    """Run a line of the shell; its status is that of the first command of a pipe that fails."""
+    """Run a shell line and return the exit status of the first failing command of its pipe."""
     words = ["bash", "-o", "pipefail", "-c", line.replace("FLIGHT", f"{sys.executable} -m flight")]
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
 
@@ -41,9 +41,9 @@ def test_output_that_does_not_fit_the_disk_is_one_line(words: str, run_folder: P
 
 
 def test_ctrl_c_ends_a_command_by_the_signal_itself_from_its_first_import_on() -> None:
-    """So no code of ours or of a library's is there to be interrupted."""
+    """At this time, neither project code nor library code can be interrupted."""
     script = (
-        # As from a terminal: a shell's `&` has the signal ignored.
+        # Restore the handler as in a terminal, because a shell's `&` ignores the signal.
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "import flight.__main__\n"
         "assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL\n"

@@ -1,4 +1,4 @@
-"""`knightcube horizon`: from a picture file to the way down, in numbers and in a picture."""
+"""Tests of `knightcube horizon`: from an image file to the nadir direction, as numbers and as an image."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SCENE = limb_scene(zenith=np.array([1.0, 0.0, 0.1]), sun=np.array([1.0, 0.6, 0.5
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a picture of the limb, grey and in colour, one of the sky, and the camera."""
+    """Return a folder with grey and colour images of the limb, an image of the sky, and the camera file."""
     folder = tmp_path_factory.mktemp("limb")
     frame = render(MODEL, SCENE, np.random.default_rng(1))
     pillow.fromarray(frame).save(folder / "limb.png")
@@ -42,7 +42,8 @@ def test_json_shows_nadir_with_its_covariance(folder: Path) -> None:
     facts = json.loads(done.stdout)
     assert facts["status"] == "found"
     off = np.degrees(np.arccos(np.array(facts["nadir_camera"]) @ nadir(SCENE)))
-    # The command does not know the lens's distortion, up to 20 px at the corners; nor does its covariance.
+    # The lens has a distortion of up to 20 px at the corners. Neither the command nor its covariance accounts
+    # for it.
     assert off < 1.0
     assert np.all(np.linalg.eigvalsh(np.array(facts["covariance_rad2"])) > -1e-15)
     assert facts["sigma_deg"] > 0.05
@@ -58,7 +59,7 @@ def test_colour_without_an_altitude_gives_one_and_a_picture(folder: Path) -> Non
         assert label in done.stdout
     drawn = np.asarray(pillow.open(overlay)).astype(int)
     orange = np.count_nonzero(np.all(np.abs(drawn - [230, 159, 0]) < 2, axis=2))
-    # The limb's line, all across the picture, and a ring for each edge.
+    # The image shows the limb's line across the whole width and a ring for each edge.
     assert orange > 512
 
 
@@ -73,12 +74,12 @@ LEVEL = limb_scene(
     sun=np.array([1.0, 0.6, 0.5]),
     dip=float(np.arcsin(6_378.137 / 6_978.137) - 0.5 * np.pi),
 )
-"""The boresight level, the limb 24 deg below."""
+"""The boresight is horizontal and the limb is 24 deg below it."""
 
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
-    """Return a folder with a level camera's picture, of one to its right, and of the first a little later."""
+    """Return a folder with images of a horizontal camera (two times) and of a camera to its right."""
     folder = tmp_path_factory.mktemp("paper")
     model = EarthCameraModel.fuga15d(seed=1)
     turns = {"first": (0.0, 0.0, 0.0), "right": (0.0, 1.0, 0.0), "later": (0.02, 0.0, 0.0)}
@@ -114,7 +115,7 @@ def test_the_papers_methods_find_nadir_of_a_level_sunlit_limb_to_a_degree(
     assert facts["method"] == words[1]
     off = np.degrees(np.arccos(min(1.0, np.array(facts["nadir_camera"]) @ downs[picture])))
     assert off < 1.0
-    # A turn of 1.1 deg that is not seen would leave it.
+    # An undetected rotation of 1.1 deg would exceed this uncertainty.
     assert picture == "first" or off < 0.6
 
 

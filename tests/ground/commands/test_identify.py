@@ -1,4 +1,4 @@
-"""`knightcube identify`: flies, fits, writes a piece of configuration; a mistake is one line."""
+"""Tests of `knightcube identify`: run, fit, configuration fragment, and one-line error messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.places import DEMO
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object]]:
-    """Return the folder of a short identification flight and what the command said of it."""
+    """Return the folder of a short identification run and the output of the command."""
     place = tmp_path_factory.mktemp("identify")
     words: list[str | Path] = [
         "--run",
@@ -34,13 +34,13 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, obj
     ]
     done = command("identify", DEMO, *words, "--json")
     assert done.returncode == 0, done.stderr
-    assert all("events" in line for line in done.stderr.splitlines())  # progress on a busy machine
+    assert all("events" in line for line in done.stderr.splitlines())  # progress lines
     facts: dict[str, object] = json.loads(done.stdout)
     return place, facts
 
 
 def test_a_flight_finds_the_simulated_body(flown: tuple[Path, dict[str, object]]) -> None:
-    """N A B / J, k / J and c / J of config/step_demo.yaml."""
+    """Values of N A B / J, k / J and c / J of config/step_demo.yaml."""
     _, facts = flown
     motion: dict[str, dict[str, float]] = facts["motion"]  # type: ignore[assignment]  # JSON
     truth = {"gain": 80 * 0.0081 * 4.5e-4 / 1.05e-3, "torsion": 1e-5 / 1.05e-3, "damping": 2e-6 / 1.05e-3}

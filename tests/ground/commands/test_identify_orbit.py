@@ -1,4 +1,4 @@
-"""`knightcube identify` of a satellite: the next flight begins nearer to the truth."""
+"""Tests that `knightcube identify` of a satellite gives a configuration nearer to the truth."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def fly(config: Path, folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """Return the folder with a flight, what the command said of it, and the fragment."""
+    """Return the folder of a run, the output of the command, and the configuration fragment."""
     place = tmp_path_factory.mktemp("identify")
     config = place / "first.yaml"
-    seen = "camera: {objects: null}\nwide_cameras: []"  # the horizon and objects teach nothing here
+    seen = "camera: {objects: null}\nwide_cameras: []"  # the run has no horizon measurements and no objects
     config.write_text(f"extends: orbit_3u\nname: first\nduration: 65.0\n{seen}\n{WORLD}")
     fly(config, place / "first")
     done = command("identify", place / "first", "--out", place / "learned.yaml", "--json")
@@ -54,7 +54,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
 
 
 def ratio_errors(folder: Path) -> list[float]:
-    """Return the largest error of an element of J / trace(J) in each description of a flight."""
+    """Return the largest error of an element of J / trace(J) for the described and identified inertia."""
     elements = read_run(folder)["description"]["inertia"].astype(float)
     true = TRUE[(0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)] / np.trace(TRUE)
     found: list[float] = np.abs(elements / elements[:, :3].sum(axis=1)[:, None] - true).max(axis=1).tolist()
@@ -206,7 +206,7 @@ def test_the_fragment_has_the_learned_lens_with_its_accuracy(flown: tuple[Path, 
     stated = (accuracy.focal_length, accuracy.centre, accuracy.distortion, accuracy.line_time)
     assert stated == pytest.approx((2e-4, 0.125, 4e-4, 1e-7), rel=0.02)
     assert (camera.line_time, camera.psf_sigma) == (2.5e-5, 1.25)
-    # The pixel on the configured axis still shows the same direction in the body.
+    # The pixel on the configured axis keeps its direction in body axes.
     (place / "plain.yaml").write_text(fragment(found, place / "first", "first/config.yaml"))
     plain = as_orbit(load(place / "plain.yaml")).camera
     assert plain is not None

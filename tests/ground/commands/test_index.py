@@ -1,4 +1,4 @@
-"""`knightcube index`: an index for a mission's camera."""
+"""Tests of `knightcube index`, which makes a star index for a mission's camera."""
 
 from __future__ import annotations
 

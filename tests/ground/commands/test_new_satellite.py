@@ -1,4 +1,4 @@
-"""`knightcube new-satellite` writes a configuration that is checked, commented and true to its options."""
+"""Tests that `knightcube new-satellite` writes a valid, commented configuration for its options."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_the_star_camera_looks_away_from_the_sun(tmp_path: Path, utc: str, hours
 
 
 def test_the_derived_values_are_those_of_the_shipped_satellites(tmp_path: Path) -> None:
-    """The scaling laws go through the two configurations that were tuned."""
+    """The scaling laws reproduce the two tuned configurations."""
     for name, words in {
         "orbit": ("--mass", "0.628", "--size", "0.1x0.1x0.1", "--coil", _coil(0.0959, 0.148, 23.0)),
         "orbit_3u": ("--mass", "4", "--size", "0.3x0.1x0.1", "--coil", _coil(0.2, 0.148, 9.13)),
@@ -265,7 +265,7 @@ def test_weak_coils_are_warned_of(tmp_path: Path) -> None:
 
 
 class Terminal(io.StringIO):
-    """A terminal on which these lines are typed."""
+    """A terminal on which the given lines are typed."""
 
     def isatty(self) -> bool:
         return True

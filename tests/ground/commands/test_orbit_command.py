@@ -1,4 +1,4 @@
-"""`knightcube orbit` from packets to words, JSON and messages that say the same; a short arc is refused."""
+"""Tests that the text, JSON and messages of `knightcube orbit` agree, and that a short arc is refused."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ UTC_NS = 1_774_008_000_000_000_000
 
 
 class Tracked(dict[str, Any]):
-    """What `orbits_of` takes of a run."""
+    """The fields of a run that `orbits_of` reads."""
 
     folder = Path("runs/tracked")
 
 
 def tracked(seconds: float) -> tuple[Tracked, np.ndarray]:
-    """Return packets of a pass that an object makes at 2,000 km, and its true state in the middle."""
+    """Return packets of a pass of an object at a distance of 2,000 km, and its true state at mid-pass."""
     rng = np.random.default_rng(4)
     times = np.arange(0.0, seconds + 0.5, 10.0)
     middle = len(times) // 2
@@ -34,7 +34,7 @@ def tracked(seconds: float) -> tuple[Tracked, np.ndarray]:
     other = np.array([6.6e6, 1.9e6, 5e5, -914.0, 1.2e3, 7.5e3])
     observer, true = (passes.flown_states(state, times, middle) for state in (own, other))
     way = true[:, :3] - observer[:, :3]
-    # By the epoch's own Earth, as an almanac has it about the equinox: 29.9 km/s.
+    # The Earth's speed at the epoch, near the equinox, is 29.9 km/s according to an almanac.
     earth = np.array([0.0, -29.9e3 * np.cos(np.radians(23.44)), -29.9e3 * np.sin(np.radians(23.44))])
     late = np.linalg.norm(way, axis=1, keepdims=True) / passes.LIGHT
     seen = way - late * (true[:, 3:] + earth)

@@ -1,4 +1,4 @@
-"""`knightcube parameters` with a flight's task of parameters at the other end of its socket."""
+"""Tests of `knightcube parameters` with the flight's parameter task at the other end of its socket."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Sink:
 
 
 class Answering:
-    """The far end: answers commands of parameters as the loop does."""
+    """The flight's end of the socket, which answers parameter commands as the loop does."""
 
     def __init__(self, path: Path) -> None:
         self.modes: list[Modes] = []

@@ -1,4 +1,4 @@
-"""The commands `passes` and `day` print, draw and refuse what their arguments describe."""
+"""Tests of the output, the plots and the refusals of the commands `passes` and `day`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The words of `knightcube command ... point` go through the packet and end in the attitude they name."""
+"""Tests that the arguments of `knightcube command ... point` give the attitude that they describe."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BEGUN = np.array([0.5, -0.5, 0.1, 0.7]) / np.linalg.norm([0.5, -0.5, 0.1, 0.7])
 
 
 def turned_by(words: list[str]) -> FloatArray:
-    """Return the matrix (3, 3), ICRS into body, at `TIME`, of a command that went through its packet."""
+    """Return the attitude matrix (3, 3), ICRS to body, at `TIME`, of a packed and unpacked command."""
     parser = argparse.ArgumentParser()
     satellite.configure_command(parser)
     options = parser.parse_args(["--to", "127.0.0.1:1", "point", *words])
@@ -34,7 +34,7 @@ def turned_by(words: list[str]) -> FloatArray:
 
 UP = ORBIT.position_at(TIME)[0] / np.linalg.norm(ORBIT.position_at(TIME)[0])
 AHEAD = np.array([-UP[2], 0.0, UP[0]])
-"""Of the circular polar orbit over the x axis."""
+"""Position and velocity on a circular polar orbit above the x axis."""
 
 
 @pytest.mark.parametrize(

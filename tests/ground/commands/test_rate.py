@@ -1,4 +1,4 @@
-"""`knightcube rate`: from a picture file to a rate, its covariance, its streaks, and a picture of them."""
+"""Tests of `knightcube rate`: from an image file to a rate, its covariance, and a plot of the streaks."""
 
 from __future__ import annotations
 
@@ -92,7 +92,10 @@ def test_a_mistake_is_one_line(words: list[str], complaint: str, picture: Path) 
 
 
 def test_options_describe_the_camera_and_a_refusal_says_why(scene: Scene, picture: Path) -> None:
-    """The picture's point spread is 1 px; called 2 px the rate is claimed less, called 4 px not at all."""
+    """The image's point spread is 1 px.
+
+    If 2 px are stated, the uncertainty grows; if 4 px are stated, the rate is refused.
+    """
     told = [
         "--fov",
         FOV,

@@ -1,4 +1,4 @@
-"""`knightcube renewal` makes keys and bundles that a board accepts."""
+"""Tests that `knightcube renewal` makes keys and bundles that an on-board computer accepts."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_bundle_is_opened_by_the_root_metadata_of_the_board(signing: Path, tmp
 
 
 def _sources(place: Path, version: str) -> Path:
-    """Return the folder of a release's sources that have a version and a file."""
+    """Return a folder with the sources of a release: a version and a file."""
     (place / "deploy").mkdir(parents=True)
     (place / "deploy/build_release.py").write_text("print('built')\n")
     (place / "pyproject.toml").write_text(f'[project]\nname = "x"\nversion = "{version}"\n')

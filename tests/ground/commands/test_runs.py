@@ -1,4 +1,4 @@
-"""Reports, exports and first orbits of a run, as the commands print them."""
+"""Tests of the printed reports, exports and initial orbits of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands, parameters and files of a satellite, on stand-ins for the socket and the link."""
+"""Tests of commands, parameters and files of a satellite with test doubles of the socket and the link."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def table(values: dict[str, float], **changes: Any) -> bytes:
 
 
 class Flight:
-    """A flight behind a socket: answers from a list, and keeps what it receives."""
+    """A test double of a flight process: it answers from a list and stores the commands it receives."""
 
     def __init__(self, *answers: bytes) -> None:
         self.answers = list(answers)
@@ -89,7 +89,7 @@ class Flight:
 
 @pytest.fixture
 def flight(monkeypatch: pytest.MonkeyPatch) -> Flight:
-    """Return a flight that the commands reach instead of a socket."""
+    """Return a test double that receives the commands instead of a socket."""
     found = Flight()
     monkeypatch.setattr(satellite, "exchange", found.exchange)
     return found
@@ -125,7 +125,7 @@ def test_directives_of_the_link_need_the_link(flight: Flight) -> None:
 
 
 def words(*arguments: str) -> Any:
-    """Return the options of a typed command."""
+    """Return the parsed options of a command line."""
     parser = argparse.ArgumentParser()
     satellite.configure_command(parser)
     return parser.parse_args(["--to", "socket", *arguments])
@@ -200,7 +200,7 @@ def report(stage: Stage, text: str = "text", counter: int = 1, spi: int = 1) -> 
 
 
 class Link:
-    """A terminal with telemetry from a list."""
+    """A ground terminal whose telemetry is a list."""
 
     packet_bytes = 987
 
@@ -223,7 +223,7 @@ class Link:
 
 @pytest.fixture
 def link(monkeypatch: pytest.MonkeyPatch) -> Link:
-    """Return a terminal that the commands open instead of a link."""
+    """Return a test double of the terminal, which the commands open instead of a link."""
     found = Link()
     monkeypatch.setattr(satellite, "terminal_of", lambda _: found)
     return found
@@ -341,7 +341,7 @@ def verified(stage: Stage, counter: int = 1, spi: int = 1, text: str = "why") ->
 
 
 def by_link(options: Any, wants_table: bool = True) -> Any:
-    """Return what is received for a request over the link."""
+    """Return the telemetry that a request over the link receives."""
     return satellite._ask_by_link(options, b"packet", wants_table)
 
 
@@ -370,7 +370,7 @@ def test_the_table_arrives_before_or_after_its_verification(link: Link) -> None:
 
 
 class Session:
-    """A file session whose reports and endings are given turn by turn."""
+    """A file session whose reports and results are given for each cycle."""
 
     def __init__(self, folder: Path, *turns: tuple[list[Report], list[Any]]) -> None:
         self.received = folder
@@ -405,17 +405,17 @@ class Session:
 
 @pytest.fixture
 def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the line be silent without waiting."""
+    """Make the link silent without waiting."""
     monkeypatch.setattr("ground.commands.satellite.select.select", lambda *_: ([], [], []))
 
 
 def work(session: Session, ended: bool = False) -> satellite._FileWork:
-    """Return the file work of a session."""
+    """Return the file-transfer methods of a session."""
     return satellite._FileWork(cast(Any, session), cast(Any, None), 1e9, lambda: ended)
 
 
 def ending(name: str, number: int = 5, condition: int = 0) -> Any:
-    """Return the end of a transfer."""
+    """Return the packet for the end of a transfer."""
     return SimpleNamespace(name=name, number=number, condition=condition)
 
 

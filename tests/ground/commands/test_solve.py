@@ -1,4 +1,4 @@
-"""`knightcube solve`: from a picture file to a place in the sky, its stars, and a picture of them."""
+"""Tests of `knightcube solve`: from an image file to an attitude, its stars, and a plot."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_streaks_give_the_rate_when_the_exposure_is_known(tmp_path: Path) -> Non
 
 
 def test_the_date_takes_aberration_off(picture: Path) -> None:
-    """The stars were drawn without it: believing in it moves the answer by the Earth's 20.5", at most."""
+    """The stars were rendered without aberration. Correcting it moves the attitude by at most 20.5"."""
     without = json.loads(command("solve", picture, "--fov", "12", "--json").stdout)
     with_it = command("solve", picture, "--fov", "12", "--date", "2026-07-02T12:00", "--json")
     facts = json.loads(with_it.stdout)
@@ -79,7 +79,7 @@ def test_the_date_takes_aberration_off(picture: Path) -> None:
 
 @pytest.mark.parametrize("method", sorted(SOLVERS))
 def test_each_attitude_solver_finds_the_same_place(method: str, resting: SkyFrame, picture: Path) -> None:
-    """TRIAD takes two of the stars: its answer is the widest, and says so."""
+    """TRIAD uses only two stars, so its attitude has the largest uncertainty."""
     words = ("--fov", "12", "--fov-error", "0.1", "--attitude", method)
     done = command("solve", picture, *words, "--json")
     assert done.returncode == 0, done.stderr
@@ -101,7 +101,7 @@ def test_each_centroid_finds_the_same_place(method: str, resting: SkyFrame, pict
     assert facts["centroid_method"] == method
     assert angle_between(np.array(facts["quaternion"]), resting.attitude) < np.radians(20.0 / 3600.0)
     places = np.array([star["point_px"] for star in facts["stars"]])
-    # The methods are different ones: their places differ.
+    # The attitudes differ, because the methods differ.
     other = "psf" if method != "psf" else "window"
     again = command("solve", picture, *words[:-1], other, "--json")
     others = np.array([star["point_px"] for star in json.loads(again.stdout)["stars"]])
@@ -190,7 +190,7 @@ def test_the_world_coordinates_put_the_stars_where_the_picture_has_them(
         assert _sky_of(wcs, x, y, crval) == pytest.approx(
             (place["right_ascension_deg"], place["declination_deg"]), abs=1e-6
         )
-    # Out to the corner and back by the other two polynomials.
+    # From pixel to sky by the forward polynomials and back by the inverse polynomials, out to the corners.
     x, y = 400.0, -350.0
     u, v = x + _polynomial(wcs, "A", x, y), y + _polynomial(wcs, "B", x, y)
     assert (u + _polynomial(wcs, "AP", u, v), v + _polynomial(wcs, "BP", u, v)) == pytest.approx(

@@ -1,4 +1,4 @@
-"""Commands of a ground station: keys, the watch of a flight, and the addresses of console and gateway."""
+"""Tests of ground station commands: keys, `watch`, and the addresses of console and gateway."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def test_the_page_listens_on_loopback_only() -> None:
 
 @contextmanager
 def _served(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
-    """Serve no page, but keep what would be served."""
+    """Store the console instead of serving its page."""
     web = pytest.importorskip("aiohttp.web")
     served: list[Any] = []
     monkeypatch.setattr(web, "run_app", lambda app, **options: served.append((app, options)))

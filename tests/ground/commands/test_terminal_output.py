@@ -1,4 +1,4 @@
-"""No command prints control characters that come from data, because they would control the terminal."""
+"""Tests that no command prints control characters from data, because they would control the terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.ground.report.synthetic import Recipe, make_run
 
 ATTACK = b"\x1b]0;x\x07\x9b2J\r\x08"
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
-"""Control characters other than tabulator and line feed."""
+"""Control characters except tab and line feed."""
 
 
 @pytest.fixture(scope="module")

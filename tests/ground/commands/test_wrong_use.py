@@ -1,4 +1,4 @@
-"""Wrong use and bad configurations: status 2 and a line with the place and what is permitted."""
+"""Tests that wrong use gives exit status 2 and one line with the location and the permitted values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A console that a test serves, and what a client gets from it."""
+"""Console server for tests, and the responses that a client receives."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def asked(
     send: Any = None,
     access: Access | None = None,
 ) -> Any:
-    """Serve a run, and return what a client gets that has opened the address, or with `access` has not."""
+    """Serve a run, and return the response to a client that is admitted unless `access` says otherwise."""
 
     async def talk(history: History) -> Any:
         place = FlightSurroundings.of(folder / "config.yaml")

@@ -1,4 +1,4 @@
-"""Whatever a browser sends is answered in words, never with status 500, and only whole commands are sent."""
+"""Tests that any request gets a text, never status 500, and that only complete commands are sent."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ ODD = [
     ),
     *(f'"{HUGE}"', f'"{"x" * 5000}"', '"' + "9" * 5000 + '"', "[" * 500 + "]" * 500, "0.1", "-0", "7"),
 ]
-"""Values in JSON that a form never sends."""
+"""JSON values that a form of the page never sends."""
 NUMBERS = [
     *(
         "",
@@ -132,7 +132,7 @@ def bodies(draw: np.random.Generator) -> Iterator[tuple[bytes, str]]:
 
 
 def queries() -> Iterator[str]:
-    """Yield addresses with numbers that no page asks for."""
+    """Yield URLs with numbers that no page requests."""
     for number in NUMBERS:
         yield f"/api/series?packet=imu&field=rate&from={number}&to=1"
         yield f"/api/series?packet=imu&field=rate&from=0&to={number}"

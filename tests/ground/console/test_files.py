@@ -1,4 +1,4 @@
-"""The satellite's files over a link, as the console lists, gets and puts them."""
+"""Tests that the console lists, downloads and uploads files of the satellite over a link."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.flight.link.process.filed_ends import FiledEnds
 
 
 class Ends(FiledEnds):
-    """Both ends of a link, whose ground end is the console alone."""
+    """Both ends of a link. The console is the only program at the ground end."""
 
     def collect(self) -> None:
         """Keep the telemetry for the console."""
@@ -40,7 +40,7 @@ def console(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[E
 
 
 def during(feed: LinkFeed, request: Callable[[], Any]) -> Any:
-    """Return the result of a request, or its FlightError, while the feed is read."""
+    """Run a request while the feed is read, and return its result or its FlightError."""
     found: list[Any] = []
 
     def work() -> None:

@@ -1,4 +1,4 @@
-"""Kept frames on the page: a PNG that another program reads, and what was found in the frame."""
+"""Tests of kept frames on the page: a PNG that Pillow reads, and the objects found in the frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The console by a link: telemetry out of frames, a command with its stages, and a link that stays silent."""
+"""Tests of the console over a link: telemetry, a command with its verification stages, and a silent link."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from tests.flight.link.process.both_ends import BothEnds
 
 
 class Satellite:
-    """Both ends of a link, whose ground is a feed; its turns are those of the feed's looks."""
+    """Both ends of a link.
+
+    The ground end is a feed; each update of the feed runs one cycle of the satellite's end.
+    """
 
     def __init__(self, ends: BothEnds, monkeypatch: pytest.MonkeyPatch) -> None:
         self.ends = ends
-        # What the terminal waits for comes out of the turns of the other end.
+        # While the terminal waits, the satellite's end of the link runs.
         monkeypatch.setattr(ends.terminal, "packets", self._packets)
         self.feed = LinkFeed(ends.terminal)
 
@@ -50,7 +53,7 @@ def test_it_asks_for_telemetry_once_and_gives_what_the_flight_records(satellite:
 
 
 def answered(satellite: Satellite, send: Callable[[], dict[str, object]]) -> dict[str, object]:
-    """Return the answer to a command that another thread sends, as the page's server does."""
+    """Send a command in a second thread, as the page's server does, and return the answer."""
     answers: list[dict[str, object]] = []
     sending = threading.Thread(target=lambda: answers.append(send()))
     sending.start()

@@ -1,4 +1,7 @@
-"""The page in Chromium; `python -m tests.studies.console` measures it beside a flight."""
+"""Tests of the page in Chromium.
+
+`python -m tests.studies.console` measures its load beside a flight process.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,7 @@ _RED = """(() => {
   }
   return found > 0.3 * canvas.width;
 })()"""
-"""Whether a dashed line in the colour of a fault is drawn across the last plot."""
+"""Script that returns whether the last plot has a dashed line in the colour of a fault."""
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +155,7 @@ def test_a_page_of_a_console_that_was_started_again_says_that_it_is_stale(folder
 
 
 def test_another_page_neither_frames_the_console_nor_asks_it_anything(folder: Path) -> None:
-    """Also in the browser that the console knows: both pages are of the same host, so cookies are sent."""
+    """Admitted browsers must be refused too: both pages have the same host, so cookies are sent."""
     with serving(folder) as url, another_origin() as foreign, browsing() as chromium:
         context = chromium.new_context()
         own, other = context.new_page(), context.new_page()

@@ -1,4 +1,4 @@
-"""The console as its page asks for it, and as strangers do."""
+"""Tests of the console's responses to its own page and to unauthorised clients."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def get(folder: Path, path: str, headers: dict[str, str] | None = None) -> tuple
 
 
 def test_the_page_and_all_that_it_names_are_served_and_stay_small(folder: Path) -> None:
-    """The page weighs at most 250 kB."""
+    """The page has at most 250 kB."""
     page = Path(__file__).parents[3] / "ground/console/page"
     names = [path.relative_to(page) for path in page.rglob("*") if path.is_file()]
     assert sum((page / name).stat().st_size for name in names) <= 250_000
@@ -81,7 +81,7 @@ def test_the_page_and_all_that_it_names_are_served_and_stay_small(folder: Path) 
     ],
 )
 def test_another_page_of_the_same_browser_gets_nothing(folder: Path, headers: dict[str, str]) -> None:
-    """Also with the cookie of a session: a name that was rebound to loopback, or another origin."""
+    """Requests by a rebound DNS name or from another origin are refused even with a session cookie."""
     for path in ("/", "/api/table", "/api/live", "/page/main.js"):
         assert get(folder, path, headers)[0] == 403
 
@@ -232,7 +232,7 @@ def test_a_log_that_grows_is_shown_within_a_second(folder: Path, tmp_path: Path)
 
 
 def test_the_links_own_packets_do_not_hide_a_flight_that_is_silent(folder: Path) -> None:
-    """A link that lives goes on to report once a second."""
+    """A working link continues to report once a second."""
 
     class Feed:
         silence = 0.0
@@ -259,7 +259,10 @@ def test_a_frame_that_was_not_kept_is_null_and_has_no_picture(folder: Path) -> N
 
 
 def test_what_is_shown_live_is_whole(folder: Path) -> None:
-    """Packets of one instant may come in two looks: live stands at the instant before until the next look."""
+    """Packets of one instant may arrive in two updates.
+
+    Until the second update, the live state is that of the previous instant.
+    """
 
     class Feed:
         silence = 0.0
@@ -379,7 +382,7 @@ def test_without_a_way_to_the_flight_nothing_is_sent(folder: Path) -> None:
 def test_a_satellites_place_is_known_from_its_elements_and_without_a_configuration_nothing_is(
     tmp_path: Path,
 ) -> None:
-    """On an equinox at noon UTC the Sun stands over the equator, some 2 deg east of Greenwich."""
+    """At an equinox at noon UTC, the Sun is above the equator at about 2 deg east."""
     shutil.copy(Path(__file__).parents[3] / "config/orbit.yaml", tmp_path / "config.yaml")
     noon = int(datetime(2026, 3, 20, 12, tzinfo=UTC).timestamp() * 1e9)
     place = FlightSurroundings.of(tmp_path / "config.yaml").at(noon)
@@ -389,7 +392,7 @@ def test_a_satellites_place_is_known_from_its_elements_and_without_a_configurati
         pytest.approx(0.0, abs=0.3),
         pytest.approx(1.9, abs=0.5),
     )
-    # Straight up is away from nadir, and the track passes below the satellite.
+    # The zenith direction is opposite to nadir, and the ground track passes below the satellite.
     track = np.array(FlightSurroundings.of(tmp_path / "config.yaml").track(noon))
     assert np.hypot(*(track - [place["latitude"], place["longitude"]]).T).min() < 0.5
     assert np.dot(place["nadir"], place["velocity"]) == pytest.approx(0.0, abs=0.01)

@@ -1,4 +1,4 @@
-"""What a connection to the gateway may send: the token, then command packets, byte by byte."""
+"""Tests of the bytes that a connection may send to the gateway: the token, then command packets."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_byte_that_no_token_has_is_refused_at_once(data: bytes) -> None:
 
 
 def test_how_much_of_a_token_is_right_is_not_disclosed() -> None:
-    """A wrong character is refused only when the line is complete, wherever it stands."""
+    """A wrong character at any position is refused only when the line is complete."""
     for right in range(len(TOKEN)):
         wrong = TOKEN[:right] + ("1" if TOKEN[right] == "0" else "0") + TOKEN[right + 1 :]
         stream = CommandStream(TOKEN)
@@ -72,13 +72,13 @@ def changed(packet: bytes, at: int, value: int) -> bytes:
     [
         (changed(PING, 0, PING[0] | 0x20), 0),  # version 1
         (changed(PING, 0, PING[0] & ~0x10), 0),  # telemetry
-        (changed(PING, 0, PING[0] & ~0x08), 0),  # without a secondary header
+        (changed(PING, 0, PING[0] & ~0x08), 0),  # packet without a secondary header
         (changed(PING, 1, 0xFF), 1),  # another application
         (changed(PING, 2, 0x40), 2),  # a segment
         (changed(PING, 4, 1), 4),  # longer than any ping
         (changed(PING, 5, PING[5] + 1), 5),
         (changed(PING, 5, PING[5] - 1), 5),
-        (changed(PING, 6, PING[6] + 1), 6),  # another version of the definition
+        (changed(PING, 6, PING[6] + 1), 6),  # packet of an unknown version of the definition
         (changed(UNIT, 4, 0xFF), 4),  # longer than any frame
         (changed(UNIT, 4, 0)[:5] + b"\x00", 5),  # shorter than its headers
         (UnitPacker(DOWN).pack(b"unit", 1), 0),

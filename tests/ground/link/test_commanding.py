@@ -1,4 +1,4 @@
-"""Commands over the link: reports, changes of keys, repetition, and files within the transmission rate."""
+"""Tests of commands over the link: reports, key changes, repetition, and files within the data rate."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def report(stage: Stage, text: str = "", counter: int = 0, spi: int = 1) -> Repo
 
 
 class FakeTerminal:
-    """A terminal that keeps what is sent, and answers with given reports."""
+    """A test double of the terminal: it stores sent packets and answers with given reports."""
 
     packet_bytes = LONGEST_PACKET
 
@@ -62,7 +62,7 @@ class FakeTerminal:
 
 
 def terminal(vault: Vault | None = None, *answers: list[Report]) -> Any:
-    """Return a terminal that answers with lists of reports."""
+    """Return a test double of the terminal that answers each command with a list of reports."""
     return FakeTerminal(vault, *answers)
 
 
@@ -95,7 +95,7 @@ def test_each_report_is_shown_and_none_is_an_error() -> None:
 
 @pytest.fixture
 def vault(tmp_path: Path) -> Vault:
-    """Return the keys of the ground."""
+    """Return the ground's key file."""
     make_keys(tmp_path / "keys")
     return Vault(tmp_path / "keys" / "ground")
 
@@ -162,7 +162,7 @@ def test_a_key_that_is_lost_on_the_ground_cannot_be_changed(vault: Vault) -> Non
 
 
 def session(folder: Path, line: Any, rate: float = 1e6) -> commanding.FileSession:
-    """Return a session whose rate is in bytes/s."""
+    """Return a file session with a data rate in bytes/s."""
     return commanding.FileSession(line, Store(folder), 1, rate, 0)
 
 

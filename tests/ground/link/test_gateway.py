@@ -1,4 +1,4 @@
-"""The gateway and those who connect to it: with the token, without it, and a web page in a browser."""
+"""Tests of the gateway with clients that have the token, clients without it, and a web page."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PATIENCE_S = 60.0
 
 
 class Satellite:
-    """Stands for the terminal: keeps the uplinked frames, and returns the frames of the downlink."""
+    """A test double of the terminal: it stores uplinked frames and returns downlinked frames."""
 
     packet_bytes = 987
 
@@ -65,14 +65,14 @@ class Satellite:
 
     @property
     def commands(self) -> list[bytes]:
-        """What went up beside the gateway's own pings."""
+        """Uplinked packets other than the gateway's own pings."""
         ping = CommandPacker().pack(Ping(), 1)[:2]
         return [packet for packet in self.up if packet[:2] != ping]
 
 
 @dataclass
 class Station:
-    """A gateway with its token, satellite and complaints."""
+    """A gateway with its token, a test double of the satellite, and the reported errors."""
 
     gateway: Gateway
     token: str
@@ -122,7 +122,7 @@ def test_a_packet_for_a_longer_frame_closes_its_connection_alone(
 
 
 def closed(line: socket.socket) -> bool:
-    """Return whether the other end has closed a connection, on which nothing came."""
+    """Return whether the other end has closed a connection without sending any byte."""
     try:
         return line.recv(1) == b""
     except ConnectionResetError:
@@ -130,7 +130,7 @@ def closed(line: socket.socket) -> bool:
 
 
 def open_still(line: socket.socket) -> bool:
-    """Return whether nothing has come on a connection, not even its end."""
+    """Return whether a connection is open and has received no byte."""
     return not select.select([line], [], [], 0.0)[0]
 
 
@@ -207,7 +207,7 @@ def test_the_file_with_the_token_is_its_users_alone_and_goes_with_the_gateway(tm
 
 @dataclass
 class Opened:
-    """The command `knightcube gateway` in a process of its own, and the frames that it sends up."""
+    """A separate process of `knightcube gateway`, and the frames that it uplinks."""
 
     process: subprocess.Popen[str]
     port: int
@@ -217,7 +217,7 @@ class Opened:
     errors: Path
 
     def command(self) -> int | None:
-        """Return the length of the next frame that is not the gateway's own ping, None within 3 s."""
+        """Return the length of the next frame that is not the gateway's own ping, or None after 3 s."""
         until = time.monotonic() + 3.0
         while (left := until - time.monotonic()) > 0.0:
             self.frames.settimeout(left)
@@ -251,7 +251,7 @@ def opened(tmp_path: Path) -> Iterator[Opened]:
 def test_the_command_obeys_whoever_has_read_its_file_and_nobody_else(opened: Opened) -> None:
     with socket.create_connection(("127.0.0.1", opened.port), PATIENCE_S) as stranger:
         head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9000\r\n\r\n"
-        skipped = 7 + int.from_bytes(head[4:6], "big")  # the length of the text, if it were a packet
+        skipped = 7 + int.from_bytes(head[4:6], "big")  # length that a packet reader would take from the text
         with contextlib.suppress(ConnectionError):
             stranger.sendall(head.ljust(skipped, b"\0") + SAFE)
         assert opened.command() is None

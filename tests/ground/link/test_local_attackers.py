@@ -1,7 +1,7 @@
-"""What web pages and other users of the ground's machine reach through gateway and console: nothing.
+"""Tests that web pages and other users of the ground's machine are refused by gateway and console.
 
-Both programs run as their commands, on one link, whose frames a socket of this test receives and admits with
-the satellite's keys. The tests in Chromium need Debian's packages `chromium` and the extra `playwright`.
+Both programs run as commands on one link. A socket of this test receives the frames and authenticates them
+with the satellite's keys. The tests in Chromium need Debian's packages `chromium` and the extra `playwright`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Ground:
     frames: socket.socket
 
     def obeyed(self, seconds: float = 0.5) -> list[bytes]:
-        """Return the commands that arrive until none has come for a while; both programs ping meanwhile."""
+        """Return the commands other than pings that arrive until the link is silent."""
         found, until = list[bytes](), time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
             self.frames.settimeout(left)
@@ -157,7 +157,7 @@ REQUESTS: list[tuple[str, str, dict[str, str], str | None]] = [
 def test_no_forged_request_is_obeyed_even_by_the_operators_browser(
     ground: Ground, cookie: str, forged: dict[str, str]
 ) -> None:
-    """Requests of a page whose name was rebound to loopback, and of other origins, with the cookie."""
+    """Test requests with the cookie from a page with a rebound DNS name, and from other origins."""
     headers = {name: text.replace("PORT", str(ground.console)) for name, text in forged.items()}
     for method, path, more, body in REQUESTS:
         status, text, _ = _asked(ground.console, method, path, {**headers, **more, "Cookie": cookie}, body)
@@ -167,8 +167,8 @@ def test_no_forged_request_is_obeyed_even_by_the_operators_browser(
 
 @pytest.mark.parametrize("session", ["", "knightcube-console-PORT=", "knightcube-console-PORT=" + "A" * 43])
 def test_without_the_token_nothing_is_obeyed(ground: Ground, cookie: str, session: str) -> None:
-    """Requests of a program on the same machine, which can state any Host and Origin."""
-    del cookie  # the token of the printed address has been used
+    """Test requests of a program on the same machine, which can state any Host and Origin."""
+    del cookie  # the token in the printed address is already used
     used = ground.url.partition("?")[2]
     headers = {
         "Origin": f"http://127.0.0.1:{ground.console}",
@@ -209,7 +209,7 @@ def _rest(line: socket.socket) -> bytes:
 
 
 def test_the_operator_is_obeyed(ground: Ground, cookie: str) -> None:
-    """Otherwise the other tests would show nothing."""
+    """If this test passes, the other tests refuse requests because of their sender."""
     with socket.create_connection(("127.0.0.1", ground.gateway), PATIENCE_S) as line:
         line.sendall(token_path(ground.keys, ground.gateway).read_bytes() + SAFE)
         assert len(ground.obeyed(PATIENCE_S)) == 1
@@ -222,7 +222,7 @@ def test_the_operator_is_obeyed(ground: Ground, cookie: str) -> None:
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
 def test_another_user_finds_no_token(ground: Ground) -> None:
-    """The folders of the keys are open to all users here, which no command makes them."""
+    """In this test, all users may enter the key folders, although no command makes them so."""
     places = [token_path(ground.keys, ground.gateway), *sorted(ground.keys.glob("spi-*"))]
     places += [Path(f"/proc/{pid}/{name}") for pid in ground.processes for name in ("environ", "mem")]
     token = places[0].read_text(encoding="ascii").strip()
@@ -273,7 +273,10 @@ _REQUESTS = """async ([page, gateway, command, packet]) => {
   }
   return found;
 }"""
-"""A page's requests to both programs. The gateway once skipped zeros as packets of 7 bytes."""
+"""JavaScript of a page that sends requests to both programs.
+
+The request begins with zeros, which could be read as packets of 7 bytes.
+"""
 _FORM = """(page) => {
   const form = document.createElement("form");
   Object.assign(form, { method: "post", action: `${page}api/command`, enctype: "text/plain" });
@@ -298,7 +301,7 @@ def context(ground: Ground, cookie: str) -> Iterator[Any]:
     if lacks := browser.missing():
         pytest.skip(lacks)
     rules = "--host-resolver-rules=MAP evil.example 127.0.0.1"
-    # Recent browsers ask their user before a page of the web reaches loopback; others do not.
+    # Recent browsers ask the user before a web page may reach loopback; older browsers do not.
     with browser.browsing(rules, "--disable-features=LocalNetworkAccessChecks") as chromium:
         opened = chromium.new_context(viewport={"width": 1000, "height": 800})
         name, _, value = cookie.partition("=")
@@ -308,7 +311,7 @@ def context(ground: Ground, cookie: str) -> Iterator[Any]:
 
 
 def _attacked(ground: Ground, context: Any, origin: str, host: str) -> list[object]:
-    """Let a page at `origin` send its requests to both programs by the name `host`; return their results."""
+    """Let a page at `origin` send its requests to both programs at `host`, and return the results."""
     page = context.new_page()
     page.goto(origin)
     console, gateway = (f"http://{host}:{port}/" for port in (ground.console, ground.gateway))
@@ -322,7 +325,7 @@ def _attacked(ground: Ground, context: Any, origin: str, host: str) -> list[obje
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["127.0.0.1", "evil.example"])
 def test_another_page_of_the_operators_browser_is_not_obeyed(ground: Ground, context: Any, name: str) -> None:
-    """A page of another port of the same host, with which cookies are sent, and a page of another site."""
+    """Test a page on a different port of the same host (with cookies), and a page of a different site."""
     with browser.another_origin() as url:
         found = _attacked(ground, context, url.replace("127.0.0.1", name), "127.0.0.1")
     assert set(found) <= {0, "refused"}, "0 is the status of an answer that the page may not read"
@@ -331,7 +334,7 @@ def test_another_page_of_the_operators_browser_is_not_obeyed(ground: Ground, con
 
 @pytest.mark.slow
 def test_a_page_whose_name_is_rebound_to_loopback_is_not_obeyed(ground: Ground, context: Any) -> None:
-    """The page has the origin of the console's port, so that the browser lets it read all answers."""
+    """The page has the origin of the console's port, so the browser permits it to read all answers."""
     origin = f"http://evil.example:{ground.console}/start"
     context.route(origin, lambda route: route.fulfill(content_type="text/html", body="<!doctype html>"))
     found = _attacked(ground, context, origin, "evil.example")

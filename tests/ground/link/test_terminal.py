@@ -1,4 +1,4 @@
-"""The ground's terminal: new keys, lines, and the reports on one command."""
+"""Tests of the ground terminal: new keys, serial and UDP lines, and the reports on a command."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_defaults_are_those_of_the_configuration() -> None:
 
 
 class SharedLine:
-    """A line that several terminals have; `before` is called before each frame is on it."""
+    """A line shared by several terminals; `before` is called before each sent frame."""
 
     def __init__(self) -> None:
         self.frames: list[bytes] = []
@@ -77,7 +77,7 @@ class SharedLine:
 
 
 def test_programs_that_share_the_keys_send_in_the_order_of_their_counters(keys: Path) -> None:
-    """The gateway has a block of counters and stops before its frame is on the line; the console sends."""
+    """The gateway reserves a block of counters and stops before it sends; then the console sends."""
     slow, line = SharedLine(), SharedLine()
     slow.frames = line.frames
     gateway, console = (Terminal(one, Vault(keys), TerminalSettings()) for one in (slow, line))
@@ -110,7 +110,7 @@ def test_a_program_that_blocks_while_it_sends_is_not_waited_for_long(
 
 @contextlib.contextmanager
 def listening() -> Iterator[socket.socket]:
-    """Yield a TCP socket that listens."""
+    """Yield a listening TCP socket."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         yield server
 

@@ -1,1 +1,1 @@
-"""Tests of the report: figures of performance, summary, text, pictures."""
+"""Tests of the report: performance figures, summary, text and plots."""

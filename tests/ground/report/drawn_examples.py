@@ -1,7 +1,6 @@
-"""Pictures of made-up runs, whose descriptions are kept in `drawn_examples.json`.
+"""Plots of artificial runs. `drawn_examples.json` contains their descriptions.
 
-`python -m tests.ground.report.drawn_examples` writes the record again, after a change of the pictures that is
-intended.
+`python -m tests.ground.report.drawn_examples` writes the record again after an intended change of the plots.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ def attitude(x: float, y: float, z: float) -> list[float]:
 
 
 def run_of_a_testbed(truth: bool = True) -> Run:
-    """Return six seconds of a testbed that turns through two targets in a rotating field."""
+    """Return a run of six seconds on a testbed that rotates to two targets in a rotating field."""
     times = [CONTROL_S * k for k in range(60)]
 
     def angle(t: float) -> float:
@@ -141,7 +140,7 @@ def run_of_a_testbed(truth: bool = True) -> Run:
 
 
 def run_in_orbit(truth: bool = True) -> Run:
-    """Return forty minutes of a flight in orbit through detumbling, shadow and two targets."""
+    """Return a run of forty minutes in orbit with detumbling, shadow and two targets."""
     times = [20.0 * k for k in range(120)]
 
     def error(t: float) -> list[float]:
@@ -251,7 +250,7 @@ def run_in_orbit(truth: bool = True) -> Run:
 
 
 def planned_slew(limit: float = 0.02) -> tuple[Any, Any]:
-    """Return a made-up slew across the edge of the map, with two cones, and its order."""
+    """Return an artificial slew across the edge of the sky map with two exclusion cones, and its command."""
     times = np.linspace(0.0, 200.0, 9)
     angle = 2.4 * (times / 200.0) ** 2 * (3.0 - 2.0 * times / 200.0)
     rate = 2.4 * 6.0 * (times / 200.0) * (1.0 - times / 200.0) / 200.0
@@ -298,7 +297,7 @@ def planned_slew(limit: float = 0.02) -> tuple[Any, Any]:
 
 
 def identified() -> tuple[Any, Any]:
-    """Return a made-up record of an identification and its fit."""
+    """Return an artificial identification record and its fit."""
     time = np.arange(0.0, 4.0, 0.1)
     taken = np.arange(0, 40, 2)
     error = np.stack([0.01 * np.sin(time[taken]), 0.002 * np.cos(time[taken])], axis=1)
@@ -371,12 +370,12 @@ PICTURES: dict[str, Callable[[], Figure]] = {
 
 
 def recorded(name: str) -> Any:
-    """Return the recorded description of a picture."""
+    """Return the recorded description of a plot."""
     return json.loads(RECORD.read_text(encoding="utf-8"))[name]
 
 
 def rounded(value: Any) -> Any:
-    """Return a description with seven digits of each number, as JSON gives it back."""
+    """Return a description after conversion to JSON and back, with seven digits of each number."""
     if isinstance(value, dict):
         return {key: rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -387,7 +386,7 @@ def rounded(value: Any) -> Any:
 
 
 def main() -> None:
-    """Write the record of all pictures."""
+    """Write the record of all plots."""
     lines = [
         f"{json.dumps(name)}: {json.dumps(rounded(described(make())))}" for name, make in PICTURES.items()
     ]

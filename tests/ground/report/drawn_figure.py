@@ -1,7 +1,7 @@
-"""Describes a matplotlib figure as plain numbers, so that a test can compare it with a record.
+"""Description of a matplotlib figure as plain numbers, for comparison with a record.
 
-Of a text only its numbers and its style are kept, because wording may change. Of a curve five points and the
-mean are kept.
+Texts are reduced to their numbers and style, because the wording may change. Curves are reduced to five
+points and the mean.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ def _colour(colour: Any) -> str:
 
 
 def unlike(record: Any, found: Any, place: str = "") -> list[str]:
-    """Return the places at which a description differs from its record."""
+    """Return the keys at which a description differs from its record."""
     if isinstance(record, dict) and isinstance(found, dict):
         lines = [f"{place}.{key}: in one of them only" for key in sorted(record.keys() ^ found.keys())]
         return lines + [

@@ -1,7 +1,8 @@
-"""A made-up run with known answers: every step is the response of a second-order system, without noise.
+"""An artificial run with known figures: each step is the noise-free response of a second-order system.
 
-The body follows y(t) = 1 - exp(-z w t) (cos(wd t) + z/sqrt(1 - z^2) sin(wd t)), wd = w sqrt(1 - z^2), of each
-step: overshoot exp(-pi z/sqrt(1 - z^2)). The coil carries `CURRENT` for the first `PULSE_S` of every step.
+The body follows y(t) = 1 - exp(-z w t) (cos(wd t) + z/sqrt(1 - z^2) sin(wd t)), wd = w sqrt(1 - z^2), in each
+step. The overshoot is exp(-pi z/sqrt(1 - z^2)). The coil carries `CURRENT` for the first `PULSE_S` of every
+step.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def trajectory(recipe: Recipe) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def make_run(folder: Path, recipe: Recipe | None = None) -> Path:
-    """Write the logs of a made-up run into `folder` and return it."""
+    """Write the logs of an artificial run into `folder`, and return the run."""
     recipe = recipe or Recipe()
     clock, packer = ManualClock(0), Packer()
     logs = {
@@ -198,10 +199,10 @@ def _plan(packer: Packer, stamp: int, number: int, start: float, target: float) 
 
 
 def _streak(packer: Packer, stamp: int, sequence: int, rates: FloatArray) -> bytes:
-    """Return a rate over the last second, off the true mean by `STREAK_ERROR`, with just that variance."""
+    """Return the mean rate over the last second with the error `STREAK_ERROR` and its square as variance."""
     mean = float(np.mean(0.5 * (rates[1:] + rates[:-1])))
     error = STREAK_ERROR if sequence % 2 == 0 else -STREAK_ERROR
-    variance = STREAK_ERROR**2 / 3.0  # three axes of which two are without error: e' P^-1 e / 3 is 1
+    variance = STREAK_ERROR**2 / 3.0  # only one of three axes has an error, so that e' P^-1 e / 3 is 1
     return packer.pack(
         table.STREAK,
         stamp,
@@ -220,7 +221,7 @@ def _streak(packer: Packer, stamp: int, sequence: int, rates: FloatArray) -> byt
 
 
 def _stars(packer: Packer, stamp: int, sequence: int, q2: float) -> bytes:
-    """Return an attitude off the true one by `STAR_ERROR` about the thread, with just that variance."""
+    """Return an attitude with the error `STAR_ERROR` about the thread and its square as variance."""
     half = np.arcsin(q2) + 0.5 * (STAR_ERROR if sequence % 2 == 0 else -STAR_ERROR)
     variance = STAR_ERROR**2 / 3.0
     return packer.pack(

@@ -1,4 +1,4 @@
-"""The report's section on the battery, from packets with known values."""
+"""Tests of the report's section on the battery with known packets."""
 
 from __future__ import annotations
 

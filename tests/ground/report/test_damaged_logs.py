@@ -1,4 +1,4 @@
-"""Flight logs with damaged packets or impossible values: no packet is invented, and the log is reported."""
+"""Tests that damaged packets and impossible values in flight logs are reported and add no packet."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]:
 
 
 def with_impossible_values(chance: Random, packet: bytes) -> bytes:
-    """Return a packet with impossible values and a right CRC."""
+    """Return a packet with impossible values and a correct CRC."""
     body = bytearray(packet[:-2])
     start = chance.randrange(6, len(body))
     body[start : start + 8] = chance.choice(IMPOSSIBLE)[: len(body) - start]

@@ -1,4 +1,4 @@
-"""The pictures of made-up runs are those of the record: curves, areas, colours, scales and labels."""
+"""Tests that plots of artificial runs match the record: curves, areas, colours, scales and labels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.packed_run import packed_run
 
 
 def unlike_record(*names: str) -> list[str]:
-    """Return the differences of pictures from their record."""
+    """Return the differences between plots and their record."""
     return [
         f"{name}{line}"
         for name in names

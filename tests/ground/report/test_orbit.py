@@ -1,4 +1,4 @@
-"""The figures of a flight in orbit: pointing errors, verdicts of the requirements, the residual dipole."""
+"""Tests of the figures of an orbit run: pointing errors, verdicts on requirements, and residual dipole."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 NAN3 = (math.nan,) * 3
 PERIOD_S, SECOND_AIM_S, SLEWED_S, DURATION_S = 10, 1000, 1700, 2000
 OFF_DEG = (3.0, 4.0, 12.0)
-"""About x, y, z once settled; ten times as much before."""
+"""Pointing errors about x, y and z after settling; before settling they are ten times as large."""
 LIMITS = "requirements: {slow_within: 100.0, knowledge_deg: 0.1, pointing_deg: %s}"
 
 
 def flown(folder: Path, limit_deg: float) -> Path:
-    """Write a flight that turns slowly from two targets by `OFF_DEG`, as its configuration and logs say."""
+    """Write a run that drifts from two targets by `OFF_DEG`, with its configuration and logs."""
     clock, packer = ManualClock(0), Packer()
     flight, truth = (
         FlightLog(folder, stem, clock=clock, sync_period_ns=None) for stem in ("flight", "truth")
@@ -79,7 +79,7 @@ def flown(folder: Path, limit_deg: float) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a flight whose axis may be off by 4.9 deg: it is by 5."""
+    """Return the folder of a run whose axis error is 5 deg while 4.9 deg are permitted."""
     place = tmp_path_factory.mktemp("orbit")
     return flown(place, 4.9)
 
@@ -157,12 +157,12 @@ def test_the_pictures_of_an_orbit_are_drawn(folder: Path, tmp_path: Path) -> Non
 
 
 SHADOW, END = 2 * JUDGED, 3 * JUDGED
-"""s, from which the satellite is in shadow, and the end of the flight."""
+"""Times (s) of the start of the shadow and of the end of the run."""
 TRUE = np.array([6e-4, 0.0, 8e-4])
 
 
 def dipole_flight(known: bool = True) -> Run:
-    """Return a flight whose estimate is off by half, later by a tenth, in shadow by a fifth of the dipole."""
+    """Return a run with a dipole error of a half, later a tenth, and in shadow a fifth of the dipole."""
     times = np.arange(END)
     share = np.where(times < SHADOW - JUDGED, 0.5, np.where(times < SHADOW, 0.1, 0.2))
     packets = np.zeros(END, dtype=[("time_ns", "i8"), ("residual_dipole", "f8", 3)])

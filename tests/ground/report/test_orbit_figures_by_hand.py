@@ -1,4 +1,4 @@
-"""Figures of an orbit flight from hand-made packets, computed by hand."""
+"""Tests of the figures of an orbit run from artificial packets, with results computed by hand."""
 
 from __future__ import annotations
 
@@ -82,7 +82,10 @@ def test_detumbling_has_the_rates_of_its_period_and_the_error_of_the_magnetomete
 
 
 def test_knowledge_counts_errors_while_fine_and_shortly_after_stars() -> None:
-    """Errors about x: 1 mrad coarse, 2 and 3 mrad with stars, 6 mrad without; sigma is 1 mrad."""
+    """The errors about x are 1 mrad (coarse), 2 and 3 mrad (with stars) and 6 mrad (without).
+
+    Sigma is 1 mrad.
+    """
     levels = [(0.0, 0), (1.0, 1), (2.0, 2), (30.0, 2)]
     sigma = {"angle_sigma": [1e-3] * 3}
     attitude: list[tuple[float, dict[str, Any]]] = [
@@ -137,7 +140,7 @@ def test_the_error_of_the_dipole_is_relative_to_its_size() -> None:
 
 
 def flown(time: float, x: float, z: float = 0.0, mode: Mode = Mode.POINT) -> tuple[float, dict[str, Any]]:
-    """Return an attitude packet off its target."""
+    """Return an attitude packet with a given error from its target."""
     return time, {"mode": int(mode), "quaternion": turned(x, 0.0, z), "target": UPRIGHT}
 
 
@@ -210,7 +213,8 @@ def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it
     sigmas = {f"{name}_sigma": [0.1] * 9 for name in matrices}
     inertia = [0.3, 0.3, 0.4, 0.0, 0.0, 0.1]
     doubled = [2.0 * one for one in inertia]
-    # The estimate of the body is off by the whole misalignment, that of the star camera by 1e-4 rad about x.
+    # The body's attitude has the whole misalignment as its error; the star camera's attitude has 1e-4 rad
+    # about x.
     body = from_rotation_vector(tilt + np.array([1e-4, 0.0, 0.0])).tolist()
     run = packed_run(
         navigation=[(0.0, {"knowledge": 2})],

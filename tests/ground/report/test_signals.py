@@ -1,4 +1,4 @@
-"""Signals of a run from hand-made packets, with figures computed by hand."""
+"""Tests of the signals of a run from artificial packets, with results computed by hand."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_covariances_are_unpacked_in_the_order_xx_yy_zz_xy_xz_yz() -> None:
 
 
 def test_the_mean_rate_over_an_exposure_is_the_integral_of_the_truth() -> None:
-    """The rate about x is the time, so its mean is the middle of the exposure."""
+    """The rate about x equals the time, so the mean rate equals the time of mid-exposure."""
     run = packed_run(truth=[(float(t), {"rate": [float(t), 2.0, -1.0]}) for t in range(6)])
     start, stop = np.array([1.0, -0.5, 4.5, 2.0, 0.0]), np.array([3.0, 1.0, 5.5, 2.0, 5.0])
     means = signals.mean_rates(run["truth"], start, stop)
@@ -146,7 +146,7 @@ def test_star_attitudes_are_compared_with_the_truth_at_the_middle_of_the_exposur
 
 
 def test_the_true_misalignment_of_the_camera_is_not_an_error_of_its_frames() -> None:
-    """A camera measures its own rotation, and so in axes that are rotated against the body's."""
+    """A camera measures the rate in its own axes, which are rotated from the body axes."""
     tilt, body = np.array([2e-3, -1e-3, 3e-3]), from_rotation_vector(np.array([0.2, -0.7, 0.4]))
     camera, rate = from_rotation_vector(tilt), np.array([0.1, 0.2, -0.05])
     truth = [(float(t), {"quaternion": body.tolist(), "rate": rate.tolist()}) for t in range(4)]

@@ -1,4 +1,4 @@
-"""The share of the star camera's unobstructed instants that gave an attitude or a rate."""
+"""Tests of the fraction of the star camera's unobstructed instants with an attitude or a rate."""
 
 from __future__ import annotations
 
@@ -22,15 +22,17 @@ from knightcube.astro.quaternion import from_rotation_vector
 from tests.support.flights import CONFIG
 
 END = 200
-"""s, duration of the flight."""
+"""Duration (s) of the run."""
 PERIOD, FINE_PERIOD, FINE_FROM = 5, 10, 100
-"""s, periods of the configuration's camera, and the time from which the attitude is fine."""
+"""Periods (s) of the configured camera, and the time (s) from which the attitude is fine."""
 FAST_UNTIL, HIDDEN = 20, (50, 80)
-"""s, until when the body is too fast for the camera, and when the Earth is in its cone."""
+"""Time (s) until which the body is too fast for the camera, and times (s) of the Earth in the exclusion
+cone.
+"""
 
 
 def packets(packet: Packet, times: list[float], **fields: Any) -> PacketArray:
-    """Return packets at times (n,), s, whose other fields are zero."""
+    """Return packets at times (n,), s, with zeros in the remaining fields."""
     rows = np.zeros(len(times), dtype=Layout(packet).dtype)
     rows["time_ns"] = (np.array(times) * 1e9).astype(np.int64)
     for name, values in fields.items():
@@ -49,9 +51,9 @@ def config() -> OrbitConfig:
 
 
 def flight(gave: list[float]) -> Run:
-    """Return a flight with frames at the times `gave`, alternately with a rate and an attitude.
+    """Return a run with frames at the times `gave`, alternately with a rate and an attitude.
 
-    The camera looks up with the Sun behind the Earth, and to the limb during `HIDDEN`.
+    The camera points to the zenith with the Sun behind the Earth, and to the limb during `HIDDEN`.
     """
     seconds = [float(at) for at in range(END + 1)]
     limb = math.pi - math.asin(EARTH_RADIUS / 7e6) - 0.1
@@ -84,7 +86,7 @@ def flight(gave: list[float]) -> Run:
 
 
 FIRST_FINE = FINE_FROM + PERIOD
-"""s, first instant 10 s after the last one before the attitude was fine."""
+"""First instant (s), 10 s after the last instant before the attitude was fine."""
 SLOW = [*range(FAST_UNTIL, FINE_FROM, PERIOD), *range(FIRST_FINE, END - FINE_PERIOD, FINE_PERIOD)]
 FREE = [at for at in SLOW if not HIDDEN[0] <= at < HIDDEN[1]]
 

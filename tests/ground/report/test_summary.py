@@ -1,4 +1,4 @@
-"""The summary reports the facts of a run, and names the unknown ones."""
+"""Tests that the summary reports the facts of a run, and names the unknown facts."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_the_worst_of_each_figure_stands_beside_the_thesis(full: Run) -> None:
 
 
 def test_supply_power_and_heat_are_means_from_the_true_energies(full: Run) -> None:
-    """A tenth of the time at 0.1 A."""
+    """The coil carries 0.1 A in a tenth of the time."""
     power = summarise(full)["power"]
     assert power["source"] == "truth"
     assert power["heat_average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
@@ -240,7 +240,7 @@ def test_slots_without_a_control_packet_are_counted(full: Run, tmp_path: Path) -
 
 
 def test_estimate_and_streaks_are_held_against_the_truth(full: Run) -> None:
-    """The made-up estimate is off by one sigma, each streak by just its covariance."""
+    """The artificial estimate and each streak rate have errors of exactly one sigma."""
     summary = summarise(full)
     assert summary["estimate"]["rate_rms_rad_s"] == pytest.approx(RATE_BIAS, rel=1e-6)
     assert summary["estimate"]["rate_normalised"] == pytest.approx(1.0, rel=1e-6)
@@ -257,7 +257,7 @@ def test_estimate_and_streaks_are_held_against_the_truth(full: Run) -> None:
 
 
 def test_the_mean_rate_over_an_exposure_is_the_turn_over_its_time() -> None:
-    """A rate growing linearly: the mean is the rate at the middle, whatever the exposure's ends."""
+    """The mean of a linearly growing rate is the rate at mid-exposure."""
     packer = Packer()
     raw = b"".join(
         packer.pack(TRUTH, i * 25_000_000, quaternion=(0, 0, 0, 1), rate=(0, 0.01 * 0.025 * i, 0),

@@ -1,4 +1,4 @@
-"""The report as text from a hand-made summary: the units and digits of every figure."""
+"""Tests of the units and digits of each figure in the text of an artificial summary."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ LOGS = (
 
 
 def blocks(**changes: Any) -> list[str]:
-    """Return the blocks of the report between the headline and the loop, the logs and the notes."""
+    """Return the sections of the report between the headline and the sections on loop, logs and notes."""
     found = format_report({**EMPTY, **changes}).removesuffix("\n").split("\n\n")
     assert found[0] == "Run runs/a: 12.3 s"
     assert found[-2:] == [LOGS, "note: one\nnote: two"]
