@@ -79,7 +79,7 @@ ACTIVATE = telecommand(
     Field("despite_faults", "u1", "-", "1 if a fault that the flight reports does not end the trial"),
     hazard="restarts flight and link with another configuration or release",
 )
-CONFIRM = telecommand("confirm", 0x2B1, "End the trial of an artefact, which stays", _KIND)
+CONFIRM = telecommand("confirm", 0x2B1, "End the trial of an artefact and keep the artefact", _KIND)
 WITHDRAW = telecommand(
     "withdraw",
     0x2B2,

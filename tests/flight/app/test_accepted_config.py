@@ -1,4 +1,4 @@
-"""A configuration that changed on the disk is not flown: the last that flew is, or nothing."""
+"""Tests that a configuration with a wrong checksum is not used, but the last accepted one or none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Command lines of any words: status 0, 1 or 2, a reason on standard error, JSON where it is asked for."""
+"""Tests that any command line gives exit status 0, 1 or 2, a reason for errors, and valid JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of the cameras from their sections: times in ns, lens, star tracker and estimator."""
+"""Tests of camera settings from configuration sections: times in ns, lens, star tracker and estimator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damaged releases, damaged records of their starts, and damaged configurations: something sound flies."""
+"""Tests that an intact release starts despite damaged releases, start records or configurations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory settings of a process, each tested in a process of its own."""
+"""Tests of the memory settings of a process, each in a separate process."""
 
 from __future__ import annotations
 

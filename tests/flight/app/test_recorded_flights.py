@@ -1,4 +1,4 @@
-"""A flight that the application composes is the recorded one."""
+"""Tests that a run composed by the application equals the recorded run."""
 
 from __future__ import annotations
 

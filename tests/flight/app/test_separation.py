@@ -1,4 +1,4 @@
-"""The separation inhibit lasts for its time with power, over restarts, and ends also with a failing disk."""
+"""Tests that the separation inhibit lasts for its powered time over restarts and with a failing disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Only a configuration judged wrong ends a board's start; all else is waited for, the coils at zero."""
+"""Tests that only a wrong configuration ends the start on a board; other faults are waited for."""
 
 from __future__ import annotations
 

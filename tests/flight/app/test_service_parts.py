@@ -1,4 +1,4 @@
-"""Parts of the flight service on stand-ins: ending signals, the flown release, garbage and supervision."""
+"""Tests of parts of the flight service with test doubles: signals, release, garbage and supervision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loop's signs of life, passed on to guardian and service manager."""
+"""Tests of the heartbeats of the loop, which guardian and service manager receive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Installed elsewhere, the wheels fly a configuration and report on it, and the library works alone."""
+"""Tests that installed wheels run a configuration and a report, and that the library needs no other wheel."""
 
 from __future__ import annotations
 

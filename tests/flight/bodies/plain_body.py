@@ -1,4 +1,4 @@
-"""A third party's body: the testbed with a PD controller of its own, as a configuration may name it."""
+"""A body of a third party, which a configuration can name: the testbed with its own PD controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The body seam: what a configuration may name as a body, and what every body reports."""
+"""Tests of the interface of bodies: the names that a configuration may give, and the reports of a body."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The estimator by corner detectors has the settings of the camera that selects it."""
+"""Tests that the corner-detector estimator has the settings of the camera that selects it."""
 
 from __future__ import annotations
 

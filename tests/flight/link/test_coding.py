@@ -1,4 +1,4 @@
-"""Channel codes against published values, programs of other authors and a second form of each definition."""
+"""Tests of channel codes against published values, independent programs and a second implementation."""
 
 from __future__ import annotations
 

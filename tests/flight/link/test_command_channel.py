@@ -1,4 +1,4 @@
-"""Commands reach a flight over real sockets; whoever floods, vanishes or sends rubbish harms nobody."""
+"""Tests of commands over real sockets: clients that flood, vanish or send garbage do no harm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A command survives its packet; anything else is refused with a reason, never with another exception."""
+"""Tests that commands are unchanged by their packets, and that other packets are refused with a reason."""
 
 from __future__ import annotations
 

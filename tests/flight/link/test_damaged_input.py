@@ -1,4 +1,4 @@
-"""Damaged keys, schedules, telecommands, streams and files of transfers; frames of an attacker."""
+"""Tests with damaged keys, schedules, telecommands, streams and file transfers, and an attacker's frames."""
 
 from __future__ import annotations
 

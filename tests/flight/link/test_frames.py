@@ -1,4 +1,4 @@
-"""Frames carry their packets, and other bytes are refused or skipped."""
+"""Tests that frames carry their packets, and that other bytes are refused or skipped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Forged and repeated frames are refused with their cause; lost counters cost one SPI."""
+"""Tests that forged and repeated frames are refused with a reason, and that lost counters disable one SPI."""
 
 from __future__ import annotations
 

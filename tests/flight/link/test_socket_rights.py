@@ -1,4 +1,4 @@
-"""Opening a command socket does not change which rights the files of the process have."""
+"""Tests that opening a command socket does not change the permissions of the process's new files."""
 
 from __future__ import annotations
 

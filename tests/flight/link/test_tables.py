@@ -1,4 +1,4 @@
-"""Events, modes, commands and directives keep the numbers that ground stations and old logs use."""
+"""Tests that events, modes, commands and directives keep their published numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A restored folder of keys is recognised by the witness, and obeys no old command."""
+"""Tests that the witness detects a restored key folder, and that no old command is accepted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders of associations for both ends of a link."""
+"""Folders of security associations for both ends of a link."""
 
 from __future__ import annotations
 

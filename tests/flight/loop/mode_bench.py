@@ -1,4 +1,4 @@
-"""A mode control with a body of one angle, for tests that set every condition by hand."""
+"""A mode control of a body with one angle, for tests that set each condition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Jobs for worker processes, apart from their tests: a worker imports this module alone."""
+"""Jobs for worker processes, in a module of their own because a worker imports only this module."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What arrives of a value that a worker sends."""
+"""Sends a value through a worker's message and returns the received value."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records of events that several tests of the loop share."""
+"""Records of events for several tests of the loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""States that several tests and processes store."""
+"""Stored states for several tests and processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""No call that the control thread makes in flight waits for a disk, a device or another process."""
+"""Tests that no call of the control thread waits for a disk, a device or another process."""
 
 from __future__ import annotations
 

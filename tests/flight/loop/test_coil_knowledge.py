@@ -1,4 +1,4 @@
-"""From when on it is known what the coils carry."""
+"""Tests of the times from which the coil currents are known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A broken coil is detected and identified from supply current and motion; healthy coils never are."""
+"""Tests that broken coils are identified from supply current and motion, and healthy coils never are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gain of a coil, estimated across stalls of the loop, and on a free body in its coils' own field."""
+"""Tests of the estimated coil gain across stalls of the loop, and on a free body in the coils' field."""
 
 from __future__ import annotations
 

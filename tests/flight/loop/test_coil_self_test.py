@@ -1,4 +1,4 @@
-"""The self-test drives hardly used coils by short currents without a lasting effect, and only when it may."""
+"""Tests that the self-test drives rarely used coils by short currents, and only when it is permitted."""
 
 from __future__ import annotations
 

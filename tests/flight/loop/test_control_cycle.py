@@ -1,4 +1,4 @@
-"""The control cycle on stand-ins: which task receives which call, and what is recorded."""
+"""Tests of the control cycle with test doubles: the calls that each task receives, and the records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damaged copies of the stored state and damaged messages of workers whose checksums are right."""
+"""Tests with damaged copies of the stored state, and damaged worker messages with valid checksums."""
 
 from __future__ import annotations
 

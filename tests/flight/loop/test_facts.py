@@ -1,4 +1,4 @@
-"""Facts count after N updates in a row, latch, reset in modes without watch, and report once.
+"""Tests that facts count after N updates in a row, latch, reset in modes without watch, and report once.
 
 Liveness, rate and validity of a stream are checked separately; a stale stream is never good.
 """

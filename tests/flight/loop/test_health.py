@@ -1,4 +1,4 @@
-"""Resources: shares and slopes of the samples, bounds with persistence, and steps of the wall clock."""
+"""Tests of resources: shares and slopes of samples, limits with persistence, and steps of the wall clock."""
 
 from __future__ import annotations
 

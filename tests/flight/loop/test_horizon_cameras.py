@@ -1,4 +1,4 @@
-"""The wide cameras' task: rounds as often as they are needed, missing frames, lost cameras."""
+"""Tests of the horizon camera task: intervals of the images, missing frames, and lost cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames of the star camera: rows of an earlier frame, pixels without stars, and mid-exposure."""
+"""Tests of star camera frames: rows of an earlier frame, pixels without stars, and mid-exposure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The imaging task on stand-ins: triggers, monitoring of the camera, jobs and the use of their results."""
+"""Tests of the imaging task with test doubles: triggers, camera monitoring, jobs and their results."""
 
 from __future__ import annotations
 

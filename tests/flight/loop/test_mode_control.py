@@ -1,4 +1,4 @@
-"""SAFE brakes a spin and then seeks the Sun, never while barred; a lost attitude ends pointing."""
+"""Tests that SAFE detumbles and then acquires the Sun, and that a lost attitude ends pointing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reactions and the transition table agree: every answer of the table can happen.
+"""Tests that the transition table is complete and that each mode, and SAFE from each mode, can be reached.
 
 The transition table is complete, every mode can be reached, and safe from everywhere.
 """

@@ -1,4 +1,4 @@
-"""A loaded table is proven after a minute of flight, and an unproven one keeps the table before it."""
+"""Tests that a loaded table is confirmed after a minute, and otherwise replaced by the former table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Positioning records the counters of the receiver's line, and reports what keeps fixes away."""
+"""Tests that positioning records the counters of the GPS line and reports the causes of missing fixes."""
 
 from __future__ import annotations
 

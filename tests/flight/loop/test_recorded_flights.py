@@ -1,4 +1,4 @@
-"""The packets of short flights are those of the record: every task of the loop takes part."""
+"""Tests that the packets of short runs with all tasks of the loop equal the record."""
 
 from __future__ import annotations
 

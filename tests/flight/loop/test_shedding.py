@@ -1,4 +1,4 @@
-"""Load shedding on stand-ins: signs of overload, order of the levels, return, and telemetry."""
+"""Tests of load shedding with test doubles: signs of overload, order of levels, recovery and telemetry."""
 
 from __future__ import annotations
 

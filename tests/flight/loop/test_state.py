@@ -1,4 +1,4 @@
-"""Crashes are counted per operating time, and only operating time ages them out.
+"""Tests that crashes are counted over the operating time and forgotten after operating time only.
 
 Parameters learned in one boot are the prior of the next, with an increased covariance.
 """

@@ -1,4 +1,4 @@
-"""The keeper writes outside the loop, reports failures, and never makes the loop wait.
+"""Tests that a flight process stores whether it ended cleanly or by an exception.
 
 A flight remembers how it ended: cleanly, or with an exception passing through.
 """

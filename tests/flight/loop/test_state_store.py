@@ -1,4 +1,4 @@
-"""After any failure while the state is written, either the old or the new state is read back."""
+"""Tests that after any failure of a write, either the old or the new state is read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The coil drive leaves resting coils undriven, corrects signs and gains, and reports trials of coils."""
+"""Tests that the coil drive leaves resting coils off, corrects signs and gains, and reports coil tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages of workers: every value of ours comes back, and nothing else is ever made of bytes."""
+"""Tests that worker messages return every permitted value, and never create another type from bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory that a worker process holds after a job, and modules that it imports."""
+"""Tests of the memory that a worker process holds after a job, and of the modules that it imports."""
 
 from __future__ import annotations
 

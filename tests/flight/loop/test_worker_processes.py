@@ -1,4 +1,4 @@
-"""Jobs: the same contract in simulated time and in processes of their own; nothing ever waits."""
+"""Tests that jobs behave alike in simulated time and in processes, and that no call waits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A configuration is right, or one clear line says which value is wrong and what would be right."""
+"""Tests that a wrong configuration gives one line with the wrong value and the permitted values."""
 
 from __future__ import annotations
 

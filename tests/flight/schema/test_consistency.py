@@ -1,4 +1,4 @@
-"""Values that contradict each other are refused; the link is open to its peers alone."""
+"""Tests that contradictory values are refused, and that the link accepts only its peers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configurations with wrong values in any place: refused in one line, or usable and finite."""
+"""Tests that configurations with random wrong values are refused in one line, or are usable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each default is written once: no settings class disagrees with the configuration section that it serves."""
+"""Tests that settings classes have the defaults of their configuration sections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""YAML text is read by the core schema of YAML 1.2, as another library reads it, or refused with its line."""
+"""Tests that YAML 1.2 text is read like by an independent library, or refused with its line."""
 
 from __future__ import annotations
 

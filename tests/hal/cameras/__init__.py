@@ -1,1 +1,1 @@
-"""Cameras behind the frame source: V4L2 over a replaced ioctl, Aravis with its own fake, the emulated one."""
+"""Tests of cameras: V4L2 with a replaced ioctl, Aravis with its fake camera, and the emulated camera."""

@@ -1,4 +1,4 @@
-"""The double of the kernel, and each frame source there is."""
+"""Test double of the kernel's camera interface, and fixtures for each frame source."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Starts the link again and again in one process; in each start other calls of the operating system fail.
+"""Starts the link repeatedly in one process; in each start, other calls of the operating system fail.
 
 Run as `python -m tests.flight.app.cli.failing_starts FOLDER [all]`, in a process of its own: the hook that
 makes calls fail stays for the life of its process. Prints one JSON object a start.

@@ -1,4 +1,4 @@
-"""The arguments of the board's commands are the published ones, with their defaults and choices."""
+"""Tests that the on-board commands have the published arguments, with their defaults and choices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`knightcube check`: ready or not, with each missing device and its cure, before anything is flown."""
+"""Tests that `knightcube check` reports readiness and each missing device with its remedy."""
 
 from __future__ import annotations
 

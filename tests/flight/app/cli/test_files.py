@@ -1,4 +1,4 @@
-"""`knightcube files` over a real line: list, get, put, use, delete, each as the page has it."""
+"""Tests of the subcommands of `knightcube files` over a real line: list, get, put, use and delete."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`knightcube link` and `knightcube command --link` over real lines, and the keys that both need."""
+"""Tests of `knightcube link` and `knightcube command --link` over real lines, and of their keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The link waits for what may pass and comes up; only a configuration judged wrong ends it for good."""
+"""Tests that the link process waits for transient faults and ends only for a wrong configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`knightcube run`: the summary of a flight, its elapsed time, its progress and its seed."""
+"""Tests of `knightcube run`: summary, elapsed time, progress and seed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Attitudes and tables that several tests of the satellite's guidance share."""
+"""Attitudes and parameter tables for several tests of the satellite's guidance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The solar strings: with the field they start the filter, without a star; a dead one is reported."""
+"""Tests that solar strings and magnetic field start the filter, and that a dead string is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The wide cameras: Sun and nadir start the filter, feed it where they say more, and correct a wrong one."""
+"""Tests that Sun and nadir of the horizon cameras start, update and correct the filter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sun acquisition reports once whether there is a Sun; commands allow for the learned coils."""
+"""Tests that Sun acquisition reports a missing Sun once, and that commands use the learned coils."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What surrounds the satellite by belief: from elements or fixes, interpolated, false fixes refused."""
+"""Tests of the predicted environment: from elements or fixes, interpolated, with false fixes refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The shipped satellites with other coils, sizes and orbits detumble in the loop."""
+"""Tests that the shipped satellites detumble with other coils, sizes and orbits."""
 
 from __future__ import annotations
 

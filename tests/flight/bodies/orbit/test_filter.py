@@ -1,4 +1,4 @@
-"""The satellite's filter: takes stars at their own times, starts by them, and begins again where wrong."""
+"""Tests that the satellite's filter uses star fixes at their times, starts with them and restarts."""
 
 from __future__ import annotations
 

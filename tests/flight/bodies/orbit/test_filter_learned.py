@@ -1,4 +1,4 @@
-"""What the satellite's filter learned is the prior of the next boot, less sure by its age."""
+"""Tests that learned parameters are the prior of the next boot, with a variance that grows with age."""
 
 from __future__ import annotations
 

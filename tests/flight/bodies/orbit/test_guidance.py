@@ -1,4 +1,4 @@
-"""What is planned when: slews for new targets and bodies astray, a path again; which part of it is flown."""
+"""Tests of when slews and paths are planned, and of which part of a path is executed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Far off its path a body is held still, told once, and planned for again only when it is slow."""
+"""Tests that a body far off its path is damped and reported once, and that a plan waits until it is slow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An object is looked for, followed by the boresight, coasted through a loss, and given up with a reason."""
+"""Tests that an object is searched for, tracked, propagated through a loss, and given up with a reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""During a slew the rest of it is planned again and handed over at its begin, without a jump."""
+"""Tests that the rest of a slew is planned again and replaces the running plan without a jump."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slew along a pointing path is under way until its arrival, which is reported once."""
+"""Tests that a slew along a pointing path lasts until its arrival, which is reported once."""
 
 from __future__ import annotations
 

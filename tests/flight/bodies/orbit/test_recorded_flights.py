@@ -1,4 +1,4 @@
-"""The body in orbit estimates and detumbles as in the recorded flights."""
+"""Tests that the orbiting body estimates and detumbles as in the recorded runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filter steps: integrals of the commanded dipole, and readings with and without a rate."""
+"""Tests of filter steps: integrals of the commanded dipole, and readings with and without a rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The targets of the satellite: by mission time, by command, and the present attitude."""
+"""Tests of the satellite's targets: by mission time, by command, and the present attitude."""
 
 from __future__ import annotations
 

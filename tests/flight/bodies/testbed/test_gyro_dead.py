@@ -1,4 +1,4 @@
-"""The testbed without a gyro: angle by the magnetometer, the coils' field, and control by the covariance."""
+"""Tests of the testbed without a gyro: angle by magnetometer, coil field, and control by covariance."""
 
 from __future__ import annotations
 

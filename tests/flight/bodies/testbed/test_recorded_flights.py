@@ -1,4 +1,4 @@
-"""The testbed estimates, plans and steers as in the recorded flights."""
+"""Tests that the testbed estimates, plans and steers as in the recorded runs."""
 
 from __future__ import annotations
 

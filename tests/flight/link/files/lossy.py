@@ -1,4 +1,4 @@
-"""Two entities and a lossy channel between them, on a clock that is moved."""
+"""Two CFDP entities and a lossy channel between them, on a manual clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transfers with cfdp-py, a CFDP implementation of another author, over a lossy channel and a moved clock."""
+"""Tests of transfers with cfdp-py, an independent CFDP implementation, over a lossy channel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transfers over a lossy channel, with ends killed and files that must not come."""
+"""Tests of transfers over a lossy channel, with killed ends and refused files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Units of CFDP against another's codec, the CFDP part of `spacepackets`, both ways."""
+"""Tests of CFDP data units against the independent codec of `spacepackets`, in both directions."""
 
 from __future__ import annotations
 

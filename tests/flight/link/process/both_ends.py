@@ -1,4 +1,4 @@
-"""Both ends of a link in one process, on a clock that is moved: a station, its flight, and a terminal."""
+"""Both ends of a link in one process on a manual clock: a station, its flight, and a terminal."""
 
 from __future__ import annotations
 

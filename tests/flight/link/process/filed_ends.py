@@ -1,4 +1,4 @@
-"""Both ends of a link with their files, on a clock that is moved and a wire that loses frames."""
+"""Both ends of a link with their files, on a manual clock and a line that loses frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands and telemetry over a bare radio: codes, noise, short frames, idle frames, readable telemetry."""
+"""Tests of commands and telemetry over a bare radio: codes, noise, short frames and idle frames."""
 
 from __future__ import annotations
 

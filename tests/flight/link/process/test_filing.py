@@ -1,4 +1,4 @@
-"""Files through the whole link: commanded, sent in protected frames both ways, chosen by their SHA-256."""
+"""Tests of files over the whole link: commands, protected frames both ways, selection by SHA-256."""
 
 from __future__ import annotations
 

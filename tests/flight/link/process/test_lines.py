@@ -1,4 +1,4 @@
-"""Lines to the ground take floods in portions, listen to peers alone, and drop who does not read."""
+"""Tests that ground lines read floods in portions, accept only peers, and drop clients that do not read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The link hands renewals over to the privileged program, and reports what that program did."""
+"""Tests that the link passes renewals to the privileged program and reports its results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scheduled commands: executed once at their UTC, also after a restart; late ones are reported alone."""
+"""Tests that scheduled commands run once at their UTC, even after a restart, and late ones are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The link process: commands go over once and are verified; telemetry comes live and from the archive."""
+"""Tests that the link process passes commands once with verification, and sends live and old telemetry."""
 
 from __future__ import annotations
 

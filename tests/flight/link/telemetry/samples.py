@@ -1,4 +1,4 @@
-"""Packets with made-up contents, for tests."""
+"""Packets with artificial contents for tests."""
 
 from __future__ import annotations
 

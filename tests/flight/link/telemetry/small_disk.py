@@ -1,4 +1,4 @@
-"""A disk with little room, and what a log has written."""
+"""A disk with little free space, and the packets that a log has written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An archive gives each boot a new folder and drops the oldest runs to keep its budget."""
+"""Tests that an archive gives each boot a new folder and deletes the oldest runs within its budget."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The documentation says what the table says, and is enough to read a packet by."""
+"""Tests that the telemetry page equals the packet tables and suffices to decode a packet."""
 
 from __future__ import annotations
 

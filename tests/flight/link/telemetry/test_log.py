@@ -1,4 +1,4 @@
-"""The flight log keeps what it is given, in order, or says what it could not keep."""
+"""Tests that the flight log stores all packets in order, or reports the packets it could not store."""
 
 from __future__ import annotations
 

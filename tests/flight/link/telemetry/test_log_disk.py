@@ -1,4 +1,4 @@
-"""The flight log on a disk that is full, slow, away or hung: it says so, and blocks nobody."""
+"""Tests that the log reports a full, slow, missing or hung disk, and never blocks the loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Packets are CCSDS space packets, byte for byte, and hold what was put in."""
+"""Tests that packets are CCSDS space packets and keep the packed values."""
 
 from __future__ import annotations
 

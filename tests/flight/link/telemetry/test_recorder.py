@@ -1,4 +1,4 @@
-"""The recorder writes to two logs in mission time, and counts what does not fit."""
+"""Tests that the recorder writes two logs in mission time, and counts values that do not fit."""
 
 from __future__ import annotations
 

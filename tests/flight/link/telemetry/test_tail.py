@@ -1,4 +1,4 @@
-"""A log that lost its power, or some of its bytes, gives back every packet that they did not touch."""
+"""Tests that a log with a torn tail or damaged bytes returns every undamaged packet."""
 
 from __future__ import annotations
 
