@@ -13,10 +13,15 @@ from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.settings import FaultEntry
-from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
+from tests.scenario.mode_flights import released
+from tests.support.flights import Rigged, config_for, demo_config, demo_world, event_names, fly
 
-BEGIN, END, DURATION, LONG = 6.0, 9.0, 15.0, 20.0
-"""Begin and end (s) of a fault; duration (s) of a flight, and of one that reaches its target late."""
+BEGIN, END, DURATION, LONG = 2.0, 5.0, 8.0, 12.0
+"""Begin and end (s) of a fault; duration (s) of a flight, and of one that returns to its target."""
+AT_TARGET = released(-0.3, 0.0)
+"""World in which the body is at rest at its target, which the thread makes it leave by 6 deg in 6 s."""
+SHAM = 0.5
+"""Begin (s) of a camera fault, between the first frame and the second."""
 WITHIN = 0.1
 """s from the loss of control until the coils are at zero."""
 
@@ -70,7 +75,7 @@ def test_a_sound_flight_raises_no_alarm(sound: Run) -> None:
 def test_a_line_without_packets_loses_control_and_the_coils_are_off_until_they_come_again(
     tmp_path: Path, faults: LineFaults, events: list[str]
 ) -> None:
-    run = fly(demo_config(LONG, camera=False), tmp_path, line(faults))
+    run = fly(demo_config(LONG, camera=False), tmp_path, line(faults), section=AT_TARGET)
     names = event_names(run)
     assert [name for name in dict.fromkeys(names) if name in events] == events
     assert true_current(run, BEGIN + WITHIN, END).max() == 0.0
@@ -87,7 +92,7 @@ def test_after_a_silence_of_a_second_the_estimate_goes_on_as_the_model_carried_i
             rigged.at(begin, lambda: setattr(wire, "faults", LineFaults(silent=True)))
             rigged.at(begin + 1.0, lambda: setattr(wire, "faults", SOUND))
 
-    run = fly(demo_config(LONG, camera=False), tmp_path, prepare)
+    run = fly(demo_config(20.0, camera=False), tmp_path, prepare)
     names = event_names(run)
     assert [names.count(name) for name in ("imu-silent", "control-lost", "control-regained")] == [2, 2, 2]
     assert "imu-refused" not in names, "the first readings agree with what was carried on"
@@ -152,7 +157,7 @@ def test_a_unit_that_restarts_is_distinguished_from_noise_and_silence(tmp_path: 
         host = rigged.lock.line.host
         rigged.at(BEGIN, lambda: host.send(b"$VNRST*4D\r\n"))
 
-    run = fly(demo_config(DURATION, camera=False), tmp_path, prepare)
+    run = fly(demo_config(DURATION, camera=False), tmp_path, prepare, section=AT_TARGET)
     names = event_names(run)
     assert "imu-unusable" in names
     assert "imu-corrupt" not in names
@@ -192,7 +197,7 @@ def test_a_bus_that_fails_is_reported_and_flown_again_when_it_is_back(tmp_path: 
         rigged.at(BEGIN, begin)
         rigged.at(END, bus.clear_faults)
 
-    run = fly(demo_config(DURATION, camera=False), tmp_path, prepare)
+    run = fly(demo_config(DURATION, camera=False), tmp_path, prepare, section=AT_TARGET)
     names = event_names(run)
     assert names.index("coil-fault") < names.index("coil-recovered")
     assert run["housekeeping"]["coil_faults"][-1] > 0
@@ -223,7 +228,7 @@ def test_a_brown_out_of_the_pwm_chip_is_mended(tmp_path: Path) -> None:
         tmp_path,
         lambda rigged: rigged.at(BEGIN, rigged.lock.hardware.pwm.brown_out),
     )
-    assert true_current(run, BEGIN + 2.0, BEGIN + 6.0).max() > 0.0
+    assert true_current(run, BEGIN + 2.0, DURATION).max() > 0.0
     assert_whole(run)
 
 
@@ -236,12 +241,13 @@ def test_a_camera_that_shows_nothing_true_is_reported_and_gives_no_rate(
 ) -> None:
     def prepare(rigged: Rigged) -> None:
         camera = rigged.lock.hardware.camera
-        rigged.at(2.0, lambda: setattr(camera, "fault", fault))
+        rigged.at(SHAM, lambda: setattr(camera, "fault", fault))
 
-    run = fly(demo_config(12.0), tmp_path, prepare)
+    run = fly(config_for("testbed-demo", camera=True, duration=5.5), tmp_path, prepare)
     names = event_names(run)
     assert event in names
     streaks = run["streak"]
+    assert len(streaks) > 2
     assert streaks["accepted"][1:].sum() == 0
     assert np.isnan(streaks["rate"][1:]).all()
 
@@ -249,20 +255,20 @@ def test_a_camera_that_shows_nothing_true_is_reported_and_gives_no_rate(
 def test_a_camera_that_is_off_is_reported_and_the_flight_goes_on(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
         camera = rigged.lock.hardware.camera
-        rigged.at(2.0, lambda: setattr(camera, "fault", "off"))
+        rigged.at(SHAM, lambda: setattr(camera, "fault", "off"))
 
-    run = fly(demo_config(12.0), tmp_path, prepare)
+    run = fly(config_for("testbed-demo", camera=True, duration=5.5), tmp_path, prepare)
     assert "camera-lost" in event_names(run)
     assert len(run["streak"]) == 1
     assert run["control"]["state"][-1] != 0
 
 
-@pytest.mark.parametrize(("max_age", "lost"), [(14.0, False), (7.0, True)])
+@pytest.mark.parametrize(("max_age", "lost"), [(5.0, False), (2.5, True)])
 def test_a_frame_that_comes_late_is_not_accepted_as_fresh(tmp_path: Path, max_age: float, lost: bool) -> None:
     def prepare(rigged: Rigged) -> None:
-        setattr(rigged.lock.hardware.camera, "late_ns", 9_000_000_000)  # noqa: B010 - it may be None
+        setattr(rigged.lock.hardware.camera, "late_ns", 3_000_000_000)  # noqa: B010 - it may be None
 
-    config = demo_config(12.0)
+    config = config_for("testbed-demo", camera=True, duration=4.5)
     assert config.camera is not None
     run = fly(replace(config, camera=replace(config.camera, period=20.0, max_age=max_age)), tmp_path, prepare)
     assert len(run["streak"]) == 1
@@ -286,7 +292,7 @@ def test_a_stall_of_the_loop_is_counted_once_and_flown_through(tmp_path: Path) -
 
         camera.poll = stall  # type: ignore[method-assign,assignment]  # the stall is the test
 
-    run = fly(demo_config(8.0), tmp_path, prepare)
+    run = fly(config_for("testbed-demo", camera=True, duration=6.0), tmp_path, prepare)
     names = event_names(run)
     assert names.count("cycle-slip") == 1
     cycles = run["control"]["cycle"]
