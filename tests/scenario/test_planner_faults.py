@@ -21,7 +21,7 @@ from knightcube.gnc.guidance.one_axis.vmc import PlanJob, StepPlan
 from knightcube.gnc.guidance.one_axis.vmc import plan as make_plan
 from tests.support.flights import demo_config, event_names, fly, thesis_config
 
-DURATION = 24.0
+DURATION = 17.5
 GOOD_PLANS = 2
 """The second is made at 5 s and ends at 15 s."""
 
@@ -138,8 +138,8 @@ def test_a_planner_that_is_just_in_time_is_flown(tmp_path: Path) -> None:
 
 def test_an_infeasible_step_is_stretched_reported_and_flown(tmp_path: Path) -> None:
     """From +0.3 back to -0.3 at rest needs more than 10 s under 0.148 A."""
-    steps = (Step(at=0.0, q2=0.3), Step(at=25.0, q2=-0.3))
-    run = fly(configuration.replace(demo_config(60.0, camera=False), steps=steps), tmp_path)
+    steps = (Step(at=0.0, q2=0.3), Step(at=14.0, q2=-0.3))
+    run = fly(configuration.replace(demo_config(34.0, camera=False), steps=steps), tmp_path)
     assert "plan-stretched" in event_names(run)
     stretched = run["plan"][run["plan"]["status"] == b"stretched"]
     assert (stretched["horizon"] > 10.0).all()
