@@ -62,7 +62,7 @@ def test_a_price_of_time_sets_the_goal_which_then_stands(tmp_path: Path) -> None
 
 
 def test_a_moving_target_is_met_at_its_rate_and_followed(tmp_path: Path) -> None:
-    run = fly(configured(40.0, (Step(at=0.0, q2=-0.2, rate=0.008),)), tmp_path)
+    run = fly(configured(26.0, (Step(at=0.0, q2=-0.2, rate=0.008),)), tmp_path)
     time, angle = true_angle(run)
     wanted = angle_of(-0.2) + 0.008 * (time - 10.0)
     assert np.degrees(np.abs(angle - wanted)[time > 12.0]).max() < 0.1
@@ -76,16 +76,16 @@ def test_a_body_that_is_pushed_off_its_hold_is_planned_for_again(tmp_path: Path)
         def kick() -> None:
             world.rate += 0.25
 
-        rigged.at(20.0, kick)
+        rigged.at(14.0, kick)
 
-    run = fly(demo_config(45.0, camera=False), tmp_path, push)
+    run = fly(demo_config(37.0, camera=False), tmp_path, push)
     plans = run["plan"]
-    late = plans[plans["origin_ns"] > 20e9]
+    late = plans[plans["origin_ns"] > 14e9]
     assert len(late) >= 1
     assert late["accepted"].any()
     time, angle = true_angle(run)
-    assert np.degrees(np.abs(angle - angle_of(-0.3))[time > 20.0].max()) > 5.0
-    assert np.degrees(np.abs(angle - angle_of(-0.3))[time > 40.0]).max() < 0.1
+    assert np.degrees(np.abs(angle - angle_of(-0.3))[time > 14.0].max()) > 5.0
+    assert np.degrees(np.abs(angle - angle_of(-0.3))[time > 34.0]).max() < 0.1
 
 
 @pytest.mark.parametrize(
@@ -100,10 +100,10 @@ def test_a_body_that_is_pushed_off_its_hold_is_planned_for_again(tmp_path: Path)
 def test_without_a_path_every_controller_is_shown_the_target_itself(
     tmp_path: Path, control: dict[str, Any]
 ) -> None:
-    config = configured(40.0, (Step(at=0.0, q2=0.1),), strategy="step")
+    config = configured(32.0, (Step(at=0.0, q2=0.1),), strategy="step")
     config = configuration.replace(config, control=configuration.replace(config.control, **control))
     run = fly(config, tmp_path)
     assert len(run["plan"]) == 0
     assert event_names(run) == ["started", "target", "stopped"]
     time, angle = true_angle(run)
-    assert np.degrees(np.abs(angle - angle_of(0.1))[time > 33.0]).max() < 0.2
+    assert np.degrees(np.abs(angle - angle_of(0.1))[time > 27.0]).max() < 0.2
