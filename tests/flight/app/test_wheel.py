@@ -60,7 +60,8 @@ def _installed(home: Path, wheels: list[Path], packages: Path) -> Path:
     """Return a new virtual environment with these wheels, and the packages of a folder beside them."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", home], check=True, timeout=30)
     python = home / "bin" / "python"
-    subprocess.run([*PIP, "--python", python, "install", "--no-compile", *ALONE, *wheels], check=True, timeout=60)
+    install = [*PIP, "--python", python, "install", "--no-compile", *ALONE, *wheels]
+    subprocess.run(install, check=True, timeout=60)
     # A .pth in a folder that a .pth adds is not read: an editable installation stays out.
     (site,) = home.glob("lib/python*/site-packages")
     (site / "others.pth").write_text(f"{packages}\n", encoding="utf-8")
