@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import os
 import shutil
 import subprocess
 import sys
 from argparse import Namespace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Self
+from unittest.mock import patch
 
 from flight.link.process.renewal import decoded, encoded
 from ground.commands.renewal import artefact, make_signing_keys, sign
 from tests.deploy.boards import FakeBoard
-from tests.deploy.scripts import ROOT, changed_testbed
+from tests.deploy.scripts import ROOT, changed_testbed, script
+
+renewal, open_bundle = script("renewal"), script("open_bundle")
 
 LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000'}"
 _SYSTEMCTL = """#!/bin/sh
@@ -26,8 +32,37 @@ esac
 """
 
 
+def in_process(
+    main: Callable[[Sequence[str]], int], words: Sequence[object]
+) -> subprocess.CompletedProcess[str]:
+    """Run the program whose function is `main` in this process; return its status and outputs."""
+    command, printed, complaint = [str(word) for word in words], io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complaint):
+        status = main(command)
+    return subprocess.CompletedProcess(command, status, printed.getvalue(), complaint.getvalue())
+
+
+class _Board(renewal.Board):  # type: ignore[misc]  # the script is imported without types
+    """Files and services of a board whose bundles are opened in this process."""
+
+    def run(self, words: Sequence[object], limit_s: float = 1800.0) -> subprocess.CompletedProcess[str]:
+        """Run a program; the Python of a release is started only to show that it starts."""
+        python, *options = words
+        if len(options) < 3 or Path(str(options[2])).name != "open_bundle.py":
+            found: subprocess.CompletedProcess[str] = super().run(words, limit_s)
+            return found
+        started: subprocess.CompletedProcess[str] = super().run([python, "-m", "flight", "--version"])
+        return in_process(open_bundle.main, options[3:]) if started.returncode == 0 else started
+
+
 class RenewedBoard:
-    """A board with the release `old`, and the ground that signs for it."""
+    """A board with the release `old`, and the ground that signs for it.
+
+    The root part of the renewal runs in this process, because most of the time of a process would be imports.
+    With `processes` it runs as on a board.
+    """
+
+    processes = False
 
     def __init__(self, place: Path) -> None:
         """Use a folder that `make` has filled."""
@@ -87,9 +122,16 @@ class RenewedBoard:
 
     def run(self, *options: str) -> str:
         """Run the root part with options; return its complaints."""
-        done = subprocess.run(
-            [*self.words(), *options], env=self.environment(), capture_output=True, text=True, check=False
-        )
+        words = [*self.words(), *options]
+        if self.processes:
+            done = subprocess.run(words, env=self.environment(), capture_output=True, text=True, check=False)
+        else:
+            program = words.index(str(self.files.prefix / "bin/renewal.py"))
+            with (
+                patch.dict(os.environ, self.environment()),
+                patch.multiple(renewal, Board=_Board, __file__=words[program]),
+            ):
+                done = in_process(renewal.main, words[program + 1 :])
         assert done.returncode == 0, done.stderr
         return done.stderr
 

@@ -42,6 +42,7 @@ def activated(board: RenewedBoard, name: str = "second", version: int = 1, hours
 
 
 def test_a_confirmed_configuration_stays(board: RenewedBoard) -> None:
+    board.processes = True
     before = board.flown()
     request = activated(board)
     assert [result for result, _ in board.reports(request)] == ["started"]
@@ -313,6 +314,7 @@ def test_elements_replace_one_value_of_the_present_configuration(board: RenewedB
 
 
 def test_a_release_is_built_from_the_packages_of_the_present_one_and_tried(board: RenewedBoard) -> None:
+    board.processes = True
     assert board.release() == "old"
     request = board.activate(board.bundle("release", board.source("new"), 1), "release")
     board.step()
