@@ -52,7 +52,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, cross_product
+from knightcube.astro.arrays import FloatArray, cross_matrix, cross_product
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
 from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
@@ -105,7 +105,7 @@ def momentum_plan(
     spans = np.diff(times, append=2.0 * times[-1] - times[-2])
     square = np.einsum("ni,ni->n", field, field)
     effect = square[:, None, None] * np.eye(3) - field[:, :, None] * field[:, None, :]
-    ahead = _FieldPreview(field, effect * spans[:, None, None], LIMIT_GAIN * limit, rest)
+    ahead = _FieldPreview(field, (effect * spans[:, None, None]).reshape(-1, 9), LIMIT_GAIN * limit, rest)
     short, long = 2, len(field)
     costate = ahead.worst(momentum, long, momentum / size)
     while long - short > 1 and times[long - 1] - times[short - 1] > times[short - 1] / FINENESS:
@@ -222,7 +222,7 @@ class _FieldPreview:
 
     Attributes:
         field: (n, 3) T.
-        effect: matrices B^2 I - B B^T (n, 3, 3), each multiplied by the time step.
+        effect: elements (n, 9) of the matrices B^2 I - B B^T, each multiplied by the time step.
         reach: maximum strength L of the dipole moment, A m^2.
         rest: residual momentum r of the plan, N m s.
     """
@@ -234,7 +234,7 @@ class _FieldPreview:
 
     def across(self, y: FloatArray, count: int) -> FloatArray:
         """Return |B x y| at the first `count` instants, bounded below by a small positive value."""
-        found = np.cross(self.field[:count], y)
+        found = self.field[:count] @ cross_matrix(y)
         across = np.sqrt(np.einsum("ni,ni->n", found, found))
         strength = math.sqrt(float(self.field[0] @ self.field[0]))
         return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
@@ -242,7 +242,7 @@ class _FieldPreview:
     def matrix(self, y: FloatArray, count: int) -> FloatArray:
         """Return the matrix A(y) (3, 3) that gives the next costate, for the first `count` instants."""
         weight = self.reach / self.across(y, count)
-        return np.asarray(np.tensordot(weight, self.effect[:count], 1) + self.rest * np.eye(3))
+        return np.asarray((weight @ self.effect[:count]).reshape(3, 3) + self.rest * _IDENTITY)
 
     def worst(self, momentum: FloatArray, count: int, guess: FloatArray) -> FloatArray:
         """Return the direction (3,) along which coils remove the least momentum in `count` instants."""
@@ -288,6 +288,7 @@ _SECOND = 1e-9
 _ROUNDING = 1e-9
 """Relative rounding error of a product that should be zero."""
 _NO_DIPOLE: FloatArray = np.zeros(3)
+_IDENTITY: FloatArray = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, cross_product
 from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
@@ -93,7 +93,7 @@ def fly(
     """
     law, rng = detumbler(body), np.random.default_rng(seed)
     limit, inertia = (LIMIT, INERTIA) if body is None else (body.limit, body.inertia)
-    speeds = []
+    inverse, speeds = np.linalg.inv(inertia), []
     law.begin(0)
     attitude, dipole = IDENTITY, np.zeros(3)
     dt = 1e-9 * CYCLE_NS
@@ -104,7 +104,7 @@ def fly(
             @ attitude_matrix(from_rotation_vector(sooner * TURN * cycle * dt)).T
             @ FIELD
         )
-        past = attitude_matrix(from_rotation_vector(-late * rate)) @ field
+        past = attitude_matrix(from_rotation_vector(-late * rate)) @ field if late else field
         sample = past + OWN_FIELD * dipole + 1e-7 * rng.standard_normal(3)
         if rng.uniform() < spikes:
             sample = sample + 1e-4 * rng.standard_normal(3)
@@ -112,12 +112,9 @@ def fly(
         law.sample(now_ns - round(1e9 * late), sample, None if gyro is None else gyro(rate))
         dipole = law.dipole(now_ns)
         assert np.abs(dipole).max() <= limit * (1.0 + 1e-12)
-        momentum = inertia @ rate
-        middle = rate + 0.5 * dt * np.linalg.solve(
-            inertia, np.cross(dipole, field) - np.cross(rate, momentum)
-        )
-        torque = np.cross(dipole, field) - np.cross(middle, inertia @ middle)
-        rate = rate + dt * np.linalg.solve(inertia, torque)
+        torque = cross_product(dipole, field)
+        middle = rate + 0.5 * dt * inverse @ (torque - cross_product(rate, inertia @ rate))
+        rate = rate + dt * inverse @ (torque - cross_product(middle, inertia @ middle))
         attitude = multiply(from_rotation_vector(dt * middle), attitude)
         square = rate @ rate if body is None else 3.0 * float(rate @ inertia @ rate) / np.trace(inertia)
         speeds.append(math.sqrt(float(square)))
@@ -145,11 +142,12 @@ def test_the_coils_never_spin_up_a_body_of_another_inertia_beyond_the_multiple(
 ) -> None:
     """The rate along the field is unknown at first, and the energy is known to the accuracy of the inertia.
 
-    The speed of a long body changes by itself while its energy stays.
+    The speed of a long body changes by itself while its energy stays. Within 400 s the bodies are fastest
+    before 300 s.
     """
     body = unlike(described, limit, seed)
     off = 0.1 * speed * np.random.default_rng(seed).standard_normal(3)
-    speeds = fly(np.array([0.0, 0.0, speed]) + off, 400.0, body=body, seed=seed)
+    speeds = fly(np.array([0.0, 0.0, speed]) + off, 300.0, body=body, seed=seed)
     assert speeds.max() < 1.15 * multiple * speeds[0]
 
 
