@@ -307,11 +307,11 @@ def main() -> None:
         config.write_text(f"body: pointing_body:POINTING\n{text}", encoding="utf-8")
         here = str(Path(__file__).resolve().parent)
         environment = {**os.environ, "PYTHONPATH": f"{here}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-        words = ["-m", "flight", "run", str(config), "--out", str(folder), "--duration", "90"]
+        words = ["-m", "flight", "run", str(config), "--out", str(folder), "--duration", "45"]
         subprocess.run([sys.executable, *words], env=environment, check=True, stdout=subprocess.DEVNULL)
         last = read_run(folder)["attitude"][-1]
     error = to_rotation_vector(multiply(last["quaternion"], conjugate(last["target"])))
-    print(f"pointing error {np.rad2deg(np.linalg.norm(error)):.2f} deg after 90 s")
+    print(f"pointing error {np.rad2deg(np.linalg.norm(error)):.2f} deg after 45 s")
     print(f"body rate      {np.rad2deg(np.linalg.norm(last['rate'])):.3f} deg/s")
 
 

@@ -21,14 +21,15 @@ def draw_orion(rows: int = 768, columns: int = 1024, fov_deg: float = 11.4) -> I
     stars = catalogue.load()
     x, y, z = attitude_matrix(camera) @ stars.directions_at(2026.5).T
     focal_length = 0.5 * columns / np.tan(np.radians(0.5 * fov_deg))
-    column, row = np.indices((rows, columns))[::-1]
     image = np.full((rows, columns), 100.0)
     for k in np.flatnonzero((z > 0.98) & (stars.magnitude < 8.0)):
         px = focal_length * x[k] / z[k] + 0.5 * (columns - 1)
         py = focal_length * y[k] / z[k] + 0.5 * (rows - 1)
         if -4.0 < px < columns + 4.0 and -4.0 < py < rows + 4.0:
             flux = 2e4 * 10.0 ** (-0.4 * (stars.magnitude[k] - 5.0))
-            image += flux / (2.0 * np.pi) * np.exp(-0.5 * ((column - px) ** 2 + (row - py) ** 2))
+            across = np.exp(-0.5 * (np.arange(columns) - px) ** 2)
+            down = np.exp(-0.5 * (np.arange(rows) - py) ** 2)
+            image += flux / (2.0 * np.pi) * np.outer(down, across)
     return np.random.default_rng(1).poisson(image).clip(0, 65_535).astype(np.uint16)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, cross_product
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.gnc.control.sun_acquisition import ResidualDipole
 
@@ -22,8 +22,8 @@ def learned(coils: FloatArray, dipole: FloatArray, bound: float) -> FloatArray:
         field = 3e-5 * np.array([np.cos(angle), np.sin(angle), 0.6])
         acting = coils * np.sin(0.7 * k * STEP)
         # Held by a torque that the coils know of, the body stays slow.
-        hold = np.cross(field, -2e-5 * rate) / (field @ field)
-        torque = np.cross(acting + hold + dipole, field) - np.cross(rate, INERTIA * rate)
+        hold = cross_product(field, -2e-5 * rate) / (field @ field)
+        torque = cross_product(acting + hold + dipole, field) - cross_product(rate, INERTIA * rate)
         rate = rate + STEP * torque / INERTIA
         observer.follow(STEP, rate + 1e-4 * rng.standard_normal(3), field, acting + hold)
     return observer.dipole
