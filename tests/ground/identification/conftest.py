@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import pickle
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,15 +13,25 @@ from ground.identification.fit import PlantFit, fit
 from ground.identification.record import Record
 from ground.identification.scale import noise_of
 from tests.ground.identification.worlds import World, believed, drawn, fly_bare
+from tests.support.shared_results import made_once
 
 Identified = tuple[World, Record, PlantFit]
 
 
-@pytest.fixture(scope="session")
-def identified() -> list[Identified]:
-    """Four drawn worlds, flown on the bare testbed and fitted."""
+def _identified() -> str:
+    """Return four drawn worlds, flown on the bare testbed and fitted, as text."""
     rng = np.random.default_rng(20)
     worlds = [drawn(rng) for _ in range(4)]
     records = [fly_bare(world, 85.0) for world in worlds]
     noise = noise_of(believed())
-    return [(world, record, fit(record, noise)) for world, record in zip(worlds, records, strict=True)]
+    made = [(world, record, fit(record, noise)) for world, record in zip(worlds, records, strict=True)]
+    return base64.b64encode(pickle.dumps(made)).decode()
+
+
+@pytest.fixture(scope="session")
+def identified(session_folder: Path) -> list[Identified]:
+    """Return four drawn worlds with their flights and fits, which one process of the session makes."""
+    found: list[Identified] = pickle.loads(
+        base64.b64decode(made_once(session_folder, "identified", _identified))
+    )
+    return found
