@@ -22,6 +22,7 @@ from knightcube.errors import UsageError
 
 DEMO = Path(__file__).parents[3] / "config" / "step_demo.yaml"
 ORBIT = DEMO.with_name("orbit_3u.yaml")
+SIMULATION = DEMO.with_name("step_simulation.yaml")
 
 
 def draws(text: str, value: float, count: int = 4000) -> np.ndarray[Any, Any]:
@@ -138,7 +139,7 @@ def test_draws_that_are_always_refused_end_with_the_reason(monkeypatch: pytest.M
 
 @pytest.mark.slow
 def test_a_campaign_continues_after_a_kill_with_the_same_result(tmp_path: Path) -> None:
-    campaign = varied_campaign(DEMO, [variation_of("plant.inertia=20%")], 2.0)
+    campaign = varied_campaign(SIMULATION, [variation_of("plant.inertia=20%")], 2.0)
     whole = fly(campaign, 3, 7, tmp_path / "whole", workers=1)
     lines = (tmp_path / "whole" / "results.jsonl").read_text().splitlines(keepends=True)
     broken = tmp_path / "broken"
@@ -147,7 +148,7 @@ def test_a_campaign_continues_after_a_kill_with_the_same_result(tmp_path: Path) 
     (broken / "results.jsonl").write_text(lines[1] + lines[0][:40])  # line cut off by a kill of the campaign
     facts = json.loads(json.dumps(fly(campaign, 3, 7, broken, workers=1).facts).replace("broken", "whole"))
     assert facts == whole.facts
-    again = varied_campaign(DEMO, [variation_of("plant.inertia=10%")], 2.0)
+    again = varied_campaign(SIMULATION, [variation_of("plant.inertia=10%")], 2.0)
     with pytest.raises(UsageError, match="give another folder"):
         fly(again, 3, 7, broken, workers=1)
 
@@ -159,7 +160,7 @@ def test_the_listed_command_flies_a_failed_flight_again(
     """A run of 2 s is too short to meet the limit of the average power."""
     out = tmp_path / "campaign"
     vary = ["--vary", "simulation.release.rate=-0.3..-0.2"]
-    words = ["campaign", str(DEMO), *vary, "--runs", "1", "--duration", "2", "--workers", "1"]
+    words = ["campaign", str(SIMULATION), *vary, "--runs", "1", "--duration", "2", "--workers", "1"]
     assert main([*words, "--out", str(out), "--json"]) == 1
     (failed,) = json.loads(capsys.readouterr().out)["failed flights"]
     program, *again = shlex.split(failed["fly it again"])
@@ -186,7 +187,11 @@ def test_an_interrupted_flight_has_no_result() -> None:
         "try:\n    fly_case(case)\nexcept KeyboardInterrupt:\n    print('interrupted')\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, str(DEMO)], capture_output=True, text=True, timeout=100, check=False
+        [sys.executable, "-c", code, str(SIMULATION)],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
     )
     assert done.stdout == "interrupted\n", done.stderr
 
