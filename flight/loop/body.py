@@ -415,9 +415,9 @@ class BodyEstimation(Protocol):
         """
         return None
 
-    def accept_fix(self, reading: GpsReading) -> bool:
-        """Accept a valid GPS reading, and return whether the body uses it."""
-        return False
+    def accept_fix(self, reading: GpsReading) -> str | None:
+        """Accept a GPS fix; return why it is refused (empty if used), or None if it waits or has no use."""
+        return None
 
     def accept_sun(self, reading: StringReading) -> str | None:
         """Accept a solar cell reading; return its fault (empty for none), or None if it was not checked."""

@@ -367,11 +367,11 @@ class Positioning:
     def __init__(
         self,
         receiver: GpsReceiver,
-        accept: Callable[[GpsReading], bool],
+        accept: Callable[[GpsReading], str | None],
         max_age_ns: int,
         services: Services,
     ) -> None:
-        """`accept` is a function that returns whether the body uses a fix.
+        """`accept` is `BodyEstimation.accept_fix`.
 
         A receiver is reported as lost after `max_age_ns` without a fix.
         """
@@ -404,15 +404,16 @@ class Positioning:
             if not reading.valid:
                 continue
             self._streams.note("gps", reading.time_ns)
-            used = self._accept(reading)
+            refusal = self._accept(reading)
+            used = refusal == ""
             if used:
                 self._fixed_ns = reading.time_ns
                 # Before the first fix, the position was computed with the wall clock.
                 self._off_ns = self._clock.correct(reading.utc_ns + GPS_DELAY_NS, reading.time_ns)
                 text = f"the wall clock is {self._off_ns * 1e-9:+.1f} s off the receiver's time"
                 self._facts.update(facts.CLOCK_OFF, abs(self._off_ns) > facts.CLOCK_OFF_NS, now_ns, text)
-            else:
-                self._events.report(events.GPS_REFUSED, now_ns, f"{reading.satellites} satellites")
+            elif refusal:
+                self._events.report(events.GPS_REFUSED, now_ns, f"{refusal}; {reading.satellites} satellites")
             self._record(reading, used, now_ns)
         link = self._watch_line(now_ns)
         age_ns = now_ns - self._fixed_ns

@@ -339,8 +339,8 @@ class SatelliteEstimation(BodyEstimation):
         """Return the satellite's velocity (3,), m/s, relative to the Sun (ICRS), or None without an orbit."""
         return self.environment.velocity(time_ns)
 
-    def accept_fix(self, reading: GpsReading) -> bool:
-        """Accept a report of the GPS receiver, and return whether it is used."""
+    def accept_fix(self, reading: GpsReading) -> str | None:
+        """Accept a GPS fix; return why it is refused (empty if used), or None if it awaits further fixes."""
         field, sigma, sunlit = None, math.inf, False
         measured = self.orbit_filter.field_at_rest
         if measured is not None and abs(reading.time_ns - measured[0]) <= LATEST_WITNESS_NS:
@@ -350,7 +350,8 @@ class SatelliteEstimation(BodyEstimation):
         if sun is not None and sun.newest is not None:
             recent = abs(reading.time_ns - sun.newest.time_ns) <= LATEST_WITNESS_NS
             sunlit = recent and float(np.max(sun.newest.currents / sun.strings.peaks)) >= SUNLIT_SHARE
-        return self.environment.fix(reading, Witness(field, sigma, sunlit))
+        used = self.environment.fix(reading, Witness(field, sigma, sunlit))
+        return "" if used else self.environment.refusal or None
 
     def accept_sun(self, reading: StringReading) -> str | None:
         """Pass a solar cell reading to the filter and to the Sun acquisition of SAFE."""

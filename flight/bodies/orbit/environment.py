@@ -178,7 +178,12 @@ def _agree(known: GpsFix | TwoLineElements, fix: GpsFix, least: float) -> bool:
 
 
 class EstimatedEnvironment:
-    """Knowledge of the orbit. The attribute `refused` counts the GPS fixes that contradict the orbit."""
+    """Knowledge of the orbit.
+
+    Attributes:
+        refused: number of GPS fixes that were refused; a fix that is kept to begin an orbit does not count.
+        refusal: why the last fix was refused; empty if it was used or kept.
+    """
 
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:
         """`elements` are the two-line elements; without them the orbit is unknown until the first fixes."""
@@ -197,6 +202,7 @@ class EstimatedEnvironment:
         # Field, pressures of air and light, and visible fraction of the Sun at the times of the prediction.
         self._near_table: FloatArray = np.zeros((0, 10))
         self.refused = 0
+        self.refusal = ""
 
     @property
     def known(self) -> bool:
@@ -233,6 +239,7 @@ class EstimatedEnvironment:
 
         `witness` holds the measurements of other sensors, which can contradict the receiver.
         """
+        self.refusal = ""
         if not reading.valid:
             return False
         date = UNIX_EPOCH + reading.utc_ns / (DAY * SECOND_NS)
@@ -241,10 +248,11 @@ class EstimatedEnvironment:
         speed_sigma = UNKNOWN_VELOCITY_SIGMA if math.isnan(speed_sigma) else speed_sigma
         try:
             fix = GpsFix(date, reading.position, reading.velocity, sigma, speed_sigma)
-            used = self._is_possible(fix) and self._judge(fix, reading, witness or Witness())
-        except OrbitError:
-            used = False
-        self.refused += not used
+            self.refusal = self._impossibility(fix)
+            used = not self.refusal and self._judge(fix, reading, witness or Witness())
+        except OrbitError as error:
+            used, self.refusal = False, str(error)
+        self.refused += bool(self.refusal)
         return used
 
     def state(self, now_ns: int) -> OrbitState | None:
@@ -348,12 +356,13 @@ class EstimatedEnvironment:
             seconds = BEHIND if near is None else self._seconds_into(near, now_ns)
         return near, np.array([seconds])
 
-    def _is_possible(self, fix: GpsFix) -> bool:
-        """Return whether position and velocity are an orbit, and the date is not long before the elements."""
+    def _impossibility(self, fix: GpsFix) -> str:
+        """Return why a fix alone is impossible, or an empty text."""
         perigee, radius = fix.at(fix.julian_date).perigee_radius, float(np.linalg.norm(fix.position))
         if not (perigee >= LOWEST_ORBIT and radius >= LOWEST_ORBIT):
-            return False
-        return self._elements is None or fix.julian_date >= self._elements.epoch - EARLIEST
+            return f"radius {1e-3 * radius:.0f} km, perigee radius {1e-3 * perigee:.0f} km is not an orbit"
+        early = 0.0 if self._elements is None else self._elements.epoch - fix.julian_date
+        return f"the date is {early:.1f} days before the epoch of the elements" if early > EARLIEST else ""
 
     def _judge(self, fix: GpsFix, reading: GpsReading, witness: Witness) -> bool:
         """Return whether a possible fix agrees with the known orbit or replaces it, and use it then."""
@@ -377,9 +386,17 @@ class EstimatedEnvironment:
             self._enlarge(fix)
             self._sequences, self._is_doubted = [], False
             return self._use(fix, offset_ns, time_ns, confirmed=True)
-        if not (by_fixes and by_elements and self._is_begun(sequence, last)):
-            return False
-        return self._use(fix, offset_ns, time_ns, confirmed=False)
+        if by_fixes and by_elements and self._is_begun(sequence, last):
+            return self._use(fix, offset_ns, time_ns, confirmed=False)
+        causes = {
+            "the time jumps against the time of earlier fixes": not by_time,
+            "the fix contradicts the orbit of earlier fixes": not by_fixes,
+            "the fix contradicts the orbit elements": not by_elements,
+            "the magnetic field or the Sun contradicts the orbit of the fixes": sequence.refuted,
+            "the newest fixes contradict one another": len(self._sequences) > 1,
+        }
+        self.refusal = next((cause for cause, is_true in causes.items() if is_true), "")
+        return False
 
     def _is_begun(self, sequence: FixSequence, last: GpsFix | None) -> bool:
         """Return whether a sequence begins or continues an orbit that only a few fixes describe."""

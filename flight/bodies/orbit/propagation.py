@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,25 +91,26 @@ class _Motion(NamedTuple):
 
 
 class PropagatedEstimate(Estimate):
-    """An estimate whose covariance (19, 19) is computed when it is first read."""
+    """An estimate whose covariance (19, 19) is computed when it is first read or copied."""
 
-    __slots__ = ("_compute", "_known")
-    _compute: Callable[[], FloatArray]
-    _known: FloatArray | None
+    __slots__ = ("_known",)
+    _known: FloatArray | Callable[[], FloatArray]
 
-    def __init__(self, covariance: Callable[[], FloatArray], **values: Any) -> None:
-        """`values` holds the other attributes of `Estimate` by name."""
-        for name, value in values.items():
+    def __init__(self, covariance: FloatArray | Callable[[], FloatArray], **values: Any) -> None:
+        """`covariance` is the matrix or its function, `values` the other attributes of `Estimate` by name."""
+        for name, value in {**values, "_known": covariance}.items():
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "_compute", covariance)
-        object.__setattr__(self, "_known", None)
+
+    def __reduce__(self) -> tuple[type[Estimate], tuple[Any, ...]]:
+        """Make copies and pickles an `Estimate`, because a function cannot be pickled."""
+        return Estimate, tuple(getattr(self, one.name) for one in fields(self))
 
     @property
     def covariance(self) -> FloatArray:
         """Covariance (19, 19) of the error state, whose attitude error is a rotation vector in body axes."""
         known = self._known
-        if known is None:
-            known = self._compute()
+        if callable(known):
+            known = known()
             object.__setattr__(self, "_known", known)
         return known
 

@@ -495,7 +495,7 @@ FIX = Packet(
         Field("sigma", "f4", "m", "standard deviation of the position per axis; NaN if unknown"),
         Field("velocity_sigma", "f4", "m/s", "standard deviation of the velocity per axis; NaN if unknown"),
         Field("satellites", "u1", "-", "number of GPS satellites"),
-        flag("used", "whether the orbit was updated; no means that the fix contradicts the known orbit"),
+        flag("used", "whether the orbit was updated"),
         Field("clock_off", "f8", "s", "host's UTC minus the UTC of the newest used fix; NaN before a fix"),
     ),
     version=2,

@@ -95,6 +95,7 @@ def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLin
     assert known.state(0) is None
     used = [known.fix(reading(elements, second * SECOND_NS)) for second in (8, 9, 10)]
     assert used == [False, False, True]
+    assert (known.refused, known.refusal) == (0, ""), "the first fixes contradict nothing"
     found = known.at(12 * SECOND_NS)
     assert found is not None
     expected = elements.at(UNIX_EPOCH + (UTC_NS + 12 * SECOND_NS) / (DAY * SECOND_NS))
@@ -110,6 +111,7 @@ def test_a_fix_with_an_impossible_velocity_is_refused(elements: TwoLineElements,
     ):
         sound = reading(elements, 0)
         assert not known.fix(replace(sound, velocity=speed * sound.velocity))
+        assert "is not an orbit" in known.refusal
         assert any([known.fix(reading(elements, second * SECOND_NS)) for second in range(1, 4)])
 
 
@@ -374,6 +376,7 @@ def test_a_receiver_whose_time_stands_is_refused_for_as_long_as_it_does(elements
     for seconds in range(11, 60):
         time_ns = seconds * SECOND_NS + GPS_DELAY_NS
         assert not known.fix(replace(frozen, time_ns=time_ns, arrival_ns=time_ns))
+        assert "time jumps" in known.refusal
     date = UNIX_EPOCH + (UTC_NS + 60 * SECOND_NS) / (DAY * SECOND_NS)
     assert known.julian_date(60 * SECOND_NS) == pytest.approx(date, abs=1e-8), "the time goes on"
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
+import pickle
+from collections.abc import Callable
+from copy import copy, deepcopy
 from dataclasses import replace
 from functools import cache
 
@@ -24,7 +26,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.control.coil_map import CoilMap
-from knightcube.gnc.estimation.estimate import ATTITUDE, FIELD_BIAS, RATE, Knowledge
+from knightcube.gnc.estimation.estimate import ATTITUDE, FIELD_BIAS, RATE, Estimate, Knowledge
 from knightcube.gnc.estimation.free_filter import (
     COILS,
     GYRO,
@@ -140,6 +142,20 @@ class Flown:
         rate, nothing = self.rate + BIAS + 1e-4 * noise[:3], np.zeros(3)
         rate = rate if self.has_gyro else np.full(3, np.nan)
         return ImuReading(self.time_ns, self.time_ns, self.time_ns, IDENTITY, rate, field, nothing)
+
+
+@pytest.mark.parametrize("form", [replace, copy, deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_a_propagated_estimate_can_be_replaced_copied_and_pickled(
+    form: Callable[[Estimate], Estimate],
+) -> None:
+    flown = Flown()
+    flown.fly(1.0)
+    flown.filter.begin(flown.stars(flown.time_ns - 24 * PERIOD_NS))
+    found = flown.filter.at(flown.time_ns)
+    other = form(found)
+    assert (other.covariance == found.covariance).all()
+    assert (other.rate == found.rate).all()
+    assert other.time_ns == found.time_ns
 
 
 def acquired(pulses: bool = False) -> Flown:
