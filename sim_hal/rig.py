@@ -27,6 +27,7 @@ from flight.schema.devices import coil_fields, driver_of
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
+from flight.schema.testbed import TestbedConfig
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import device_file, lock_bus
 from hal.buses.serial_port import PySerialPort
@@ -61,8 +62,6 @@ from sim_hal.worlds.world import BodyMotion, TruthRecorder, WorldInputs, make_wo
 
 PATIENCE_S = 5.0
 """Time (s) after which the device server ends if the flight process has died."""
-FARTHEST_ELEMENTS = 100e3
-"""Largest accepted distance (m) of the two-line elements from the first revolution of the simulated orbit."""
 BENCH_COIL_FIELD = 5.0e-4
 """Field (T/A) of a coil along its axis at the magnetometer, if neither field nor position is configured."""
 _START_S = 20.0
@@ -135,24 +134,28 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
 
 
 def check_elements(request: SimulationRequest, config: Config) -> None:
-    """Raise ConfigError if the two-line elements of a configuration do not fit its simulated orbit."""
+    """Raise ConfigError if the elements of a satellite or of a cage do not fit the simulated orbit."""
     section = request.section()
-    if section.free_body is None or not isinstance(config, OrbitConfig) or config.elements is None:
+    if isinstance(config, OrbitConfig):
+        name, lines, world, described = "elements", config.elements, "free_body", section.free_body
+        cure = "`knightcube elements --config FILE` makes elements of the simulated orbit"
+    else:
+        cage = cast(TestbedConfig, config).cage
+        name, lines, world, described = "cage.elements", cage and cage.elements, "cage", section.cage
+        cure = "`knightcube elements --altitude KM` makes elements of this orbit"
+    if lines is None or described is None:
         return
-    from sim_hal.worlds.orbit import distance_from  # noqa: PLC0415 - loads SciPy
+    from sim_hal.worlds.orbit import misfit  # noqa: PLC0415 - loads SciPy
 
-    cure = "`knightcube elements --config FILE` makes elements of the simulated orbit"
     try:
-        distance = distance_from(config.elements, section.free_body.orbit, section.utc)
+        problem = misfit(lines, described.orbit, section.utc)
     except UsageError as error:
-        raise ConfigError("elements", f"are not valid two-line elements: {error}: {cure}") from error
+        raise ConfigError(name, f"are not valid two-line elements: {error}: {cure}") from error
     except OrbitError as error:
-        raise ConfigError("elements", f"give no position at `simulation.utc`: {error}: {cure}") from error
-    if distance > FARTHEST_ELEMENTS:
-        orbit = "the first revolution of `simulation.free_body.orbit`"
-        problem = f"are up to {1e-3 * distance:,.0f} km from {orbit}"
-        limit = f"must be within {1e-3 * FARTHEST_ELEMENTS:g} km"
-        raise ConfigError("elements", f"{problem}: {limit}: {cure}")
+        raise ConfigError(name, f"give no position at `simulation.utc`: {error}: {cure}") from error
+    if problem:
+        orbit = f"the first revolution of `simulation.{world}.orbit`"
+        raise ConfigError(name, f"do not fit {orbit}: {problem}: {cure}")
 
 
 @dataclass(frozen=True, slots=True)

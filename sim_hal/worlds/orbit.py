@@ -216,17 +216,53 @@ def elements(orbit: OrbitSection, date: float) -> KeplerianElements:
     )
 
 
-def distance_from(lines: tuple[str, str], orbit: OrbitSection, utc: str) -> float:
-    """Return the largest distance (m) of two-line elements from the first revolution of a configured orbit.
+_FARTHEST_ELEMENTS, _TILT = 100e3, 0.25
+"""Largest distance (m) of fitting elements from the first revolution, and difference of inclination (deg).
 
-    The orbit starts at `utc`. Raises UsageError for invalid elements, and OrbitError if SGP4 cannot propagate
-    them to the first revolution.
+The inclination of elements refers to the equator of date, whose pole is 0.15 deg from that of ICRS in 2026.
+J2 adds 0.03 deg in a revolution.
+"""
+
+
+def misfit(lines: tuple[str, str], orbit: OrbitSection, utc: str) -> str:
+    """Return how two-line elements differ from a configured orbit that starts at `utc`; empty if they fit.
+
+    Means over the first revolution are compared, and distances. The tolerances also hold for an orbit that is
+    described by mean elements instead of osculating ones: J2 varies the semi-major axis by the fraction
+    k = 3/2 J2 (R/p)^2 and the eccentricity by at most 2 k in a revolution. Raises UsageError for invalid
+    elements, and OrbitError if SGP4 cannot propagate them to the first revolution.
     """
     date = julian_date(utc)
     start, known = elements(orbit, date), TwoLineElements(*lines)
-    times = np.linspace(0.0, start.period, 9)
-    found = np.array([known.at(date + time / DAY).position for time in times.tolist()])
-    return float(np.linalg.norm(found - propagate(start, start.period).positions_at(times), axis=1).max())
+    times = np.linspace(0.0, start.period, 25)
+    states = [known.at(date + time / DAY) for time in times.tolist()]
+    found = np.array([[*state.position, *state.velocity] for state in states])
+    true = propagate(start, start.period).states_at(times)
+    axis, eccentricity, inclination = _mean_shape(true)
+    other_axis, other_eccentricity, other_inclination = _mean_shape(found)
+    share = 1.5 * J2 * (EARTH_RADIUS / (axis * (1.0 - eccentricity**2))) ** 2
+    distance = float(np.linalg.norm((found - true)[:, :3], axis=1).max())
+    compared = (
+        ("mean inclination", other_inclination, inclination, _TILT, ".2f", " deg"),
+        ("mean eccentricity", other_eccentricity, eccentricity, 2.0 * share, ".4f", ""),
+        ("mean semi-major axis", 1e-3 * other_axis, 1e-3 * axis, 1e-3 * share * axis, ".1f", " km"),
+        ("largest distance", 1e-3 * distance, 0.0, 1e-3 * _FARTHEST_ELEMENTS, ",.0f", " km"),
+    )
+    return ", ".join(
+        f"{name} {one:{form}}{unit} instead of {two:{form}}{unit} (tolerance {tolerance:{form}}{unit})"
+        for name, one, two, tolerance, form, unit in compared
+        if not abs(one - two) <= tolerance
+    )
+
+
+def _mean_shape(states: FloatArray) -> tuple[float, float, float]:
+    """Return the mean semi-major axis (m), eccentricity and inclination (deg) of osculating orbits (n, 6)."""
+    position, velocity = states[:, :3], states[:, 3:]
+    radius, momentum = np.linalg.norm(position, axis=1), np.cross(position, velocity)
+    axes = 1.0 / (2.0 / radius - np.sum(velocity**2, axis=1) / GRAVITATIONAL_PARAMETER)
+    perigees = np.cross(velocity, momentum) / GRAVITATIONAL_PARAMETER - position / radius[:, None]
+    tilts = np.degrees(np.arccos(momentum[:, 2] / np.linalg.norm(momentum, axis=1)))
+    return float(axes.mean()), float(np.linalg.norm(perigees.mean(axis=0))), float(tilts.mean())
 
 
 _PROFILE = np.array(

@@ -156,14 +156,22 @@ def test_check_refuses_elements_that_do_not_fit_and_accepts_those_that_are_made(
     done = command("check", path)
     assert done.returncode == 2
     assert "orbit.yaml:" in done.stderr
-    assert "`elements` are up to " in done.stderr
-    assert "km from the first revolution of `simulation.free_body.orbit`" in done.stderr
-    assert "must be within 100 km: `knightcube elements --config FILE` makes" in done.stderr
+    assert "`elements` do not fit the first revolution of `simulation.free_body.orbit`: " in done.stderr
+    assert " deg instead of 51.58 deg (tolerance 0.25 deg), mean semi-major axis " in done.stderr
+    assert "(tolerance 100 km): `knightcube elements --config FILE` makes" in done.stderr
     made = command("elements", "--config", path)
     assert made.returncode == 0, made.stderr
     path.write_text(f"{path.read_text(encoding='utf-8')}{made.stdout}", encoding="utf-8")
     done = command("check", path)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_check_refuses_elements_that_do_not_fit_the_orbit_of_a_cage(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: cage\nsimulation: {cage: {orbit: {inclination_deg: 96.9}}}\n", encoding="utf-8")
+    done = command("check", path)
+    assert done.returncode == 2
+    assert "`cage.elements` do not fit the first revolution of `simulation.cage.orbit`: mean " in done.stderr
 
 
 def test_check_refuses_damaged_elements_with_their_place(tmp_path: Path) -> None:

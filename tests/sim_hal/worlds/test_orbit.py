@@ -27,6 +27,7 @@ from sim_hal.worlds.orbit import (
     elements,
     julian_date,
     log_density,
+    misfit,
     propagate,
     sun_position,
 )
@@ -48,6 +49,56 @@ LOW = KeplerianElements(
     argument_of_perigee=0.9,
     true_anomaly=2.0,
 )
+
+
+@pytest.mark.parametrize(
+    ("change", "value", "complaint"),
+    [
+        ("inclination", 0.1, ""),
+        ("inclination", 0.5, "mean inclination 97.90 deg instead of 97.40 deg (tolerance 0.25 deg)"),
+        ("inclination", -1.0, "mean inclination 96.40 deg instead of 97.40 deg (tolerance 0.25 deg)"),
+        ("eccentricity", 0.001, ""),
+        ("eccentricity", 0.004, "mean eccentricity 0.0043 instead of 0.0005 (tolerance 0.0028)"),
+        ("axis", 5.0, ""),
+        ("axis", 10.0, "mean semi-major axis 6879.1 km instead of 6869.1 km (tolerance 9.6 km)"),
+    ],
+)
+def test_elements_with_another_shape_than_the_orbit_are_named(
+    change: str, value: float, complaint: str
+) -> None:
+    first = "1 99999U 26001A   26079.50000000  .00000000  00000-0  00000+0 0    05"
+    second = "2 99999  97.4640 337.4170 0011973 295.7805  64.3547 15.24067411    0"
+    if change == "inclination":
+        second = f"{second[:8]}{97.464 + value:8.4f}{second[16:]}"
+    elif change == "eccentricity":
+        second = f"{second[:26]}{round(1e7 * (0.0011973 + value)):07d}{second[33:]}"
+    else:
+        second = f"{second[:52]}{15.24067411 * (1.0 - 1.5 * value / 6878.0):11.8f}{second[63:]}"
+    check = sum(int(c) if c.isdigit() else c == "-" for c in second) % 10
+    found = misfit((first, f"{second}{check}"), OrbitSection(local_time=10.5), "2026-03-20T12:00:00Z")
+    assert found.startswith(complaint)
+    assert bool(found) is bool(complaint)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_mean_elements_written_as_an_orbit_keep_its_shape(seed: int) -> None:
+    """The mean elements of SGP4 are written as osculating elements in ICRS axes, a common confusion."""
+    rng = np.random.default_rng(seed)
+    altitude, tilt = rng.uniform(400e3, 1200e3), rng.uniform(20.0, 120.0)
+    node, perigee = rng.uniform(0.0, 360.0, 2)
+    rate = 86_400.0 / (2.0 * np.pi) * np.sqrt(GRAVITATIONAL_PARAMETER / (EARTH_RADIUS + altitude) ** 3)
+    first = "1 99999U 26001A   26079.50000000  .00000000  00000-0  00000+0 0    05"
+    second = f"2 99999 {tilt:8.4f} {node:8.4f} 0010000 {perigee:8.4f}   0.0000 {rate:11.8f}    0"
+    check = sum(int(c) if c.isdigit() else c == "-" for c in second) % 10
+    orbit = OrbitSection(
+        altitude=altitude,
+        inclination_deg=tilt,
+        ascending_node_deg=node,
+        argument_of_perigee_deg=perigee,
+    )
+    found = misfit((first, f"{second}{check}"), orbit, "2026-03-20T12:00:00Z")
+    assert "inclination" not in found
+    assert "eccentricity" not in found
 
 
 def test_elements_give_the_published_state() -> None:

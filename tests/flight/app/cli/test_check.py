@@ -247,7 +247,7 @@ def test_a_configuration_that_is_refused_is_one_line_and_status_2(
         (
             "simulation: {utc: '2027-01-01T00:00:00Z'}",
             None,
-            "`elements` are up to ",
+            "`elements` do not fit the first revolution of `simulation.free_body.orbit`: largest distance ",
         ),
     ],
 )
