@@ -335,6 +335,7 @@ def _orbit_facts(made: OrderedSlew, at: datetime, solved_s: float) -> dict[str, 
         "energy_J": plan.energy,
         "mean_heat_W": plan.energy / plan.horizon,
         "peak_of_limit": plan.peak,
+        "dipole_limit_A_m2": made.task.craft.limit.tolist(),
         "turn_deg": math.degrees(float(angle_between(path.quaternion[0], path.quaternion[-1]))),
         # The path's quaternion is continuous, so its scalar part changes sign after half a revolution.
         "way_round": "short" if around[3] >= 0.0 else "long",
@@ -357,7 +358,6 @@ def _nodes(made: OrderedSlew) -> dict[str, object]:
         "quaternion": path.quaternion.tolist(),
         "rate_rad_s": path.rate.tolist(),
         "dipole_A_m2": path.dipole.tolist(),
-        "dipole_limit_A_m2": made.task.craft.limit.tolist(),
     }
 
 
@@ -366,8 +366,10 @@ def _orbit_text(facts: dict[str, object]) -> str:
     note = f" ({facts['horizon_asked_s']:g} s is too short)" if stretched else ""
     begins = facts["begins_compared"]
     chosen = "" if begins == 1 else f", the best of {begins} start times"
-    clear = facts["clearance_deg"]
+    clear, limits = facts["clearance_deg"], facts["dipole_limit_A_m2"]
     assert isinstance(clear, dict)
+    assert isinstance(limits, list)
+    largest = ", ".join(f"{name} {limit:.4g}" for name, limit in zip("xyz", limits, strict=True))
     kept = "".join(f"{name + ':':15}{value:.2f} deg outside its cone\n" for name, value in clear.items())
     return (
         f"status:        {facts['status']}\n"
@@ -376,6 +378,7 @@ def _orbit_text(facts: dict[str, object]) -> str:
         f"horizon:       {facts['horizon_s']:.3f} s{note}\n"
         f"energy:        {facts['energy_J']:.5f} J, integral of R I^2\n"
         f"peak dipole:   {100.0 * float(str(facts['peak_of_limit'])):.1f} % of the limit\n"
+        f"dipole limits: {largest} A m^2\n"
         f"turn:          {facts['turn_deg']:.2f} deg, the {facts['way_round']} way, "
         f"on a path of {facts['way_deg']:.1f} deg\n"
         f"peak rate:     {facts['peak_rate_deg_s']:.3f} deg/s\n"

@@ -19,12 +19,21 @@ Values = Mapping[str, Any]
 COIL_EXAMPLE = "axis=xyz,dipole=0.2,current=0.1,resistance=40"
 _FORMS = {
     "1u": (0.1, 0.1, 0.1135),
+    "1.5u": (0.1702, 0.1, 0.1),
     "2u": (0.227, 0.1, 0.1),
     "3u": (0.3405, 0.1, 0.1),
+    "4u": (0.454, 0.1, 0.1),
     "6u": (0.366, 0.2263, 0.1),
+    "8u": (0.227, 0.2263, 0.2263),
     "12u": (0.366, 0.2263, 0.2263),
+    "16u": (0.454, 0.2263, 0.2263),
+    "27u": (0.366, 0.3526, 0.3526),
 }
-"""Sizes of CubeSats, m [CubeSat Design Specification]; all but the 1U have their longest side along x."""
+"""Sizes of CubeSats, m; all but the 1U have their longest side along x.
+
+The CubeSat Design Specification, Rev. 14.1, gives the sizes of 1U, 1.5U, 2U, 3U, 6U and 12U. A 4U, 8U or
+16U is a stack with 113.5 mm per unit along x. A 27U is as long as a 12U, with 126.3 mm more per unit across.
+"""
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _DENSITIES = (20.0, 20_000.0)
 """Range of the mean density, kg/m^3: from an empty box of thin sheet to solid tungsten."""
@@ -142,7 +151,8 @@ def _read_size(text: str) -> Vector:
         return _FORMS[text.lower()]
     parts = text.lower().split("x")
     if len(parts) != 3:
-        raise ValueError(f"give three sides in m, such as 0.3x0.1x0.1, or one of {', '.join(_FORMS)}")
+        known = f"the CubeSats {', '.join(_FORMS)}"
+        raise ValueError(f"give three sides in m, such as 0.3x0.1x0.1, or one of {known}")
     side = number(0.02, 3.0, "m for each side")
     return side(parts[0]), side(parts[1]), side(parts[2])
 
@@ -212,7 +222,7 @@ QUESTIONS = (
     Question(
         "size",
         "XxYxZ",
-        "sides along body x, y and z, m, such as 0.3x0.1x0.1; or 1u, 2u, 3u, 6u, 12u, longest along x",
+        f"sides along body x, y and z, m, such as 0.3x0.1x0.1; or {', '.join(_FORMS)}, longest along x",
         _read_size,
     ),
     Question(

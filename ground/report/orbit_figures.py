@@ -338,13 +338,15 @@ def slew_figure(made: OrderedSlew, order: SlewOrder) -> Figure:
     torque, energy = (figure.add_subplot(grid[k], sharex=dipole) for k in (2, 3))
     times = np.linspace(0.0, made.plan.horizon, 601)
     _slew_sky(sky, made, order, times)
-    dipoles, limit = 1e3 * made.plan.path.dipoles(times), 1e3 * float(made.task.craft.limit.min())
+    dipoles, limits = 1e3 * made.plan.path.dipoles(times), 1e3 * made.task.craft.limit
     panels.vectors(dipole, times, dipoles)
-    # The limit is drawn only near the curves, because a distant line would flatten the curves.
-    if np.abs(dipoles).max() > 0.3 * limit:
-        panels.level(dipole, -limit, "")
-        panels.level(dipole, limit, "limit")
-    panels.style(dipole, "dipole, mA m²", f"Dipole; the limit is {limit:.3g} mA m²", "")
+    text = ", ".join(f"{name} {limit:.3g}" for name, limit in zip("xyz", limits, strict=True))
+    # A limit is drawn only near the curves, because a distant line would flatten the curves.
+    for (name, colour), limit in zip(panels.AXIS_COLOURS.items(), limits.tolist(), strict=True):
+        if np.abs(dipoles).max() > 0.3 * limit:
+            panels.level(dipole, -limit, "", colour)
+            panels.level(dipole, limit, f"limit {name}", colour)
+    panels.style(dipole, "dipole, mA m²", f"Dipole; the limits are {text} mA m²", "")
     _slew_torque(torque, made, times)
     moments = made.plan.path.dipoles(times)
     power = np.sum(moments @ heat_matrix(made.task.craft.weights) * moments, axis=1)
@@ -416,9 +418,11 @@ def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
     ax.plot(times, 1e6 * across, color=panels.BLUE, linewidth=1.3, label="across the field")
     label = "along the field, not available"
     ax.plot(times, 1e6 * along, color=panels.VERMILLION, linewidth=1.3, label=label)
-    largest = 1e6 * size * float(craft.limit.min())
-    if 1e6 * across.max() > 0.3 * largest.min():
-        label = "limit of one coil across the field"
+    # The dipole across the field that makes this torque, as the largest share of the limit of a body axis.
+    share = np.max(np.abs(np.cross(field, torque)) / size[:, None] ** 2 / craft.limit, axis=1)
+    if share.max() > 0.3:
+        label = "limit across the field in this direction"
+        largest = 1e6 * across / np.where(share > 0.0, share, np.nan)
         ax.plot(times, largest, color=panels.GREY, linestyle=panels.DASHED, label=label)
     panels.style(ax, "torque, µN m", "Torque of the coils", "")
 

@@ -141,9 +141,9 @@ def legend(ax: Axes) -> None:
         )
 
 
-def level(ax: Axes, value: float, label: str) -> None:
+def level(ax: Axes, value: float, label: str, colour: str = VERMILLION) -> None:
     """Draw a dashed horizontal line at a target or a limit."""
-    ax.axhline(value, color=VERMILLION, linewidth=1.2, linestyle=DASHED, label=label)
+    ax.axhline(value, color=colour, linewidth=1.2, linestyle=DASHED, label=label)
 
 
 def vectors(ax: Axes, times: FloatArray, values: FloatArray) -> None:

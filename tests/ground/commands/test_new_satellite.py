@@ -159,7 +159,7 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
         (("--mass", "4", "--size", "300x100x100"), "--size 300x100x100: give a number from 0.02 to 3 m"),
         (
             ("--mass", "4", "--size", "big"),
-            "--size big: give three sides in m, such as 0.3x0.1x0.1, or one of 1u",
+            "--size big: give three sides in m, such as 0.3x0.1x0.1, or one of the CubeSats 1u, 1.5u",
         ),
         (("--mass", "400", "--size", "1u"), "--size 1u: 400 kg in this size is 3.52e+05 kg/m^3"),
         (("--altitude", "20000"), "--altitude 20000: give a number from 200 to 2000 km"),
@@ -331,3 +331,19 @@ def test_ctrl_c_shows_the_command_that_continues(tmp_path: Path) -> None:
     assert process.returncode == 130
     assert "nothing was written; to continue:\n  knightcube new-satellite --mass 4\n" in rest
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("size", "sides"),
+    [
+        ("1.5U", (0.1702, 0.1, 0.1)),
+        ("4u", (0.454, 0.1, 0.1)),
+        ("8U", (0.227, 0.2263, 0.2263)),
+        ("12U", (0.366, 0.2263, 0.2263)),
+        ("16u", (0.454, 0.2263, 0.2263)),
+        ("27U", (0.366, 0.3526, 0.3526)),
+    ],
+)
+def test_sizes_of_cubesats_are_known_in_either_case(size: str, sides: tuple[float, ...]) -> None:
+    (asked,) = (question for question in QUESTIONS if question.name == "size")
+    assert asked.read(size) == sides

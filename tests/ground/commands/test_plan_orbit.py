@@ -38,6 +38,18 @@ def test_a_slew_begins_in_its_start_and_ends_in_its_target_whose_length_is_mende
     )
 
 
+def test_each_axis_has_the_dipole_limit_of_its_own_coil(tmp_path: Path) -> None:
+    path = tmp_path / "unequal.yaml"
+    coils = ["{axis: [1, 0, 0], dipole_per_ampere: 0.648, resistance: 23.0, channels: [0, 1]}"]
+    coils += ["{axis: [0, 1, 0], dipole_per_ampere: 1.296, resistance: 23.0, channels: [2, 3]}"]
+    coils += ["{axis: [0, 0, 1], dipole_per_ampere: 0.324, resistance: 23.0, channels: [4, 5]}"]
+    path.write_text(f"extends: orbit\ncoils: {{windings: [{', '.join(coils)}]}}\n", encoding="utf-8")
+    words = ("plan", "--orbit", path, *PLAN[3:], "--from", "nadir", "--to", "sun", "--within", "200")
+    done = command(*words)
+    assert done.returncode == 0, done.stderr
+    assert "dipole limits: x 0.0959, y 0.1918, z 0.04795 A m^2\n" in done.stdout
+
+
 def test_the_picture_is_drawn_and_the_text_says_how_far_the_camera_keeps_from_the_earth(
     tmp_path: Path,
 ) -> None:
