@@ -339,6 +339,8 @@ MAKERS: Mapping[str, Callable[[Mapping[str, Any]], Command]] = {
 """Functions by packet name; each creates a command from the fields of such a packet."""
 
 
+_DEGREES = "deg"
+"""Unit of an angle in a command in words."""
 LONGEST = max(layout.length for layout in LAYOUTS.values())
 """Length (bytes) of the longest command packet. Longer packets are refused."""
 
@@ -416,18 +418,21 @@ def unpack(data: bytes) -> Command:
     return command_of(layout.packet, fields)
 
 
-def command_of_words(text: str) -> Command:
-    """Return the command of a line such as `slew 0.2`, `mode hold`, `safe end of pass` or `point sun`.
+def command_of_words(text: str, stored: bool = False) -> Command:
+    """Return the command of a line such as `slew 0.2` or `point ground 52.5deg 13.4deg roll 90deg`.
 
-    The line consists of the command's name and the values of its fields, in the order and units of the packet
-    definition. A state is written as its label. Omitted real numbers at the end of the line become NaN, and a
-    text field takes the rest of the line. Raises CommandError for an unknown command, for superfluous words
-    and for values out of range.
+    The line consists of the command's name and the values of its fields, in the order of the packet
+    definition. A state is written as its label, and an angle of `point` with its unit. Omitted real numbers
+    at the end of the line become NaN, and a text field takes the rest of the line. A line that an earlier
+    release `stored` may have angles in rad without a unit. Raises CommandError for an unknown command, for
+    superfluous words and for values out of range.
     """
     name, *words = text.split() or [""]
     if name not in LAYOUTS:
         raise CommandError(f"{name!r} is not a command: use {', '.join(LAYOUTS)}")
     packet = LAYOUTS[name].packet
+    if packet is POINT:
+        words = _by_fields(words, stored)
     fields: dict[str, Any] = {}
     for field in packet.fields:
         if field.kind.startswith("S"):
@@ -443,9 +448,40 @@ def command_of_words(text: str) -> Command:
     return command
 
 
+def _by_fields(words: list[str], stored: bool) -> list[str]:
+    """Return the words after `point` in the order and units of its fields."""
+    goal, numbers = words[:1], words[1:]
+    is_attitude = goal == [Goal.INERTIAL.label]
+    keyword = next((at for at, word in enumerate(numbers) if word in {"roll", "--roll"}), None)
+    if keyword is not None:
+        if len(numbers) != keyword + 2:
+            raise CommandError(f"roll needs one angle such as 90{_DEGREES}")
+        numbers = [*numbers[:keyword], *["nan"] * (4 - keyword), *numbers[keyword + 1 :]]
+    return goal + [
+        word if is_attitude and at < 4 else _in_radians(word, stored) for at, word in enumerate(numbers)
+    ]
+
+
+def _in_radians(word: str, stored: bool) -> str:
+    try:
+        if word.endswith(_DEGREES):
+            return repr(math.radians(float(word.removesuffix(_DEGREES))))
+    except ValueError:
+        raise CommandError(f"{word!r} is not an angle such as 52.5{_DEGREES}") from None
+    if stored or word == "nan":
+        return word
+    raise CommandError(f"{word!r} has no unit: give an angle such as 52.5{_DEGREES}")
+
+
 def words_of(command: Command) -> str:
     """Return the line for which `command_of_words` returns the given command, with numbers of 10 digits."""
     words = [command.packet.name]
+    if isinstance(command, Point):
+        target = command.target
+        angles = [f"{math.degrees(angle):.10g}{_DEGREES}" for angle in (*target.numbers, target.roll or 0.0)]
+        numbers = [f"{one:.10g}" for one in target.numbers] if target.goal is Goal.INERTIAL else angles[:-1]
+        roll = [] if target.roll is None else ["roll", angles[-1]]
+        return " ".join([*words, target.goal.label, *numbers, *roll])
     for field in command.packet.fields:
         value = command.fields[field.name]
         labels = dict(field.states)

@@ -437,7 +437,7 @@ class Scheduling:
                 text = f"not executed, {problem}: {text_of(entry)}"
                 yield Report(entry.spi, entry.counter, Stage.FAILED, SCHEDULE.name, text)
             else:
-                yield Sent(entry.spi, entry.counter, command_of_words(entry.command))
+                yield Sent(entry.spi, entry.counter, command_of_words(entry.command, stored=True))
 
     def _problem(self, entry: Entry, utc_ns: int) -> str:
         """Return why a due command must not be executed, or an empty text if it may be executed."""
@@ -446,7 +446,7 @@ class Scheduling:
         if self._mode == Mode.SAFE:
             return "only the ground may decide in mode SAFE"
         try:
-            command_of_words(entry.command)
+            command_of_words(entry.command, stored=True)
         except CommandError as error:  # the entry was scheduled by another software release
             return str(error)
         return ""
@@ -478,7 +478,7 @@ def utc_of(text: str) -> int:
 def text_of(entry: Entry) -> str:
     """Return the number, UTC and command of a schedule entry as text, with angles in degrees."""
     try:
-        text = command_of_words(entry.command).text
+        text = command_of_words(entry.command, stored=True).text
     except CommandError:  # the entry was scheduled by another software release
         text = entry.command
     return f"{entry.number}: {_utc(entry.at_ns)} {text}"

@@ -125,7 +125,12 @@ SCHEDULE = telecommand(
     0x220,
     "Execute a command at a time in UTC, also after a restart",
     Field("at", f"S{_LONGEST_UTC}", "-", "time in UTC, such as 2026-11-23T21:00:00"),
-    Field("words", f"S{LONGEST_COMMAND}", "-", "command in words, such as slew 0.2"),
+    Field(
+        "words",
+        f"S{LONGEST_COMMAND}",
+        "-",
+        "command in words, such as slew 0.2 or point ground 52.5deg 13.4deg roll 90deg",
+    ),
     hazard="executes the command later",
 )
 UNSCHEDULE = telecommand(

@@ -47,7 +47,7 @@ def test_the_schedule_consists_of_commands_that_can_be_sent(capsys: pytest.Captu
         assert isinstance(end, Scheduled)
         rise = datetime.fromisoformat(one["rise_utc"]).replace(tzinfo=None)
         assert abs(datetime.fromisoformat(begin.at) - (rise - timedelta(seconds=90))) < timedelta(seconds=1)
-        assert begin.words.startswith("point ground 0.916297857")
+        assert begin.words.startswith("point ground 52.5deg ")
         assert end.words == "point nadir"
 
 

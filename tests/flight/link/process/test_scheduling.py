@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -17,6 +18,7 @@ from flight.link.commands import (
     Slew,
     command_of_words,
     unpack,
+    words_of,
 )
 from flight.link.modes import Mode
 from flight.link.process import commanding, directives
@@ -92,7 +94,7 @@ def test_an_entry_of_another_release_that_fits_no_packet_is_reported_and_not_exe
 
 def test_the_answer_and_the_list_show_angles_in_degrees(link: BothEnds) -> None:
     at = in_seconds(link, 60)
-    counter = send(link, Scheduled(at, "point ground 0.9162979 0.2338741 nan nan 1.5707963"))
+    counter = send(link, Scheduled(at, "point ground 52.5deg 13.4deg roll 90deg"))
     assert (
         texts(link, counter)[0]
         == f"at {at}: point ground latitude 52.5000, longitude 13.4000 deg, roll 90 deg"
@@ -278,9 +280,30 @@ def test_words_are_read_by_the_table() -> None:
     assert command_of_words("safe end of pass") == ChangeMode(Mode.SAFE, "end of pass")
     assert command_of_words("mode hold") == ChangeMode(Mode.HOLD)
     assert command_of_words("point sun") == Point(PointingTarget(Goal.SUN, (), None))
-    for wrong in ("", "mode up", "ping", "ping x", "slew 0.1 0.2"):
+    for wrong in ("", "mode up", "ping", "ping x", "slew 0.1 0.2", "point sun roll"):
         with pytest.raises(CommandError):
             command_of_words(wrong)
+
+
+def test_angles_in_words_have_their_unit() -> None:
+    target = PointingTarget(Goal.GROUND, (math.radians(52.5), math.radians(-13.4)), math.radians(90.0))
+    for words in ("point ground 52.5deg -13.4deg roll 90deg", "point ground 52.5deg -13.4deg --roll 90deg"):
+        assert command_of_words(words) == Point(target)
+    assert words_of(Point(target)) == "point ground 52.5deg -13.4deg roll 90deg"
+    for wrong in (
+        "point ground 0.91 0.23",
+        "point nadir roll 90",
+        "point inertial 0 0 0 1 0.5",
+        "point sun roll xdeg",
+    ):
+        with pytest.raises(CommandError, match="deg"):
+            command_of_words(wrong)
+
+
+def test_a_line_that_an_earlier_release_stored_has_angles_in_rad() -> None:
+    assert command_of_words("point ground 0.5 0.2 nan nan 1.5", stored=True) == Point(
+        PointingTarget(Goal.GROUND, (0.5, 0.2), 1.5)
+    )
 
 
 def label(link: BothEnds, utc_ns: int) -> bytes:
