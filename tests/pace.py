@@ -7,9 +7,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 
+Result = TypeVar("Result")
+_warm: set[str] = set()
+"""Names of the calls that this process has made."""
 ORDINARY_PACE_S = 4.5e-4
 """Processor time of `pace_s` on the two-core machines that the limits are meant for."""
 
@@ -21,6 +25,19 @@ def pace_s() -> float:
     for _ in range(1_000):
         np.add(vector, vector)
     return time.process_time() - begun
+
+
+def warm_call(name: str, call: Callable[[], Result]) -> tuple[Result, float]:
+    """Return the result of `call` and its processor time (s), without the loading of code.
+
+    The first call of this `name` in a process loads modules and compiled kernels, so it is made twice.
+    """
+    if name not in _warm:
+        _warm.add(name)
+        call()
+    begun = time.process_time()
+    result = call()
+    return result, time.process_time() - begun
 
 
 def ordinary_seconds(work: Callable[[], object], runs: int = 3) -> float:

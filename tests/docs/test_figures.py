@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
+from sim_hal.star_camera import StarCameraModel
 from tests.docs.blocks import ROOT
+from tests.support.scenes import EXPOSURES, FIELD
 
 
 def _rows(page: str) -> dict[str, list[str]]:
@@ -19,6 +23,13 @@ def test_the_thesis_s_power_stands_beside_the_power_from_the_supply(page: str) -
     rows = [first for first, others in _rows(page).items() if "0.10 W" in others]
     assert rows
     assert all("from the supply" in first and "R I²" not in first for first in rows)
+
+
+def test_the_page_of_streaks_states_the_camera_of_its_campaigns() -> None:
+    camera, (short, long) = StarCameraModel(field_of_view=FIELD), EXPOSURES
+    head = (ROOT / "docs/results/streaks.md").read_text(encoding="utf-8").partition("\n## ")[0]
+    assert f"{camera.columns} x {camera.rows} pixels over {math.degrees(FIELD):.0f} degrees" in head
+    assert f"exposures of {short:g} and {long:g} s" in head
 
 
 def test_the_readme_has_the_figures_of_the_results_page() -> None:

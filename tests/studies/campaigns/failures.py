@@ -14,7 +14,6 @@ minimum length, the rate cannot be determined, and a refusal is right.
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections import Counter
 from collections.abc import Sequence
@@ -31,6 +30,7 @@ from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
+from tests.pace import warm_call
 from tests.support.scenes import FIELD, RandomSlew, Scene, usable
 
 WRONG_SIGMAS = 6.0
@@ -61,9 +61,10 @@ def run(case: Case) -> Result:
     settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, knowledge=EXACT)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        begun = time.process_time()
-        found = estimate_motion(scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0)
-        spent = time.process_time() - begun
+        found, spent = warm_call(
+            "failures",
+            lambda: estimate_motion(scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0),
+        )
     good = usable(scene, camera)
     true_length = float(np.median(_path_lengths(scene)[good]))
     return {

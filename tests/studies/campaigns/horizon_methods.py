@@ -11,7 +11,6 @@ half a degree off, far wrong more than five.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,6 +36,7 @@ from knightcube.vision.horizon.limb import MEAN_RADIUS
 from knightcube.vision.horizon.nadir import find_nadir, nadir_of_cameras
 from knightcube.vision.horizon.settings import HorizonKnowledge, SensedDirection
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
+from tests.pace import warm_call
 from tests.sim_hal.earth_camera.scenes import DAY, NIGHT, pointing, random_direction
 from tests.studies.campaigns.nadir import WRONG_DEG
 from tests.support.earth_truth import limb_truth
@@ -101,11 +101,9 @@ def run(case: Case) -> Result:
     known = before.camera_matrix @ (-position / np.linalg.norm(position))
     answers = {}
     for name, ask in _methods(model, cameras, frames, earlier, knowledge, known).items():
-        begun = time.process_time()
-        found = ask()
-        spent = 1e3 * (time.process_time() - begun)
+        found, spent = warm_call(name, ask)
         off = None if found is None else float(np.degrees(np.arccos(np.clip(found @ truth, -1.0, 1.0))))
-        answers[name] = {"error_deg": off, "milliseconds": spent}
+        answers[name] = {"error_deg": off, "milliseconds": 1e3 * spent}
     return {**case.parameters, "seed": list(case.seed), "answers": answers}
 
 

@@ -11,9 +11,8 @@ please.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from knightcube.reference.star_identification import METHODS, StarMotion, identi
 from knightcube.reference.star_tables import KnownSky, angles
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.index.build import default_index
+from tests.pace import warm_call
 from tests.support.star_lists import PIXELS, ListKind, StarList, draw
 
 NOMINAL: dict[str, float] = {
@@ -82,9 +82,7 @@ def run(case: Case) -> Result:
     field, motion = drawn.field(), moving(drawn, generator)
     result: Result = {**case.parameters, "stars": len(field)}
     for name in METHODS:
-        begun = time.process_time()
-        answer = answer_of(name, field, sky, motion)
-        spent = time.process_time() - begun
+        answer, spent = warm_call(name, partial(answer_of, name, field, sky, motion))
         result[name] = {"verdict": verdict(answer, drawn), "ms": 1000.0 * spent}
     return result
 

@@ -12,7 +12,6 @@ An accepted answer more than half a degree off is wrong; refused and ambiguous f
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections import Counter
 from collections.abc import Sequence
@@ -25,6 +24,7 @@ import numpy as np
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir
 from sim_hal.earth_camera import nadir, render
+from tests.pace import warm_call
 from tests.sim_hal.earth_camera.scenes import random_scene
 from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings, random_air
 
@@ -56,9 +56,7 @@ def run(case: Case) -> Result:
     knowledge, settings = coarse_knowledge(scene, generator), finder_settings(model, air)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        begun = time.process_time()
-        found = find_nadir(frame, model.lens, knowledge, settings)
-        spent = time.process_time() - begun
+        found, spent = warm_call("nadir", lambda: find_nadir(frame, model.lens, knowledge, settings))
     result: Result = {
         **case.parameters,
         "seed": list(case.seed),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +17,7 @@ from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
+from tests.pace import warm_call
 from tests.support.scenes import SAMPLES, catalogue
 
 EXPOSURE = 0.5
@@ -91,15 +91,17 @@ def _motion(generator: np.random.Generator, place: FloatArray) -> FloatArray:
 
 def look(pixels: Image, camera: StarCameraModel, rate: FloatArray) -> tuple[ObjectReport | None, float]:
     """Return the report on a frame, by the likelihood's rotation, and the processor seconds of both."""
+    return warm_call("rso", lambda: _look(pixels, camera, rate))
+
+
+def _look(pixels: Image, camera: StarCameraModel, rate: FloatArray) -> ObjectReport | None:
     settings = StreakSettings(saturation=float(camera.highest_count), gain=camera.gain)
-    begun = time.process_time()
     likelihood = LikelihoodSettings(saturation=settings.saturation, gain=settings.gain, line_time=0.0)
     motion = estimate_motion(pixels, camera.pinhole, EXPOSURE, likelihood, rate, 0.0)
     if motion.rate is None:
-        return None, time.process_time() - begun
+        return None
     turn = motion.rate * EXPOSURE
-    report = detect(pixels, camera.pinhole, turn, EXPOSURE, settings, ObjectSettings())
-    return report, time.process_time() - begun
+    return detect(pixels, camera.pinhole, turn, EXPOSURE, settings, ObjectSettings())
 
 
 def match(report: ObjectReport | None, truth: FloatArray | None) -> Found:
