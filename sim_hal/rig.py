@@ -129,7 +129,12 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
         served.release(epoch_ns, faults)
 
     cameras = served.cameras
-    rig = Rig(served.clock, served.wires, release, True, section.seed, reach=reach, cameras=cameras)
+    rig = Rig(
+        *(served.clock, served.wires, release, True, section.seed),
+        reach=reach,
+        cameras=cameras,
+        lateness=served.lateness,
+    )
     return with_host_faults(rig, section)
 
 
@@ -427,6 +432,11 @@ class Served:
     def release(self, epoch_ns: int, faults: Sequence[str] = ()) -> None:
         """Release the body at `epoch_ns` and schedule the faults of the flight."""
         self.bus.call("release", epoch_ns, list(faults), os.getpid())
+
+    def lateness(self) -> tuple[int, float]:
+        """Return the number of late events since the release, and the largest lateness, s. Raises OSError."""
+        late, latest_ns = self.bus.call("lateness")
+        return int(late), 1e-9 * latest_ns
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -235,9 +235,12 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
         if not loop.restart:
             release.end()
         ending = loop.ending()
+        late = None
+        with suppress(OSError):  # the emulated devices have ended before the flight
+            late = rig.lateness() if rig.lateness is not None else None
     faults = () if config.simulation is None else injected_faults(opened.request, text)
     folder, error = opened.request.out, opened.log.error()
-    return RunResult(folder, reason, signals.received, error, ending, loop.restart, faults)
+    return RunResult(folder, reason, signals.received, error, ending, loop.restart, faults, late)
 
 
 def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Opened:

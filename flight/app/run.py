@@ -46,7 +46,7 @@ class RunResult:
 
     The attribute `ending` is the state of the loop at the end of the flight. The text `restart` states why
     the process should be restarted; it is empty if no restart is needed. The attribute `faults` contains the
-    text of each injected fault.
+    text of each injected fault. The attribute `devices_late` is the result of `Rig.lateness`.
     """
 
     folder: Path
@@ -56,6 +56,7 @@ class RunResult:
     ending: FlightEnding
     restart: str = ""
     faults: tuple[str, ...] = ()
+    devices_late: tuple[int, float] | None = None
 
 
 def utc_ns() -> int:

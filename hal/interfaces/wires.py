@@ -15,6 +15,8 @@ from hal.interfaces.devices import FrameSource
 from hal.interfaces.guardian import CoilReach
 
 SECOND_NS = 1_000_000_000
+LATE_NS = 25_000_000
+"""Lateness (ns) of an emulated device that a flight can notice: the period of a control cycle."""
 
 
 class Ticker(Protocol):
@@ -178,6 +180,8 @@ class Rig:
         host: simulated faults inside the flight process, None for no faults.
         cameras: emulated cameras, first the star camera, if fitted; None if the drivers open real cameras.
         earliest_utc_ns: UTC (ns since 1970) before the flight, by which a GPS receiver's week is resolved.
+        lateness: function that returns how often emulated devices in real time were later than `LATE_NS`, and
+            their largest lateness, s; None for other devices.
     """
 
     clock: Clock
@@ -190,3 +194,4 @@ class Rig:
     host: HostFaults | None = None
     cameras: tuple[FrameSource | None, ...] | None = None
     earliest_utc_ns: int = 0
+    lateness: Callable[[], tuple[int, float]] | None = None

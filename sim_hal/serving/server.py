@@ -26,6 +26,7 @@ from flight.schema.devices import Camera
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.interfaces.errors import DeviceError
+from hal.interfaces.wires import LATE_NS
 from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.assembly import (
     Hardware,
@@ -123,6 +124,7 @@ class DeviceServer:
         self.lines = {name: line.name for name, line in self._lines.items()}
         self._faults_drawn = fault_generator(section.seed)
         self._frames_sent = 0
+        self._late = self._latest_ns = 0  # number of late events since the release, and the largest lateness
         self._served_anybody = False
         self._selector = selectors.DefaultSelector()
         self._connections: dict[int, _DeviceClient] = {}
@@ -155,7 +157,7 @@ class DeviceServer:
                 return
             for pty in self._lines.values():
                 pty.exchange(now_ns)
-            self.hardware.simulation.advance_to(now_ns)
+            self._advance(now_ns)
             self._deliver_frames()
             due_ns = min(
                 self.hardware.simulation.next_event_ns(),
@@ -168,8 +170,15 @@ class DeviceServer:
                 elif key.fd in self._connections:
                     self._serve_client(self._connections[key.fd])
                 elif key.data is not None:
-                    self.hardware.simulation.advance_to(self._clock.now_ns())
+                    self._advance(self._clock.now_ns())
                     key.data()
+
+    def _advance(self, now_ns: int) -> None:
+        """Process the events of the devices up to the present, and count those that come late."""
+        late_ns = now_ns - self.hardware.simulation.next_event_ns()
+        self._late += late_ns > LATE_NS
+        self._latest_ns = max(self._latest_ns, late_ns)
+        self.hardware.simulation.advance_to(now_ns)
 
     def close(self) -> None:
         """Release everything."""
@@ -213,7 +222,7 @@ class DeviceServer:
             connection.line.close()
             return
         for number, name, *arguments in requests:
-            self.hardware.simulation.advance_to(self._clock.now_ns())
+            self._advance(self._clock.now_ns())
             try:
                 result = self._operations()[name](connection, *arguments)
             except OSError as error:
@@ -251,6 +260,7 @@ class DeviceServer:
             "exchange": exchange,
             "spi": spi,
             "release": lambda _, *a: self.release(*a),
+            "lateness": lambda _: [self._late, self._latest_ns],
             "currents": lambda _: self.hardware.circuit.currents().tolist(),
             "trigger": trigger,
         }
@@ -258,6 +268,7 @@ class DeviceServer:
     def release(self, epoch_ns: int, faults: Sequence[str] = (), flight_process: int | None = None) -> None:
         """Release the body and schedule the faults of a flight process."""
         self.hardware.release(epoch_ns)
+        self._late = self._latest_ns = 0
         generator = self._faults_drawn
         line, gps_line = (
             cast(PtyLine, self.hardware.wires.line_of(kind)) for kind in ("inertial_unit", "gps")

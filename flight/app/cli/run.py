@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from flight.app.cli import PROGRAM
 from flight.app.run import RunRequest, RunResult
 from flight.schema.document import config_path, names
+from hal.interfaces.wires import LATE_NS
 from knightcube.errors import FlightError
 
 if TYPE_CHECKING:  # see `flight.app.run`
@@ -32,6 +33,12 @@ def summary_text(result: RunResult, elapsed: float) -> str:
     ]
     if result.faults:
         lines.append(("injected", "; ".join(result.faults)))
+    if result.devices_late is not None and result.devices_late[0]:
+        count, longest = result.devices_late
+        text = (
+            f"emulated devices late by more than {1e-6 * LATE_NS:g} ms {count} times, at most {longest:.2f} s"
+        )
+        lines.append(("devices", f"{text}: gaps in their readings are not the flight's fault"))
     lines += [("log", str(result.folder)), ("next", f"{PROGRAM} report {result.folder}")]
     return "".join(f"{name + ':':10}{text}\n" for name, text in lines)
 
@@ -55,6 +62,8 @@ def summary_facts(result: RunResult, elapsed: float) -> dict[str, Any]:
         "coils_left_out": ending.coils_left_out,
         "log_error": result.log_error or None,
         "faults": result.faults,
+        "devices_late": result.devices_late and result.devices_late[0],
+        "devices_latest_s": result.devices_late and result.devices_late[1],
     }
 
 

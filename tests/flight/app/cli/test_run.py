@@ -68,6 +68,15 @@ def test_the_json_facts_hold_the_ending() -> None:
     assert summary_facts(RESULT, 1.0)["log_error"] is None
 
 
+def test_the_summary_states_late_emulated_devices() -> None:
+    assert "devices:" not in summary_text(RESULT, 1.0)
+    assert "devices:" not in summary_text(replace(RESULT, devices_late=(0, 0.012)), 1.0)
+    late = replace(RESULT, devices_late=(7, 0.341))
+    assert "emulated devices late by more than 25 ms 7 times, at most 0.34 s: " in summary_text(late, 1.0)
+    assert summary_facts(late, 1.0)["devices_late"] == 7
+    assert summary_facts(RESULT, 1.0)["devices_late"] is None
+
+
 @pytest.mark.parametrize(
     ("change", "status", "complaint"),
     [
