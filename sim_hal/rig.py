@@ -57,7 +57,7 @@ from sim_hal.faults.catalogue import listing
 from sim_hal.faults.host import corrupted_by, host_faults
 from sim_hal.faults.schedule import check, put, scheduled
 from sim_hal.serving.device_link import DeviceLink, RemoteI2cBus
-from sim_hal.settings import Simulation
+from sim_hal.settings import CageTruth, FreeBodySection, Simulation
 from sim_hal.worlds.world import BodyMotion, TruthRecorder, WorldInputs, make_world
 
 PATIENCE_S = 5.0
@@ -141,12 +141,15 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
 def check_elements(request: SimulationRequest, config: Config) -> None:
     """Raise ConfigError if the elements of a satellite or of a cage do not fit the simulated orbit."""
     section = request.section()
+    lines: tuple[str, str] | None
+    described: FreeBodySection | CageTruth | None
     if isinstance(config, OrbitConfig):
         name, lines, world, described = "elements", config.elements, "free_body", section.free_body
         cure = "`knightcube elements --config FILE` makes elements of the simulated orbit"
     else:
         cage = cast(TestbedConfig, config).cage
-        name, lines, world, described = "cage.elements", cage and cage.elements, "cage", section.cage
+        lines = None if cage is None else cage.elements
+        name, world, described = "cage.elements", "cage", section.cage
         cure = "`knightcube elements --altitude KM` makes elements of this orbit"
     if lines is None or described is None:
         return
@@ -434,7 +437,7 @@ class Served:
         self.bus.call("release", epoch_ns, list(faults), os.getpid())
 
     def lateness(self) -> tuple[int, float]:
-        """Return the number of late events since the release, and the largest lateness, s. Raises OSError."""
+        """Return how many events were late since the release, and the largest lateness, s. Raises OSError."""
         late, latest_ns = self.bus.call("lateness")
         return int(late), 1e-9 * latest_ns
 

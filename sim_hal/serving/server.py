@@ -124,7 +124,7 @@ class DeviceServer:
         self.lines = {name: line.name for name, line in self._lines.items()}
         self._faults_drawn = fault_generator(section.seed)
         self._frames_sent = 0
-        self._late = self._latest_ns = 0  # number of late events since the release, and the largest lateness
+        self._late = self._latest_ns = 0  # events that were late since the release, and the largest lateness
         self._served_anybody = False
         self._selector = selectors.DefaultSelector()
         self._connections: dict[int, _DeviceClient] = {}
