@@ -16,7 +16,7 @@ from tests.scenario.mode_flights import modes_of
 from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
-DURATION, SUNWARD = 60.0, 45.0
+DURATION, SUNWARD = 52.0, 47.0
 """s: the flight, and when the mode SUN is commanded."""
 SPEED = 0.001
 """rad/s, the orbit's own: the body keeps what it has while the field lets the coils act."""

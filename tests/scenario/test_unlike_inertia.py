@@ -38,14 +38,14 @@ def _flown(folder: Path, duration: float, fault: str) -> Run:
 
 def test_moments_two_percent_off_isolate_no_healthy_coil(tmp_path: Path) -> None:
     """Of this flight the believed inertia alone made coils y and z look reversed, at 48 and 88 s."""
-    found = coil_judgement(_flown(tmp_path, 110.0, ""), "")
+    found = coil_judgement(_flown(tmp_path, 95.0, ""), "")
     assert found["healthy_isolated"] == []
     assert found["healthy_suspected"] == found["healthy_corrected"] == []
 
 
 @pytest.mark.parametrize("axis", "yz")
 def test_a_coil_reversed_in_the_tumble_is_soon_flown_with_its_sign_changed(tmp_path: Path, axis: str) -> None:
-    flown = _flown(tmp_path, 60.0, f"coil-{axis}: reversed")
+    flown = _flown(tmp_path, 42.0, f"coil-{axis}: reversed")
     found = coil_judgement(flown, axis)
     assert found["corrected_s"] is not None
     assert found["corrected_s"] < 30.0

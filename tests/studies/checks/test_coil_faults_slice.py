@@ -26,8 +26,11 @@ def test_a_broken_coil_misleads_the_estimate_for_less_than_a_quarter_of_a_second
     ["orbit tumble reversed 0", "orbit_3u tumble open 0", "orbit slow reversed 1"],
 )
 def test_a_broken_coil_of_an_unlike_body_is_handled_soon_and_no_healthy_coil_is_judged(
-    key: str, tmp_path: Path
+    key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for kind in unlike_inertia.DURATIONS:
+        seconds = unlike_inertia.TEST_INTERVAL if "slow" in kind else unlike_inertia.SOON
+        monkeypatch.setitem(unlike_inertia.DURATIONS, kind, seconds)
     (case,) = (case for case in unlike_inertia.cases(2, 7) if case.key == key)
     result = unlike_inertia.run(case)
     assert result["handled_s"] is not None

@@ -119,7 +119,7 @@ def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Number 97 of seed 3: they taught a bias of 0.5 deg/s, from which each attitude began again in vain."""
-    found = refly(monkeypatch, 3, 97, "wide: wrong", "acquire", 70.0)
+    found = refly(monkeypatch, 3, 97, "wide: wrong", "acquire", 48.0)
     assert found["event"] == "wide-false"
     assert found["works"]
     assert found["beyond_s"] == 0.0
