@@ -34,7 +34,7 @@ def printed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 @pytest.fixture(scope="module")
 def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = tmp_path_factory.mktemp("demonstration") / "run"
-    words = [sys.executable, "-m", "flight", "run", CONFIG, "--out", folder]
+    words: list[str | Path] = [sys.executable, "-m", "flight", "run", CONFIG, "--out", folder]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return read_run(folder)
