@@ -41,10 +41,13 @@ from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
     PATHS_PER_LENGTH,
     Explanation,
+    LocatedEnds,
+    Patch,
     StarLight,
     brightest_left,
     cut_patch,
     fit_stars,
+    region_along,
 )
 from knightcube.vision.objects.streak_ends import (
     Segmented,
@@ -57,7 +60,7 @@ from knightcube.vision.objects.streak_ends import (
     near_border,
     segment_frame,
 )
-from knightcube.vision.objects.streak_images import at_mid_exposure
+from knightcube.vision.objects.streak_images import at_mid_exposure, pixels_near, star_path
 
 INDICATORS = ("centre", "displacement", "residual")
 """Names of the three indicators that show that a streak is not a star."""
@@ -265,6 +268,7 @@ class SpaceObject:
     Attributes:
         endpoints: ends of the object's streak (2, 2), px, in the order in time for which the motion relative
             to the stars is slower.
+        sigma: standard deviation of each end (2,), px, along the axis of the larger error.
         fired: names of the indicators that exceed their thresholds; empty if the object was found by its
             pixels only.
         flux: flux of the object, counts.
@@ -276,12 +280,18 @@ class SpaceObject:
     """
 
     endpoints: FloatArray
+    sigma: FloatArray
     fired: tuple[str, ...]
     flux: float
     improvement: float
     relative_rate: float
     direction: FloatArray
     other_relative_rate: float
+
+    @property
+    def middle_sigma(self) -> float:
+        """The standard deviation per axis of the midpoint of the streak, px."""
+        return 0.5 * float(np.hypot(*self.sigma))
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,6 +319,14 @@ _LEAST_CROSSING_PX = 10.0
 _FITTED_PX = 1.0
 # Number of trial star paths per path length in the first test of whether stars explain the pixels.
 _FEW_PATHS = 2
+# Chi-square per pixel along an object's streak below which its ends and its stars are not located again.
+_GOOD_FIT = 1.4
+# Largest excess of chi-square over its expected value beside an object, relative to the decrease of
+# chi-square by the object: for any object, and for an object whose streak resembles a star's.
+_MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
+# Distance from a star's path at which its light falls below the noise beyond that of its Gaussian profile,
+# in standard deviations of the PSF.
+_DIM_SIGMAS = 2.0
 # Minimum distance (px) from the image border at which the ends of a region count as inside the image.
 _BORDER_PX = 2
 
@@ -354,15 +372,16 @@ class Judge:
             return Judgement(Verdict.STAR)
         try:
             light = self._light(ends, per_length=_FEW_PATHS)
-            if self._only_stars(light, self.objects.improvement):
-                return Judgement(Verdict.STARS, light=light)
+            if self._gained(light, light.explain(ends)) < self.objects.improvement:
+                if self._only_stars(light, self.objects.improvement):
+                    return Judgement(Verdict.STARS, light=light)
+                return self._stars_or_unclear(self._light(ends))
             light = self._light(ends)
-            found = light.explain(ends)
+            candidate = self._candidate(ends, fired, light, (), self.objects.improvement)
         except FlightError:
             return Judgement(Verdict.UNCLEAR)
-        if self._is_object(light, found, self.objects.improvement):
-            candidate = self._candidate(ends, fired, light, found)
-            return Judgement(Verdict.UNCLEAR if candidate is None else Verdict.OBJECT, candidate)
+        if candidate is not None:
+            return Judgement(Verdict.OBJECT, candidate)
         return self._stars_or_unclear(light)
 
     def crowd(self, corners: FloatArray) -> Judgement:
@@ -384,10 +403,10 @@ class Judge:
             return Judgement(Verdict.UNCLEAR)
         if not tried:
             return self._stars_or_unclear(light)
-        ends, found = min(tried, key=lambda one: one[1].chi_square)
-        if self._is_object(light, found, enough) and not self._moves_like_a_star(ends):
-            candidate = self._candidate(ends, (), light, found)
-            return Judgement(Verdict.UNCLEAR if candidate is None else Verdict.OBJECT, candidate)
+        ends, _ = min(tried, key=lambda one: one[1].chi_square)
+        candidate = None if self._moves_like_a_star(ends) else self._candidate(ends, (), light, (), enough)
+        if candidate is not None:
+            return Judgement(Verdict.OBJECT, candidate)
         return self._stars_or_unclear(light)
 
     def explained(self, judged: Judgement, label: int) -> bool:
@@ -395,6 +414,20 @@ class Judge:
         if judged.light is None:
             return False
         return judged.light.excess(self._pixels_of(label)) < self.objects.crossing_improvement
+
+    def has_other_light(self, ends: FloatArray, label: int) -> bool:
+        """Return whether a region has significant light beside the path of the star with the given ends."""
+        region = self._pixels_of(label)
+        rows, columns = self.segmented.signal.shape
+        signal = self.segmented.signal[region[:, 1], region[:, 0]].astype(np.float64)
+        noise = self.segmented.background.typical_noise
+        brightness = max(float(np.percentile(signal, 90.0)), noise)
+        reach = self.objects.psf_sigma * (_DIM_SIGMAS + float(np.sqrt(2.0 * np.log(brightness / noise))))
+        middle = self.pinhole.unit_vectors(ends.mean(axis=0)[None])[0]
+        near = pixels_near(star_path(middle, self.rotation, 0.5, self.pinhole), reach, rows, columns)
+        beside = ~np.isin(region[:, 1] * columns + region[:, 0], near[:, 1] * columns + near[:, 0])
+        other = float(np.maximum(signal[beside], 0.0).sum())
+        return other >= self.objects.point_significance * noise * float(np.sqrt(beside.sum() + 1.0))
 
     def _stars_fill(self, label: int) -> bool:
         """Return whether few stars near the axis of a region explain all light of the region."""
@@ -441,14 +474,7 @@ class Judge:
         for index in indices[order].tolist():
             if self._stars_fill(int(regions.label[index])):
                 continue
-            patch = cut_patch(
-                self.segmented,
-                regions,
-                index,
-                self.objects.psf_sigma,
-                self.settings.gain,
-                self.settings.saturation or np.inf,
-            )
+            patch = self._patch(index)
             stars, left = fit_stars(patch, self.rotation, self.pinhole)
             if patch.excess(left) < self.objects.crossing_improvement:
                 continue
@@ -469,15 +495,12 @@ class Judge:
             return None
         enough = self.objects.crossing_improvement
         try:
-            if self._only_stars(self._light(ends, stars, _FEW_PATHS), enough):
+            few = self._light(ends, stars, _FEW_PATHS)
+            if self._gained(few, few.explain(ends)) < enough:
                 return None
-            light = self._light(ends, stars)
-            if light.chi_square - light.pixels < enough:
-                return None
-            found = light.explain(ends)
+            return self._candidate(ends, (), self._light(ends, stars), stars, enough)
         except FlightError:
             return None
-        return self._candidate(ends, (), light, found) if self._is_object(light, found, enough) else None
 
     def _only_stars(self, few: StarLight, enough: float) -> bool:
         """Return whether few trial stars explain the pixels, as more trial stars then do as well.
@@ -503,13 +526,24 @@ class Judge:
             per_length,
         )
 
-    def _is_object(self, light: StarLight, found: Explanation, improvement: float) -> bool:
-        """Return whether an object improves chi-square enough and explains the pixels along its streak."""
-        enough = light.chi_square - found.chi_square >= improvement
-        most = found.misfit <= 0.5 * found.misfit_of_stars
+    def _gained(self, light: StarLight, found: Explanation) -> float:
+        """Return the decrease of chi-square when an object is added to a model of stars."""
+        return light.chi_square - found.chi_square
+
+    def _is_object(self, light: StarLight, found: Explanation, improvement: float, uniform: bool) -> bool:
+        """Return whether an object improves chi-square enough and explains the pixels along its streak.
+
+        A streak that differs from a star's only near its ends fits nearly as well as a star along its length.
+        If the streak is `uniform`, it suffices that the object explains nearly all light that stars do not
+        explain. An object that explains little of this light is no object.
+        """
+        gained = self._gained(light, found)
+        remains = found.chi_square - light.expected
+        most = found.misfit <= 0.5 * found.misfit_of_stars and remains <= _MOST_UNEXPLAINED * gained
+        most |= uniform and remains <= _LEAST_UNEXPLAINED * gained
         # A saturated point has a position error of 0.1 px, so that residuals in its wings exceed the noise.
         fits = found.misfit <= max(self.objects.worst_fit, 0.1 * found.misfit_of_stars)
-        return enough and most and fits
+        return gained >= improvement and most and fits
 
     def _stars_or_unclear(self, light: StarLight) -> Judgement:
         stars = light.chi_square <= self.objects.worst_fit * light.pixels
@@ -522,20 +556,72 @@ class Judge:
         return bool(missed < within)
 
     def _candidate(
-        self, ends: FloatArray, fired: tuple[str, ...], light: StarLight, found: Explanation
+        self,
+        ends: FloatArray,
+        fired: tuple[str, ...],
+        light: StarLight,
+        stars: Sequence[FloatArray],
+        improvement: float,
     ) -> SpaceObject | None:
         """Return the object between `ends`, ordered such that the motion relative to the stars is slower.
 
-        Returns None if the streak is dark near an end, because that end is then wrong by many pixels.
+        The ends are located by all light of the streak. If the known `stars` leave light along the streak,
+        the stars of the region are fitted. Returns None if the located streak is a star's, or if stars
+        explain its pixels.
         """
-        if not light.lit_to_ends(ends):
+        located = self._located(ends, light, stars, improvement)
+        if not stars and (located is None or located[2].misfit > _GOOD_FIT):
+            stars = self._stars_along(ends)
+            again = self._located(ends, self._light(ends, stars), stars, improvement) if stars else None
+            if again is not None and (located is None or again[2].misfit < located[2].misfit):
+                located = again
+        if located is None:
             return None
+        found_ends, light, found = located
+        ends, sigma = found_ends.ends, found_ends.sigma
         rate, direction = self._among_stars(ends)
         other, other_direction = self._among_stars(ends[::-1])
         if other < rate:
             ends, rate, other, direction = ends[::-1], other, rate, other_direction
-        improvement = light.chi_square - found.chi_square
-        return SpaceObject(ends, fired, found.flux, improvement, rate, direction, other)
+            sigma = sigma[::-1]
+        gained = self._gained(light, found)
+        return SpaceObject(ends, sigma, fired, found.flux, gained, rate, direction, other)
+
+    def _located(
+        self, ends: FloatArray, light: StarLight, stars: Sequence[FloatArray], improvement: float
+    ) -> tuple[LocatedEnds, StarLight, Explanation] | None:
+        """Return the located ends of an object, and how well stars and object explain its pixels, or None."""
+        best = None
+        for among_stars in (True, False):
+            located = light.located(ends, among_stars)
+            if located is not None and (best is None or located.misfit < best.misfit):
+                best = located
+            if best is not None and best.misfit <= _GOOD_FIT:
+                break
+        if best is None:
+            best = LocatedEnds(ends, np.full(2, np.sqrt(2.0) * self.objects.streak_sigma), np.inf)
+        else:
+            best = replace(best, sigma=np.hypot(best.sigma, self.objects.end_floor))
+            light = self._light(best.ends, stars)
+        found = light.explain(best.ends)
+        uniform = best.misfit <= _GOOD_FIT
+        if self._moves_like_a_star(best.ends, _FITTED_PX):
+            return None
+        if not self._is_object(light, found, improvement, uniform):
+            return None
+        return best, light, found
+
+    def _stars_along(self, ends: FloatArray) -> list[FloatArray]:
+        """Return the paths (m, 2), px, of the stars in the region along a line between `ends` (2, 2), px."""
+        regions = self.segmented.regions
+        index = np.flatnonzero(regions.label == region_along(self.segmented, ends))
+        return fit_stars(self._patch(int(index[0])), self.rotation, self.pinhole)[0] if len(index) else []
+
+    def _patch(self, index: int) -> Patch:
+        """Return the patch of the frame around the region `index`."""
+        saturation = self.settings.saturation or np.inf
+        psf_sigma, gain = self.objects.psf_sigma, self.settings.gain
+        return cut_patch(self.segmented, self.segmented.regions, index, psf_sigma, gain, saturation)
 
     def _among_stars(self, ends: FloatArray) -> tuple[float, FloatArray]:
         """Return the rate, rad/s, and the image direction (2,) of a motion relative to the stars.
@@ -599,7 +685,8 @@ def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Str
     for label, streak, deviation, fired in each:
         names = tuple(name for name, fires in zip(INDICATORS, fired, strict=True) if fires)
         judged.append(judge.streak(streak, names))
-        calm = judged[-1].verdict is Verdict.OBJECT or np.abs(deviation).max() <= _STRANGE
+        calm = np.abs(deviation).max() <= _STRANGE and not judge.has_other_light(streak, label)
+        calm |= judged[-1].verdict is Verdict.OBJECT
         (settled if calm else strange).append(label)
     for index, corners in streaks.crowded:
         judged.append(judge.crowd(corners))
@@ -670,7 +757,7 @@ def detect_objects(
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
     # The angle that a pixel subtends on the boresight, the largest angle, is used for all directions.
-    sigma = settings.streak_sigma / camera.focal_length
+    sigma = np.array([item.middle_sigma for item in objects]) / camera.focal_length
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     reason = f"fewer than {ends.least_streaks} significant streaks" if report is None else ""
-    return DetectedObjects(objects, directions, sigma**2 * across, reason)
+    return DetectedObjects(objects, directions, sigma[:, None, None] ** 2 * across, reason)

@@ -393,7 +393,7 @@ def _among_streaks(
     for found in report.objects:
         middle, half = found.endpoints.mean(axis=0), 0.5 * (found.endpoints[1] - found.endpoints[0])
         fit = patches.measured(middle, half, found.flux) if np.isfinite(zero) else None
-        rough = FittedObject(middle, search.streak_sigma**2 * np.eye(2), found.flux, 0.0, 1.0)
+        rough = FittedObject(middle, found.middle_sigma**2 * np.eye(2), found.flux, 0.0, 1.0)
         fits.append((fit or rough, zero))
     return fits
 
@@ -484,7 +484,7 @@ def measure_points(
         points = np.vstack([motion.stars[motion.used], middles])
         spread = motion.star_covariance[motion.used]
         sigma = np.sqrt(0.5 * np.trace(spread, axis1=1, axis2=2))
-        sigma = np.concatenate([sigma, np.full(len(middles), settings.search.streak_sigma)])
+        sigma = np.concatenate([sigma, [item.middle_sigma for item in found]])
         flux = np.concatenate([motion.flux[motion.used], [item.flux for item in found]])
         moving = np.arange(len(points)) >= len(points) - len(middles)
     else:

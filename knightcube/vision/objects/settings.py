@@ -87,7 +87,9 @@ class ObjectSettings:
         crossing_improvement: minimum decrease of chi-square for an object whose streak crosses stars; larger
             than `improvement`, because many lines are tested.
         worst_fit: largest chi-square per pixel along the streak of an accepted object.
-        streak_sigma: standard deviation, per axis, of the midpoint of an object's streak, px.
+        streak_sigma: standard deviation, per axis, of the midpoint of a streak that is too short to locate
+            its ends, px.
+        end_floor: minimum standard deviation of an end of an object's streak, px, due to faint stars.
     """
 
     bounds: tuple[float, float, float] = (8.0, 10.0, 10.0)
@@ -105,6 +107,7 @@ class ObjectSettings:
     crossing_improvement: float = 600.0
     worst_fit: float = 2.5
     streak_sigma: float = 0.1
+    end_floor: float = 0.2
 
 
 @dataclass(frozen=True, slots=True)

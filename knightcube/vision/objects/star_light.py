@@ -50,14 +50,22 @@ PATHS_PER_LENGTH = 8
 """Number of trial star paths along a bright region, per length of a star path."""
 # Maximum length of a chain of successive star streaks in a bright region, in path lengths.
 _LONGEST_CHAIN = 5.0
-# Number of segments of equal length into which an object's streak is divided to test its ends.
-_SEGMENTS = 12
-# Minimum length (px) of an object's streak whose ends are tested.
-_LEAST_TESTED = 40.0
-# Minimum brightness of the first and last segment of an object's streak, relative to its mean brightness.
-_LEAST_END = 0.5
-# Standard deviation of the relative brightness of a segment above which the segment is not tested.
-_MOST_VAGUE = 0.2
+# Maximum number of rounds that follow the light of an object's streak and fit its ends.
+_ROUNDS = 5
+# Smallest length (px) beyond both ends of a streak at which its light is looked for: first, and later.
+_BEYOND_FIRST, _BEYOND_LATER = 60.0, 25.0
+# Displacement (px) of an end by the followed light above which the end is moved before the fit.
+_FOLLOWED = 1.5
+# Maximum number of Gauss-Newton steps of the ends in a round, and the step (px) that ends the fit.
+_END_FITS, _END_CONVERGED = 4, 0.05
+# Change (px) of the ends in a round below which the ends are located.
+_LOCATED = 0.3
+# Brightness of light relative to the streak above which the light is that of another source.
+_BRIGHTER = 2.0
+# Error of a subtracted star, relative to the brightness of the streak, above which the streak is hidden.
+_HIDDEN = 0.25
+# Minimum length (px) of a streak whose ends are located.
+_LEAST_LOCATED = 12.0
 # Distance from all star and object paths beyond which pixels are ignored, in standard deviations of the PSF.
 _REACH = 3.0
 # Relative ridge of the normal equations of brightnesses.
@@ -75,12 +83,29 @@ class Explanation:
         misfit, misfit_of_stars: chi-square per pixel along the object's streak, for stars with the object and
             for stars only.
         flux: flux of the object, counts.
+        among_stars: whether the object's path is straight relative to the stars, not in the image.
     """
 
     chi_square: float
     misfit: float
     misfit_of_stars: float
     flux: float
+    among_stars: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocatedEnds:
+    """Ends of an object's streak, located by all light of the streak.
+
+    Attributes:
+        ends: the two ends (2, 2), px.
+        sigma: standard deviation of each end (2,), px, along the axis of the larger error.
+        misfit: chi-square per pixel along the streak.
+    """
+
+    ends: FloatArray
+    sigma: FloatArray
+    misfit: float
 
 
 class StarLight:
@@ -129,6 +154,7 @@ class StarLight:
         rows, columns = segmented.signal.shape
         self._psf_sigma, self._rotation, self._pinhole = psf_sigma, rotation, pinhole
         self._segmented, self._gain, self._saturation = segmented, gain, saturation
+        self._known = tuple(known)
         points = np.concatenate([stars.reshape(-1, 2), *lines])
         self._near = pixels_near(points, _REACH * psf_sigma, rows, columns)
         signal = segmented.signal[self._near[:, 1], self._near[:, 0]].astype(np.float64)
@@ -156,36 +182,158 @@ class StarLight:
         line, (brightness, chi_square) = lines[better], fits[better]
         along = np.flatnonzero(line > 0.05 * line.max())
         if not len(along):
-            return Explanation(chi_square, np.inf, np.inf, 0.0)
+            return Explanation(chi_square, np.inf, np.inf, 0.0, better == 1)
         target, stars = self._target[along], self._stars.T[:, along]
         missed = target - brightness[:-1] @ stars - line[along] * brightness[-1]
         by_stars = target - self._brightness @ stars
         misfit, of_stars = (float(each @ each) / len(each) for each in (missed, by_stars))
-        return Explanation(chi_square, misfit, of_stars, float(brightness[-1]))
+        return Explanation(chi_square, misfit, of_stars, float(brightness[-1]), better == 1)
 
-    def lit_to_ends(self, ends: FloatArray) -> bool:
-        """Return whether the streak of an object between `ends` (2, 2), px, is lit up to both ends.
+    def located(self, ends: FloatArray, among_stars: bool) -> LocatedEnds | None:
+        """Return the ends of an object's streak that most likely bound its light, or None without a streak.
 
-        The stars and the object are fitted together. The streak is divided into segments, and the brightness
-        of its first and last segment is measured where the noise and the light of stars permit.
+        The light is followed along the path of the streak beyond both ends. The part of the path with the
+        largest likelihood that its brightness is uniform, and zero outside, gives the ends, which are then
+        fitted with the brightness to the pixels. Light is not followed into other regions. Known stars are
+        subtracted.
+
+        Args:
+            ends: initial guess of the two ends (2, 2), px.
+            among_stars: whether the path is straight relative to the stars, not in the image.
         """
-        length = float(np.linalg.norm(ends[1] - ends[0]))
-        if length < _LEAST_TESTED:
-            return True
-        line = self._weighted_image(straight_path(ends))
-        brightness, _ = self._with_line(line)
-        left = self._target - self._stars @ brightness[:-1]
-        along = (self._near - ends[0]) @ (ends[1] - ends[0]) / length**2
-        segment = np.floor(along * _SEGMENTS).astype(np.int64)
-        for which in (0, _SEGMENTS - 1):
-            here = segment == which
-            power = float(line[here] @ line[here])
-            if power <= 0.0 or brightness[-1] <= 0.0:
-                continue
-            vague = 1.0 / (brightness[-1] * np.sqrt(power))
-            if vague < _MOST_VAGUE and line[here] @ left[here] < _LEAST_END * brightness[-1] * power:
-                return False
-        return True
+        beyond = max(_BEYOND_FIRST, float(np.linalg.norm(ends[1] - ends[0])))
+        label = region_along(self._segmented, ends)
+        found = None
+        for _ in range(_ROUNDS):
+            length = float(np.linalg.norm(ends[1] - ends[0]))
+            if length < _LEAST_LOCATED:
+                return None
+            parts = np.arange(-beyond, length + beyond + 1.0) / length
+            curve = self._path(ends, among_stars, parts)
+            rows, columns = self._segmented.signal.shape
+            inside = np.all((curve >= 0.0) & (curve <= (columns - 1, rows - 1)), axis=1)
+            kept = _around(inside, len(parts) // 2)
+            if len(kept) < _LEAST_LOCATED:
+                return None
+            lit = self._lit(curve[kept], parts[kept], ends, among_stars, label)
+            if lit is None:
+                return None
+            bounds, vague, pixels, target, weight = lit
+            followed = self._path(ends, among_stars, bounds)
+            moved = np.linalg.norm(followed - ends, axis=1)
+            start = np.where(moved[:, None] > _FOLLOWED, followed, ends)
+            if np.linalg.norm(start[1] - start[0]) < _LEAST_LOCATED:
+                return None
+            fitted = self._fitted_ends(pixels, target, weight, start, among_stars)
+            if fitted is None:
+                return None
+            found = LocatedEnds(fitted.ends, np.hypot(fitted.sigma, vague), fitted.misfit)
+            change = float(np.linalg.norm(found.ends - ends, axis=1).max())
+            ends = found.ends
+            if change < _LOCATED:
+                break
+            beyond = _BEYOND_LATER if moved.max() < _BEYOND_LATER else beyond
+        return found
+
+    def _path(self, ends: FloatArray, among_stars: bool, parts: FloatArray | None = None) -> FloatArray:
+        """Return points (m, 2), px, of the path of an object between `ends` (2, 2), px."""
+        if among_stars:
+            return path_among_stars(ends, self._rotation, self._pinhole, parts)
+        return straight_path(ends, parts)
+
+    def _lit(
+        self, curve: FloatArray, parts: FloatArray, ends: FloatArray, among_stars: bool, label: int
+    ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, FloatArray] | None:
+        """Return the lit part of a curve and the pixels near the curve, or None if the curve is dark.
+
+        The results are the fractions of the path at which its light begins and ends (2,), their standard
+        deviations (2,), px, the pixels (p, 2), their counts without known stars (p,), and their weights (p,).
+
+        Args:
+            curve: points (m, 2), px, that are 1 px apart.
+            parts: fractions of the path at the points (m,).
+            ends: current ends of the path (2, 2), px.
+            among_stars: whether the path is straight relative to the stars, not in the image.
+            label: label of the region of the path.
+        """
+        rows, columns = self._segmented.signal.shape
+        pixels = pixels_near(curve, _REACH * self._psf_sigma, rows, columns)
+        signal = self._segmented.signal[pixels[:, 1], pixels[:, 0]].astype(np.float64)
+        weight = _pixel_weights(signal, self._segmented.background, self._gain, self._saturation)
+        regions = self._segmented.regions
+        own = regions.labels[pixels[:, 1], pixels[:, 0]]
+        weight[(own != label) & np.isin(own, regions.label)] = 0.0
+        target = signal
+        if len(self._known):
+            paths = [*self._known, self._path(ends, among_stars)]
+            images = [streak_images(pixels, path[None], self._psf_sigma, False)[0, 0] for path in paths]
+            shapes = np.array(images) * weight
+            flux, _ = _brightnesses(shapes @ shapes.T, shapes @ (signal * weight), 0.0)
+            target = signal - flux[:-1] @ np.array(images[:-1])
+        light, share = _light_along(pixels, target, weight, curve, self._psf_sigma)
+        inner = (parts > 0.05) & (parts < 0.95) & (share > 0.0)
+        usual = float(np.median(light[inner])) if inner.any() else 0.0
+        if usual <= 0.0:
+            return None
+        # Doubled logarithm of the likelihood ratio of the usual brightness and darkness.
+        gain = share * usual * (2.0 * light - usual)
+        gain[light > _BRIGHTER * usual + 3.0 / np.sqrt(np.maximum(share, 1e-300))] = 0.0
+        if len(self._known):
+            # The error of a subtracted star is common to all pixels of the star.
+            hidden, _ = _light_along(pixels, signal - target, weight, curve, self._psf_sigma)
+            gain[SHAPE_ERROR * hidden > _HIDDEN * usual] = 0.0
+        middle = int(np.argmin(np.abs(parts - 0.5)))
+        step = parts[1] - parts[0]
+        first, first_sigma = _end_of_light(gain[middle::-1])
+        last, last_sigma = _end_of_light(gain[middle:])
+        bounds = parts[middle] + np.array([-first - 0.5, last + 0.5]) * step
+        return bounds, np.array([first_sigma, last_sigma]), pixels, target, weight
+
+    def _fitted_ends(
+        self,
+        pixels: IntArray,
+        target: FloatArray,
+        weight: FloatArray,
+        ends: FloatArray,
+        among_stars: bool,
+    ) -> LocatedEnds | None:
+        """Return the ends that Gauss-Newton fits to the counts `target` (p,) of pixels (p, 2), or None."""
+        size = 0.0
+        for _ in range(_END_FITS):
+            chord = ends[1] - ends[0]
+            size = float(np.linalg.norm(chord))
+            if size < _LEAST_LOCATED:
+                return None
+            path = self._path(ends, among_stars)
+            along = (pixels - ends[0]) @ chord / size**2
+            near = np.flatnonzero(
+                (along > -_WIDE_REACH / size) & (along < 1.0 + _WIDE_REACH / size) & (weight > 0)
+            )
+            if len(near) < _LEAST_LOCATED:
+                return None
+            images = streak_images(pixels[near], path[None], self._psf_sigma, True)[0]
+            second = np.clip(along[near], 0.0, 1.0)
+            # A displacement of an end along the streak also changes the brightness of the streak.
+            thinned = images[0] * (chord / size**2)[:, None]
+            design = np.concatenate(
+                [images[:1], images[1:] * (1.0 - second) + thinned, images[1:] * second - thinned]
+            )
+            design *= weight[near]
+            scale = np.sqrt(np.maximum(np.sum(design**2, axis=1), 1e-300))
+            normal = (design @ design.T) / np.outer(scale, scale) + _RIDGE * np.eye(5)
+            inverse = np.linalg.inv(normal) / np.outer(scale, scale)
+            solution = inverse @ (design @ (target[near] * weight[near]))
+            if solution[0] <= 0.0:
+                return None
+            steps = np.clip(solution[1:] / solution[0], -_LARGEST_STEP, _LARGEST_STEP).reshape(2, 2)
+            ends = ends + steps
+            if np.abs(steps).max() < _END_CONVERGED:
+                break
+        missed = target[near] * weight[near] - solution[0] * design[0]
+        misfit = float(missed @ missed) / len(near)
+        covariance = inverse[1:, 1:] / solution[0] ** 2 * max(misfit, 1.0)
+        sigma = np.sqrt([np.linalg.eigvalsh(covariance[k : k + 2, k : k + 2])[1] for k in (0, 2)])
+        return LocatedEnds(ends, sigma, misfit)
 
     def excess(self, region: IntArray) -> float:
         """Return by how much chi-square of pixels and region exceeds its expected value, without an object.
@@ -218,6 +366,65 @@ class StarLight:
         """Return the weighted image of a streak of one count along `path` (m, 2), px, on p pixels, (p,)."""
         image = streak_images(self._near, path[None], self._psf_sigma, False)[0, 0]
         return np.asarray(image * self._weight)
+
+
+def region_along(segmented: Segmented, ends: FloatArray) -> int:
+    """Return the label of the region that contains most of the line between two ends (2, 2), px, or 0."""
+    labels = segmented.regions.labels
+    column, row = np.clip(np.rint(straight_path(ends)), 0, np.array(labels.shape[::-1]) - 1).T.astype(int)
+    shares = np.bincount(labels[row, column])
+    shares[0] = 0
+    return int(np.argmax(shares))
+
+
+def _around(inside: BoolArray, middle: int) -> IntArray:
+    """Return the indices of the uninterrupted true values around the index `middle`, or none."""
+    outside = np.flatnonzero(~inside)
+    place = int(np.searchsorted(outside, middle))
+    first = int(outside[place - 1]) + 1 if place > 0 else 0
+    last = int(outside[place]) if place < len(outside) else len(inside)
+    return np.arange(first, last)
+
+
+def _end_of_light(gain: FloatArray) -> tuple[float, float]:
+    """Return the expected last index of light, and its standard deviation.
+
+    The array `gain` (n,) holds the doubled logarithm of the likelihood ratio of light and darkness at each
+    index.
+    """
+    total = np.cumsum(gain)
+    likelihood = np.exp(0.5 * (total - total.max()))
+    likelihood /= likelihood.sum()
+    place = np.arange(len(gain))
+    last = float(likelihood @ place)
+    return last, float(np.sqrt(likelihood @ (place - last) ** 2))
+
+
+def _light_along(
+    pixels: IntArray, target: FloatArray, weight: FloatArray, curve: FloatArray, psf_sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the brightness (m,), counts/px, along a curve (m, 2), px, and the inverse variances (m,).
+
+    The pixels (p, 2) have the counts `target` (p,) and the reciprocal standard deviations `weight` (p,).
+    """
+    width = float(np.sqrt(psf_sigma**2 + 1.0 / 12.0))
+    chord = curve[-1] - curve[0]
+    place = np.interp(
+        (pixels - curve[0]) @ chord, np.maximum.accumulate((curve - curve[0]) @ chord), np.arange(len(curve))
+    )
+    tangent = np.gradient(curve, axis=0)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
+    near = np.rint(place).astype(np.int64)
+    # The nearest point of a bent curve is found in a second step.
+    ahead = np.sum((pixels - curve[near]) * tangent[near], axis=1)
+    near = np.clip(near + np.rint(ahead).astype(np.int64), 0, len(curve) - 1)
+    away = pixels - curve[near]
+    across = away[:, 1] * tangent[near, 0] - away[:, 0] * tangent[near, 1]
+    profile = np.exp(-0.5 * (across / width) ** 2) / (np.sqrt(2.0 * np.pi) * width)
+    profile[np.abs(np.sum(away * tangent[near], axis=1)) > 1.0] = 0.0
+    share = np.bincount(near, (weight * profile) ** 2, len(curve))
+    light = np.bincount(near, weight**2 * profile * target, len(curve))
+    return np.asarray(light / np.maximum(share, 1e-300)), np.asarray(share, dtype=float)
 
 
 def _pixel_weights(signal: FloatArray, background: Background, gain: float, saturation: float) -> FloatArray:
@@ -291,8 +498,6 @@ _WIDE_REACH = 5.0
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
 # Minimum length (px) of an object's line of light; a shorter remainder of light counts as a point.
 _LEAST_LINE_PX = 4.0
-# Widest gap (px) in an object's line of light that the subtraction of a crossing star may leave.
-_WIDEST_GAP_PX = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -540,40 +745,7 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
     points = points[weight >= 0.5 * np.percentile(weight, 80.0)]
     spread = np.cov(points.T, bias=True) if len(points) > 1 else np.eye(2)
     guess = line_of(points.mean(axis=0), spread, _LEAST_LINE_PX)
-    ends = _fit_line(patch, left, guess + patch.corner)
-    longer = _continued(patch, seen, ends)
-    return ends if longer is None else _fit_line(patch, left, longer)
-
-
-def _continued(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2), px, of a line of light extended across gaps, or None if no light continues.
-
-    A star that crosses the object's line leaves a gap, because the star is subtracted together with the
-    line's light.
-    """
-
-    def last_before_gap(lit: BoolArray) -> int:
-        places = np.flatnonzero(lit)
-        if not len(places):
-            return 0
-        gaps = np.flatnonzero(np.diff(places) > _WIDEST_GAP_PX)
-        return int(places[gaps[0]] if len(gaps) else places[-1])
-
-    length = float(np.linalg.norm(ends[1] - ends[0]))
-    if length < 2.0 * _LEAST_LINE_PX:
-        return None
-    along = (ends[1] - ends[0]) / length
-    reach = int(np.hypot(*patch.signal.shape))
-    at = np.arange(-reach, int(length) + reach + 1)
-    points = ends[0] - patch.corner + at[:, None] * along
-    profile = ndimage.map_coordinates(seen, points.T[::-1], order=1, mode="constant")
-    middle = int(np.argmin(np.abs(at - 0.5 * length)))
-    lit = profile > 0.5 * np.median(profile[(at >= 0) & (at <= length)])
-    first = middle - last_before_gap(lit[middle::-1])
-    last = middle + last_before_gap(lit[middle:])
-    if at[first] > -_LARGEST_STEP and at[last] < length + _LARGEST_STEP:
-        return None
-    return np.asarray(ends[0] + np.array([[min(at[first], 0)], [max(at[last], length)]]) * along)
+    return _fit_line(patch, left, guess + patch.corner)
 
 
 def _fit_line(patch: Patch, left: FloatArray, ends: FloatArray) -> FloatArray:

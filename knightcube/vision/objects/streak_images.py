@@ -120,23 +120,37 @@ def _set_circle(
             points[k, 0] = points[k, 1] = math.nan
 
 
-def straight_path(ends: FloatArray) -> FloatArray:
-    """Return evenly spaced points (m, 2), px, on the straight line between two ends (2, 2), px."""
-    steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
-    parts = (np.arange(steps)[:, None] + 0.5) / steps
-    return np.asarray(ends[0] + parts * (ends[1] - ends[0]))
+def straight_path(ends: FloatArray, parts: FloatArray | None = None) -> FloatArray:
+    """Return points (m, 2), px, on the straight line between two ends (2, 2), px.
+
+    The points are those at the given fractions `parts` (m,) of the line, or evenly spaced points.
+    """
+    if parts is None:
+        steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
+        parts = (np.arange(steps) + 0.5) / steps
+    return np.asarray(ends[0] + parts[:, None] * (ends[1] - ends[0]))
 
 
-def path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
+def path_among_stars(
+    ends: FloatArray, rotation: FloatArray, pinhole: Pinhole, parts: FloatArray | None = None
+) -> FloatArray:
     """Return points (m, 2), px, of a uniform motion relative to the stars between two ends (2, 2), px.
 
-    The ends are passed in the order in time that gives the slower motion relative to the stars.
+    The ends are passed in the order in time that gives the slower motion relative to the stars. The points
+    are those after the given fractions `parts` (m,) of the motion from the first end to the second, or evenly
+    spaced points between the ends.
     """
     vectors = pinhole.unit_vectors(ends)
-    both = [at_mid_exposure(pair, rotation) for pair in (vectors, vectors[::-1])]
-    first, last = min(both, key=lambda pair: float(np.linalg.norm(pair[1] - pair[0])))
-    steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
-    parts = (np.arange(steps) + 0.5) / steps
+    # Both ends are rotated to mid-exposure from the start and from the end of the exposure.
+    middle = _rotated(vectors, rotation, np.array([[0.5, -0.5], [0.5, -0.5]]))
+    apart = middle[1, 1] - middle[0, 0], middle[0, 1] - middle[1, 0]
+    slower = int(apart[1] @ apart[1] < apart[0] @ apart[0])
+    first, last = middle[slower, 0], middle[1 - slower, 1]
+    if parts is None:
+        steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
+        parts = (np.arange(steps) + 0.5) / steps
+    elif slower:
+        parts = 1.0 - parts
     at = first + parts[:, None] * (last - first)
     return pinhole.project(_rotated(at, rotation, (parts - 0.5)[:, None])[:, 0])
 
@@ -157,8 +171,11 @@ def _rotated(directions: FloatArray, rotation: FloatArray, parts: FloatArray) ->
     axis = rotation / angle if angle > 0.0 else rotation
     along = (directions @ axis)[:, None] * axis
     turned = (parts * angle)[..., None]
+    x, y, z = directions.T
+    a, b, c = axis
+    crossed = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
     out = np.cos(turned) * (directions - along)[:, None]
-    out += np.sin(turned) * np.cross(directions, axis)[:, None]
+    out += np.sin(turned) * crossed[:, None]
     out += along[:, None]
     return np.asarray(out)
 

@@ -370,9 +370,10 @@ def test_the_public_search_gives_the_direction_of_each_object_with_its_covarianc
     assert found.reason == ""
     assert len(found.objects) == len(found.directions) == 1
     off = np.cross(found.directions[0], pinhole.unit_vectors(path[[0, -1]].mean(axis=0)[None])[0])
-    assert np.linalg.norm(off) < 5.0 * settings.streak_sigma / pinhole.focal_length
+    sigma = found.objects[0].middle_sigma / pinhole.focal_length
+    assert np.linalg.norm(off) < 3.5 * sigma < 1.0 / pinhole.focal_length
     spread = np.sort(np.linalg.eigvalsh(found.covariance[0]))
-    assert spread == pytest.approx([0.0, *[(0.1 / pinhole.focal_length) ** 2] * 2], abs=1e-20)
+    assert spread == pytest.approx([0.0, sigma**2, sigma**2], abs=1e-20)
     with pytest.raises(ValueError, match="but the camera has"):
         detect_objects(pixels[1:], pinhole, _ROTATION, exposure)
 

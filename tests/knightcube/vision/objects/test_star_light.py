@@ -65,14 +65,22 @@ def test_a_point_on_a_star_remains_and_is_measured() -> None:
 
 
 def test_a_line_across_a_star_remains_with_its_ends() -> None:
+    """The star covers the middle of the line, and the ends are located by all of its light."""
     ends = np.array([[230.2, 226.4], [255.7, 253.1]])
-    patch = _patch(
-        [(240.3, 238.7)], 60_000.0, ends[0] + np.linspace(0, 1, 801)[:, None] * np.diff(ends, axis=0), 3
-    )
-    _, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
-    found = brightest_left(patch, left)
+    middle = _CAMERA.pinhole.unit_vectors(np.array([[240.3, 238.7]]))[0]
+    image = np.zeros((512, 512))
+    deposit(image, star_path(middle, _ROTATION, 0.5, _CAMERA.pinhole), 60_000.0, 1.0)
+    deposit(image, ends[0] + np.linspace(0, 1, 801)[:, None] * np.diff(ends, axis=0), 40_000.0, 1.0)
+    noisy = 500.0 + image + np.random.default_rng(3).normal(0.0, np.sqrt(_NOISE**2 + image))
+    segmented = segment_frame(np.rint(noisy).astype(np.uint16), EndpointSettings())
+    patch = cut_patch(segmented, segmented.regions, 0, 1.0, 1.0, 65_535.0)
+    stars, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
+    line = brightest_left(patch, left)
+    assert line is not None
+    light = StarLight(segmented, line, _ROTATION, _CAMERA.pinhole, 1.0, 1.0, 65_535.0, stars)
+    found = light.located(line, among_stars=False)
     assert found is not None
-    error = min(np.abs(found - truth).max() for truth in (ends, ends[::-1]))
+    error = min(np.abs(found.ends - truth).max() for truth in (ends, ends[::-1]))
     assert error < 0.5
 
 
@@ -121,17 +129,41 @@ def test_an_object_in_a_region_exceeds_the_expected_chi_square(crossed: bool) ->
         assert (excess > 1000.0) if crossed else (excess < 200.0)
 
 
-@pytest.mark.parametrize(("beyond", "lit"), [(0.0, True), (1.5, True), (12.0, False), (30.0, False)])
-def test_an_end_in_the_dark_is_noticed(beyond: float, lit: bool) -> None:
-    """A streak of 100 px with an end `beyond` px too far is rejected if that end is dark."""
+@pytest.mark.parametrize(
+    ("beyond", "gap"), [(0.0, 0.0), (12.0, 0.0), (30.0, 0.0), (-40.0, 0.0), (-40.0, 8.0)]
+)
+def test_the_ends_of_a_streak_follow_its_light(beyond: float, gap: float) -> None:
+    """An end of a streak of 100 px is `beyond` px too far, and some pixels before the end are saturated."""
     ends = np.array([[200.0, 210.0], [280.0, 270.0]])
     image = np.zeros((512, 512))
     deposit(image, ends[0] + np.linspace(0.0, 1.0, 2001)[:, None] * np.diff(ends, axis=0), 60_000.0, 1.0)
     noisy = 500.0 + image + np.random.default_rng(7).normal(0.0, np.sqrt(_NOISE**2 + image))
     segmented = segment_frame(np.rint(noisy).astype(np.uint16), EndpointSettings())
     claimed = ends + np.array([[0.0, 0.0], [0.8, 0.6]]) * beyond
+    if gap > 0.0:
+        segmented.signal[255:260] = 65_535.0
     light = StarLight(segmented, claimed, _ROTATION, _CAMERA.pinhole, 1.0, 1.0, 65_535.0)
-    assert light.lit_to_ends(claimed) is lit
+    found = light.located(claimed, among_stars=False)
+    assert found is not None
+    errors = np.linalg.norm(found.ends - ends, axis=1)
+    assert np.all(errors < 3.5 * found.sigma)
+    assert np.all(found.sigma < 0.5)
+
+
+def test_a_hidden_end_has_a_large_claim() -> None:
+    """The last 20 px of a streak lie in pixels that are saturated, so that its end is not known to 2 px."""
+    ends = np.array([[200.0, 210.0], [280.0, 270.0]])
+    image = np.zeros((512, 512))
+    deposit(image, ends[0] + np.linspace(0.0, 1.0, 2001)[:, None] * np.diff(ends, axis=0), 60_000.0, 1.0)
+    noisy = 500.0 + image + np.random.default_rng(7).normal(0.0, np.sqrt(_NOISE**2 + image))
+    segmented = segment_frame(np.rint(noisy).astype(np.uint16), EndpointSettings())
+    segmented.signal[258:282] = 65_535.0
+    light = StarLight(segmented, ends, _ROTATION, _CAMERA.pinhole, 1.0, 1.0, 65_535.0)
+    found = light.located(ends, among_stars=False)
+    assert found is not None
+    assert found.sigma[1] > 2.0
+    assert np.linalg.norm(found.ends[1] - ends[1]) < 3.0 * found.sigma[1]
+    assert np.linalg.norm(found.ends[0] - ends[0]) < 3.5 * found.sigma[0] < 2.0
 
 
 @pytest.mark.parametrize("beyond", [0.0, np.inf])
