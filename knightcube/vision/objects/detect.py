@@ -47,6 +47,7 @@ from knightcube.vision.objects.star_light import (
     brightest_left,
     cut_patch,
     fit_stars,
+    light_on_path,
     region_along,
 )
 from knightcube.vision.objects.streak_ends import (
@@ -60,7 +61,7 @@ from knightcube.vision.objects.streak_ends import (
     near_border,
     segment_frame,
 )
-from knightcube.vision.objects.streak_images import at_mid_exposure, pixels_near, star_path
+from knightcube.vision.objects.streak_images import at_mid_exposure, star_path, star_paths
 
 INDICATORS = ("centre", "displacement", "residual")
 """Names of the three indicators that show that a streak is not a star."""
@@ -315,15 +316,26 @@ class ObjectReport:
 
 # Distance (px) between two corners of a region below which they count as the same corner.
 _LEAST_CROSSING_PX = 10.0
+# Distance (px) of the second end of a line from the path of a star through its first end below which the
+# line lies on the path.
+_ON_PATH_PX = 1.5
 # Distance (px) of a streak's ends from the predicted ends of a star below which the streak is a star's.
 _FITTED_PX = 1.0
 # Number of trial star paths per path length in the first test of whether stars explain the pixels.
 _FEW_PATHS = 2
 # Chi-square per pixel along an object's streak below which its ends and its stars are not located again.
 _GOOD_FIT = 1.4
+# Chi-square per pixel along a streak of uniform brightness, for 1000 pixels and three standard deviations.
+_UNIFORM = 1.15
+# Brightness of a star's path relative to a line on this path above which the line may be part of the star.
+_HIDDEN_STAR = 0.6
+# Number of parts of a star's path whose brightness is compared.
+_PARTS = 12
 # Largest excess of chi-square over its expected value beside an object, relative to the decrease of
 # chi-square by the object: for any object, and for an object whose streak resembles a star's.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
+# The same limit for an object whose ends are not yet located.
+_HOPELESS = 4.0
 # Distance from a star's path at which its light falls below the noise beyond that of its Gaussian profile,
 # in standard deviations of the PSF.
 _DIM_SIGMAS = 2.0
@@ -418,15 +430,22 @@ class Judge:
     def has_other_light(self, ends: FloatArray, label: int) -> bool:
         """Return whether a region has significant light beside the path of the star with the given ends."""
         region = self._pixels_of(label)
-        rows, columns = self.segmented.signal.shape
-        signal = self.segmented.signal[region[:, 1], region[:, 0]].astype(np.float64)
+        signal = np.maximum(self.segmented.signal[region[:, 1], region[:, 0]], 0.0).astype(np.float64)
         noise = self.segmented.background.typical_noise
-        brightness = max(float(np.percentile(signal, 90.0)), noise)
-        reach = self.objects.psf_sigma * (_DIM_SIGMAS + float(np.sqrt(2.0 * np.log(brightness / noise))))
+        brightness = float(signal.max() / noise)
+        reach = self.objects.psf_sigma * (_DIM_SIGMAS + float(np.sqrt(2.0 * np.log(max(brightness, 1.0)))))
         middle = self.pinhole.unit_vectors(ends.mean(axis=0)[None])[0]
-        near = pixels_near(star_path(middle, self.rotation, 0.5, self.pinhole), reach, rows, columns)
-        beside = ~np.isin(region[:, 1] * columns + region[:, 0], near[:, 1] * columns + near[:, 0])
-        other = float(np.maximum(signal[beside], 0.0).sum())
+        path = star_path(middle, self.rotation, 0.5, self.pinhole)
+        # The path of a star is nearly a parabola over its chord.
+        chord = ends[1] - ends[0]
+        length = max(float(np.linalg.norm(chord)), 1.0)
+        along, normal = chord / length, np.array([-chord[1], chord[0]]) / length
+        sag = 4.0 * float((path[len(path) // 2] - ends.mean(axis=0)) @ normal) / length**2
+        place, away = (region - ends[0]) @ along, (region - ends[0]) @ normal
+        inside = np.clip(place, 0.0, length)
+        far = np.hypot(away - sag * inside * (length - inside), place - inside)
+        beside = far > reach
+        other = float(signal[beside].sum())
         return other >= self.objects.point_significance * noise * float(np.sqrt(beside.sum() + 1.0))
 
     def _stars_fill(self, label: int) -> bool:
@@ -535,7 +554,7 @@ class Judge:
 
         A streak that differs from a star's only near its ends fits nearly as well as a star along its length.
         If the streak is `uniform`, it suffices that the object explains nearly all light that stars do not
-        explain. An object that explains little of this light is no object.
+        explain. A line that explains only a small part of this light is rejected.
         """
         gained = self._gained(light, found)
         remains = found.chi_square - light.expected
@@ -569,6 +588,10 @@ class Judge:
         the stars of the region are fitted. Returns None if the located streak is a star's, or if stars
         explain its pixels.
         """
+        rough = light.explain(ends)
+        gained = self._gained(light, rough)
+        if gained < improvement or rough.chi_square - light.expected > _HOPELESS * gained:
+            return None
         located = self._located(ends, light, stars, improvement)
         if not stars and (located is None or located[2].misfit > _GOOD_FIT):
             stars = self._stars_along(ends)
@@ -604,12 +627,31 @@ class Judge:
             best = replace(best, sigma=np.hypot(best.sigma, self.objects.end_floor))
             light = self._light(best.ends, stars)
         found = light.explain(best.ends)
-        uniform = best.misfit <= _GOOD_FIT
-        if self._moves_like_a_star(best.ends, _FITTED_PX):
+        uniform = best.misfit <= _UNIFORM
+        if self._moves_like_a_star(best.ends, _FITTED_PX) or self.begins_a_star(best.ends, found.flux):
             return None
         if not self._is_object(light, found, improvement, uniform):
             return None
         return best, light, found
+
+    def begins_a_star(self, ends: FloatArray, flux: float) -> bool:
+        """Return whether a line between `ends` (2, 2), px, may be the part of a star beside other stars.
+
+        The line then lies on the path of a star that begins or ends at one end of the line, and the whole
+        path is about as bright as the line of `flux` counts or brighter, because other stars cover the rest
+        of the path.
+        """
+        length = max(float(np.linalg.norm(ends[1] - ends[0])), 1.0)
+        directions = self.pinhole.unit_vectors(ends[[0, 0, 1, 1]])
+        paths = star_paths(directions, self.rotation, np.array([0.0, 1.0, 0.0, 1.0]), self.pinhole)
+        for path, other in zip(paths, ends[[1, 1, 0, 0]], strict=True):
+            on_path = float(np.min(np.linalg.norm(path - other, axis=1))) < _ON_PATH_PX
+            if on_path and length < len(path) - _ON_PATH_PX:
+                light = light_on_path(self.segmented, path, self.objects.psf_sigma)
+                parts = [float(np.median(part)) for part in np.array_split(light, _PARTS)]
+                if min(parts) >= _HIDDEN_STAR * flux / length:
+                    return True
+        return False
 
     def _stars_along(self, ends: FloatArray) -> list[FloatArray]:
         """Return the paths (m, 2), px, of the stars in the region along a line between `ends` (2, 2), px."""

@@ -57,7 +57,7 @@ _BEYOND_FIRST, _BEYOND_LATER = 60.0, 25.0
 # Displacement (px) of an end by the followed light above which the end is moved before the fit.
 _FOLLOWED = 1.5
 # Maximum number of Gauss-Newton steps of the ends in a round, and the step (px) that ends the fit.
-_END_FITS, _END_CONVERGED = 4, 0.05
+_END_FITS, _END_CONVERGED = 3, 0.05
 # Change (px) of the ends in a round below which the ends are located.
 _LOCATED = 0.3
 # Brightness of light relative to the streak above which the light is that of another source.
@@ -375,6 +375,17 @@ def region_along(segmented: Segmented, ends: FloatArray) -> int:
     shares = np.bincount(labels[row, column])
     shares[0] = 0
     return int(np.argmax(shares))
+
+
+def light_on_path(segmented: Segmented, path: FloatArray, psf_sigma: float) -> FloatArray:
+    """Return the brightness (m,), counts/px, along a path (m, 2), px, whose points are 1 px apart.
+
+    Light of other sources on the path is included. Outside the frame, the brightness is zero.
+    """
+    rows, columns = segmented.signal.shape
+    pixels = pixels_near(path, _REACH * psf_sigma, rows, columns)
+    signal = segmented.signal[pixels[:, 1], pixels[:, 0]].astype(np.float64)
+    return _light_along(pixels, signal, np.ones(len(pixels)), path, psf_sigma)[0]
 
 
 def _around(inside: BoolArray, middle: int) -> IntArray:

@@ -19,6 +19,7 @@ from knightcube.astro.quaternion import angle_between, attitude_matrix, from_mat
 from knightcube.gnc.tracker import FrameSightings, ObjectTracker, TrackSettings
 from knightcube.vision.frame_job import run
 from knightcube.vision.objects.detect import (
+    Judge,
     ObjectReport,
     SpaceObject,
     Verdict,
@@ -35,6 +36,7 @@ from knightcube.vision.objects.detect import (
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import StarLight
 from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
+from knightcube.vision.objects.streak_images import star_path
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
@@ -478,3 +480,20 @@ def test_a_star_is_explained_as_well_without_an_object_as_with_one() -> None:
         assert found.misfit <= found.misfit_of_stars * 1.05
         assert found.misfit_of_stars < 2.5
         assert light.chi_square < 2.5 * light.pixels
+
+
+def test_a_line_that_another_star_continues_may_begin_a_star() -> None:
+    """Two star streaks in line overlap by a fifth of their length."""
+    pinhole = _FRAME_CAMERA.pinhole
+    image = np.zeros((512, 512))
+    first, second = (star_path(_PLACE, _ROTATION, start, pinhole) for start in (0.5, -0.3))
+    for path in (first, second):
+        add_object(image, _FRAME_CAMERA, path, 3.0, 0.5)
+    pixels = read_out(_FRAME_CAMERA, image, 0.5, np.random.default_rng(3))
+    segmented = segment_frame(pixels, _SETTINGS)
+    judge = Judge(segmented, _ROTATION, pinhole, 0.5, _SETTINGS, ObjectSettings())
+    part = 2 * len(first) // 3
+    flux = part / len(first) * _FRAME_CAMERA.zero_magnitude * 10.0**-1.2 * 0.5
+    assert judge.begins_a_star(first[[0, part]], flux)
+    assert not judge.begins_a_star(first[[0, part]], 4.0 * flux)
+    assert not judge.begins_a_star(first[[0, part]] + np.array([[0.0, 0.0], [4.0, -4.0]]), flux)
