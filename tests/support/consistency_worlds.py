@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from scipy.stats import chi2
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, cross_product
 from knightcube.astro.quaternion import about_axis_y, normalise
 from knightcube.gnc.estimation.attitude_filter import FilterSettings
 from knightcube.gnc.estimation.estimate import Parameters
@@ -180,13 +180,13 @@ class FreeWorld:
     def _flow(self, x: FloatArray, field: FloatArray) -> FloatArray:
         """Return d(q, w)/dt: q' = Omega(w) q / 2 and Euler's equation, B turned by Rodrigues' formula."""
         vector, scalar, rate = x[:3], x[3], x[4:]
-        q_dot = 0.5 * np.append(scalar * rate - np.cross(rate, vector), -rate @ vector)
+        q_dot = 0.5 * np.append(scalar * rate - cross_product(rate, vector), -rate @ vector)
         field_body = (
             (scalar**2 - vector @ vector) * field
             + 2.0 * (vector @ field) * vector
-            - 2.0 * scalar * np.cross(vector, field)
+            - 2.0 * scalar * cross_product(vector, field)
         )
-        torque = np.cross(DIPOLE * self.parameters.gain * self._currents, field_body) - np.cross(
+        torque = cross_product(DIPOLE * self.parameters.gain * self._currents, field_body) - cross_product(
             rate, INERTIA @ rate
         )
         return np.concatenate([q_dot, np.linalg.solve(INERTIA, torque) + self.disturbance])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, cross_product
 from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.sun_acquisition import MEMORY, SunAcquisition, SunAcquisitionSettings
@@ -42,7 +42,7 @@ def fly(sun: FloatArray | None, rate: FloatArray, seconds: float) -> tuple[Float
         law.sample(now_ns, field + OWN_FIELD * dipole + 1e-7 * rng.standard_normal(3), rate + BIAS)
         dipole = law.dipole(now_ns)
         assert np.abs(dipole).max() <= LIMIT * (1.0 + 1e-12)
-        torque = np.cross(dipole, field) - np.cross(rate, INERTIA * rate)
+        torque = cross_product(dipole, field) - cross_product(rate, INERTIA * rate)
         rate = rate + step * torque / INERTIA
         attitude = multiply(from_rotation_vector(step * rate), attitude)
     off, speed = np.array(notes).T

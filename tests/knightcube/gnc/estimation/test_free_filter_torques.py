@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, cross_product
 from knightcube.astro.earth.disturbance import AIR, Pressures
 from knightcube.astro.quaternion import (
     IDENTITY,
@@ -57,19 +57,17 @@ class Craft:
 
     def second(self, dipole: FloatArray, noise: float) -> FloatArray:
         """Fly a second under a dipole (3,) A m^2 with `noise` A m^2 of each cycle; return the gyro's mean."""
-        dt, rates = 1.0 / CYCLES, []
+        dt, rates, inverse = 1.0 / CYCLES, [], np.linalg.inv(self.inertia)
         for _ in range(CYCLES):
-            torque = np.cross(
-                dipole + noise * self.rng.standard_normal(3), attitude_matrix(self.quaternion) @ FIELD
-            )
-            middle = self.rate + 0.5 * dt * self._acceleration(self.rate, torque)
+            acting = dipole + noise * self.rng.standard_normal(3)
+            torque = cross_product(acting, attitude_matrix(self.quaternion) @ FIELD)
+            momentum = self.inertia @ self.rate
+            middle = self.rate + 0.5 * dt * inverse @ (torque - cross_product(self.rate, momentum))
             self.quaternion = multiply(from_rotation_vector(dt * middle), self.quaternion)
-            self.rate = self.rate + dt * self._acceleration(middle, torque)
+            momentum = self.inertia @ middle
+            self.rate = self.rate + dt * inverse @ (torque - cross_product(middle, momentum))
             rates.append(middle)
         return np.asarray(np.mean(rates, axis=0) + BIAS + GYRO_SIGMA * self.rng.standard_normal(3))
-
-    def _acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.solve(self.inertia, torque - np.cross(rate, self.inertia @ rate)))
 
     def seen(self, sigma: float) -> FloatArray:
         """Return the attitude with an error of `sigma` rad an axis."""
