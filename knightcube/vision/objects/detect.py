@@ -474,7 +474,7 @@ class Judge:
         """Return the objects in regions in which objects and stars may be merged.
 
         If few stars do not explain all light of a region, its stars are fitted. If the fitted stars do not
-        explain it either, the brightest light of the region with and without its stars is tested. Regions
+        explain it either, the brightest light of the region without its stars is tested. Regions
         whose label is in `settled` are not examined. Regions whose label is in `strange` are examined first.
         Regions whose label is in `explained` contain only stars, and count as examined.
         """
@@ -497,12 +497,9 @@ class Judge:
             stars, left = fit_stars(patch, self.rotation, self.pinhole)
             if patch.excess(left) < self.objects.crossing_improvement:
                 continue
-            found = self._remaining_object(brightest_left(patch, patch.signal), ())
-            if found is None and stars:
-                found = self._remaining_object(brightest_left(patch, left), stars)
-                enough = self.objects.least_share * float(regions.flux[index])
-                found = found if found is not None and found.flux >= enough else None
-            objects += [found] if found is not None else []
+            found = self._remaining_object(brightest_left(patch, left), stars)
+            enough = self.objects.least_share * float(regions.flux[index]) if stars else 0.0
+            objects += [found] if found is not None and found.flux >= enough else []
         return objects
 
     def _remaining_object(self, ends: FloatArray | None, stars: Sequence[FloatArray]) -> SpaceObject | None:

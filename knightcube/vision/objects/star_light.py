@@ -50,6 +50,8 @@ PATHS_PER_LENGTH = 8
 """Number of trial star paths along a bright region, per length of a star path."""
 # Maximum length of a chain of successive star streaks in a bright region, in path lengths.
 _LONGEST_CHAIN = 5.0
+# Largest distance (px) between two paths that count as the same path.
+_SAME_PATH = 0.15
 # Maximum number of rounds that follow the light of an object's streak and fit its ends.
 _ROUNDS = 5
 # Smallest length (px) beyond both ends of a streak at which its light is looked for: first, and later.
@@ -83,14 +85,12 @@ class Explanation:
         misfit, misfit_of_stars: chi-square per pixel along the object's streak, for stars with the object and
             for stars only.
         flux: flux of the object, counts.
-        among_stars: whether the object's path is straight relative to the stars, not in the image.
     """
 
     chi_square: float
     misfit: float
     misfit_of_stars: float
     flux: float
-    among_stars: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,18 +176,19 @@ class StarLight:
         chi-square.
         """
         paths = straight_path(ends), path_among_stars(ends, self._rotation, self._pinhole)
-        lines = [self._weighted_image(path) for path in paths]
+        first = int(np.abs(paths[1] - paths[0]).max() < _SAME_PATH)
+        lines = [self._weighted_image(path) for path in paths[first:]]
         fits = [self._with_line(line) for line in lines]
-        better = int(fits[1][1] < fits[0][1])
-        line, (brightness, chi_square) = lines[better], fits[better]
+        best = int(np.argmin([fit[1] for fit in fits]))
+        line, (brightness, chi_square) = lines[best], fits[best]
         along = np.flatnonzero(line > 0.05 * line.max())
         if not len(along):
-            return Explanation(chi_square, np.inf, np.inf, 0.0, better == 1)
+            return Explanation(chi_square, np.inf, np.inf, 0.0)
         target, stars = self._target[along], self._stars.T[:, along]
         missed = target - brightness[:-1] @ stars - line[along] * brightness[-1]
         by_stars = target - self._brightness @ stars
         misfit, of_stars = (float(each @ each) / len(each) for each in (missed, by_stars))
-        return Explanation(chi_square, misfit, of_stars, float(brightness[-1]), better == 1)
+        return Explanation(chi_square, misfit, of_stars, float(brightness[-1]))
 
     def located(self, ends: FloatArray, among_stars: bool) -> LocatedEnds | None:
         """Return the ends of an object's streak that most likely bound its light, or None without a streak.

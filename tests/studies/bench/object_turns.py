@@ -37,9 +37,17 @@ _SEED = 27_182
 
 @dataclass(frozen=True, slots=True)
 class Looked:
-    """The search of one frame: error (px) of the true object's ends or None, number of other finds, ms."""
+    """The search of one frame.
+
+    Attributes:
+        error: error (px) of the true object's ends, or None if the object is not found.
+        claims: squared errors of the two ends (2,) in claimed standard deviations, or none.
+        others: number of other finds.
+        spent: processor time, ms.
+    """
 
     error: float | None
+    claims: tuple[float, ...]
     others: int
     spent: float
 
@@ -92,7 +100,14 @@ def looked(
     found = () if report is None else report.objects
     errors = [] if ends is None else [ends_error(item.endpoints, ends) for item in found]
     hits = [error for error in errors if error < MATCH_PX]
-    return Looked(min(hits, default=None), len(found) - min(len(hits), 1), spent)
+    claims: tuple[float, ...] = ()
+    if ends is not None and hits:
+        item = found[int(np.argmin(errors))]
+        off = min(
+            (np.linalg.norm(item.endpoints - truth, axis=1) for truth in (ends, ends[::-1])), key=np.max
+        )
+        claims = tuple(((off / item.sigma) ** 2).tolist())
+    return Looked(min(hits, default=None), claims, len(found) - min(len(hits), 1), spent)
 
 
 def main() -> None:
@@ -106,7 +121,7 @@ def main() -> None:
     options = parser.parse_args()
     camera, out = StarCameraModel(field_of_view=FIELD), sys.stdout
     out.write(f"{options.frames} frames a row, seed {options.seed}\n")
-    out.write("  %    V   rates  found  others  error px  CPU ms: median  95 %     max\n")
+    out.write("  %    V   rates  found  others  error px  (error/claim)^2  CPU ms: median  95 %     max\n")
     # The first search of a process loads its compiled forms.
     pixels, rate, _ = frame(camera, (options.seed,), options.percent[0], None)
     looked(camera, pixels, rate, None)
@@ -119,11 +134,13 @@ def main() -> None:
                 seen.append(looked(camera, pixels, rate, None if magnitude is None else ends))
             rates = [each for each in seen if each is not None]
             errors = [each.error for each in rates if each.error is not None]
+            claims = [claim for each in rates for claim in each.claims]
             spent = np.array([each.spent for each in rates])
             out.write(
                 f"{percent:3.0f} {'-' if magnitude is None else f'{magnitude:.1f}':>4s} {len(rates):7d}"
                 f" {len(errors):6d} {sum(each.others for each in rates):7d}"
-                f" {np.median(errors) if errors else np.nan:9.2f} {np.median(spent):15.0f}"
+                f" {np.median(errors) if errors else np.nan:9.2f}"
+                f" {np.mean(claims) if claims else np.nan:16.1f} {np.median(spent):15.0f}"
                 f" {np.percentile(spent, 95.0):5.0f} {spent.max():7.0f}\n"
             )
             out.flush()
