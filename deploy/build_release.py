@@ -140,7 +140,8 @@ class Build:
             check=False,
         )
         if done.returncode != 0:
-            sys.stderr.write(f"{done.stdout}\ninstall: failed: {' '.join(command)}\n")
+            cause = (done.stdout.strip().splitlines() or [f"status {done.returncode}"])[-1]
+            sys.stderr.write(f"{done.stdout}\ninstall: failed: {cause}: {' '.join(command)}\n")
             raise SystemExit(1)
 
     def _remove_incomplete(self) -> None:

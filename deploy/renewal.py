@@ -324,13 +324,7 @@ class Board:
         command = [str(word) for word in words]
         try:
             return subprocess.run(
-                command,
-                cwd="/",
-                capture_output=True,
-                text=True,
-                errors="replace",
-                timeout=limit_s,
-                check=False,
+                command, cwd="/", capture_output=True, errors="replace", timeout=limit_s, check=False
             )
         except (OSError, subprocess.TimeoutExpired) as error:
             return subprocess.CompletedProcess(command, 127, "", f"{type(error).__name__}: {error}")
@@ -449,15 +443,16 @@ class Renewal:
 
     def step(self) -> None:
         """Continue an interrupted step, execute one request and judge the trial. Raises OSError."""
-        if self._state.trial is not None:
+        # A trial whose installation ends in this step is not judged, because the units still have to restart.
+        trial = self._state.trial
+        judged = trial if trial is not None and trial.stage == "fly" else None
+        if trial is not None:
             self._continue()
         if self._state.returning:
             self._return()
-        begun = self._state.trial
         for name, request in self._requests():
             self._obey(name, request)
-        # A trial that has just begun is not judged, because the units are still restarting.
-        if begun is not None and self._state.trial is begun and begun.stage == "fly":
+        if judged is not None and self._state.trial is judged and judged.stage == "fly":
             self._judge()
         self._count_silence()
         self._age_note()
@@ -551,9 +546,7 @@ class Renewal:
             new = board.keep("", staging / "set")
             if new == old:
                 raise Refused(f"this {kind} flies already")
-        trial = Trial(what, kind, version, name, old, new, "install", left_s, despite, before, session)
-        state.trial = trial
-        self._report(name, "started", "activate", f"{kind} {version} is installed, trial of {hours:g} h")
+        state.trial = Trial(what, kind, version, name, old, new, "install", left_s, despite, before, session)
         self._save()
         self._continue()
 
@@ -588,8 +581,7 @@ class Renewal:
             words += [board.configuration(), kept, utc]
             done = board.run([board.python(release), "-I", "-B", *words], 600.0)
             if done.returncode == 0:
-                facts: dict[str, Any] = json.loads(done.stdout)
-                return facts
+                return dict(json.loads(done.stdout))
             problems += done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
         raise Refused(problems[0] if problems else "no release or no root.json is installed")
 
@@ -601,6 +593,8 @@ class Renewal:
         board = self._board
         if board.active(SAFE) or not (board.active(FLIGHT) and board.active(LINK)):
             raise Refused("flight or link is not up: confirm it when both are")
+        if other := self._other_release(trial):
+            raise Refused(f"flight or link run release {other} instead")
         state.versions[kind] = trial.version
         if trial.what == "configuration":
             state.previous = trial.old
@@ -661,6 +655,8 @@ class Renewal:
             board.point("current", trial.new)
         board.restart()  # if killed before the state is stored, this step is repeated
         trial.stage = "fly"
+        text = f"{trial.kind} {trial.version} is installed, trial of {trial.left_s / 3600.0:g} h"
+        self._report(trial.request, "started", "activate", text)
         self._save()
 
     def _built(self) -> str:
@@ -712,7 +708,8 @@ class Renewal:
         self._note(text)
         state.trial = None
         self._report(trial.request, "failed", "activate", text)
-        board.restart()  # if killed before the state is stored, this step is repeated
+        if trial.what == "configuration" or trial.new:  # a release that was not built has changed nothing
+            board.restart()  # if killed before the state is stored, this step is repeated
         self._save()
 
     def _judge(self) -> None:
@@ -722,18 +719,22 @@ class Renewal:
         up = board.active(FLIGHT) and board.active(LINK)
         trial.down_s = 0.0 if up else trial.down_s + self._elapsed
         trial.left_s -= self._elapsed
-        units = (FLIGHT, LINK) if up and trial.what == "release" else ()
-        others = [name for name in map(board.flown_release, units) if name not in {"", trial.new}]
+        other = self._other_release(trial) if up else ""
         if board.active(SAFE):
             self._begin_revert("the flight ended five times in a minute")
         elif trial.down_s >= DOWN_S:
             self._begin_revert(f"flight or link were not up for {DOWN_S:.0f} s")
-        elif others:
-            self._begin_revert(f"flight or link run release {others[0]} instead")
+        elif other:
+            self._begin_revert(f"flight or link run release {other} instead")
         elif contact.get("fault") and contact["session"] != trial.session and not trial.despite_faults:
             self._begin_revert(f"the flight reported a fault: {contact['fault']}")
         elif trial.left_s <= 0.0:
             self._begin_revert("the ground did not confirm it")
+
+    def _other_release(self, trial: Trial) -> str:
+        """Return the release that flight or link run instead of the one on trial, or an empty text."""
+        flown = {self._board.flown_release(unit) for unit in (FLIGHT, LINK)} - {"", trial.new}
+        return min(flown, default="") if trial.what == "release" else ""
 
     def _go_back(self, what: str, request: str, word: str, text: str) -> bool:
         """Return to the previous release or configuration. Returns False without a previous version."""

@@ -26,7 +26,8 @@ from flight.link.security import COMMAND_SPIS
 from flight.loop.state import LinuxFiles, replace_file
 from flight.schema.document import read_document, read_text
 from flight.schema.reader import parse
-from ground.link.commanding import add_link_options, explained, sha256_of, terminal_of
+from ground.commands.options import positive
+from ground.link.commanding import add_link_options, explained, no_answer, sha256_of, terminal_of
 from knightcube.errors import FlightError, UsageError
 
 ENDLESS = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)
@@ -45,8 +46,8 @@ PARTS = (
 )
 """Source files and folders that a release contains."""
 _SIGNED_BY_ONE = ("targets", "snapshot", "timestamp")
-_TIMEOUT_S = 60.0
-"""Default time (s) to wait for the privileged part, which runs every 10 s."""
+_TIMEOUT_S, _BUILD_TIMEOUT_S = 60.0, 1800.0
+"""Default times (s) to wait for the privileged part, which runs every 10 s, and for a release to be built."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -85,8 +86,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         placed.add_argument("kind", choices=KINDS, help="kind of the artefact")
         text = "key of the commands on the link (default %(default)s)"
         placed.add_argument("--spi", type=int, choices=COMMAND_SPIS, default=COMMAND_SPIS[0], help=text)
-        text = f"time to wait for the satellite (default {_TIMEOUT_S:g} s)"
-        placed.add_argument("--timeout", type=float, default=_TIMEOUT_S, metavar="S", help=text)
+        text = (
+            f"time to wait for the satellite (default {_TIMEOUT_S:g} s, for a release {_BUILD_TIMEOUT_S:g} s)"
+        )
+        placed.add_argument("--timeout", type=positive, metavar="S", help=text)
         if word == "activate":
             placed.add_argument("path", type=Path, metavar="BUNDLE", help="local copy of the bundle")
             text = "powered time (h) within which the ground must confirm (default %(default)g)"
@@ -204,17 +207,24 @@ def _command(options: argparse.Namespace) -> int:
         directive = Confirm(kind) if options.what == "confirm" else Withdraw(kind)
 
     reports: list[Report] = []
+    builds = options.what == "activate" and options.kind == "release"
+    timeout = options.timeout or (_BUILD_TIMEOUT_S if builds else _TIMEOUT_S)
     with closing(terminal_of(options)) as terminal:
         counter = terminal.send(directives.pack(directive, utc_ns()), options.spi)
-        for report in terminal.follow(counter, options.spi, options.timeout):
+        for report in terminal.follow(counter, options.spi, timeout):
             reports.append(report)
             sys.stdout.write(f"{report.stage.name.lower()}: {explained(report)}\n")
             sys.stdout.flush()
             # The link reports the first start; the second start, of the privileged part, begins the trial.
             if options.what == "activate" and [one.stage for one in reports].count(Stage.STARTED) == 2:
-                break
+                return 0
     if not reports:
-        raise FlightError(f"no answer over the link within {options.timeout:g} s")
+        raise no_answer(timeout)
+    if not reports[-1].stage.final:
+        raise FlightError(
+            f"no result of the renewal within {timeout:g} s: look at the telemetry, and send `confirm` or "
+            "`withdraw`, whose answer says whether a trial is running"
+        )
     return int(reports[-1].stage in {Stage.REFUSED, Stage.FAILED})
 
 

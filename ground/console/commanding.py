@@ -46,7 +46,7 @@ from flight.schema.reader import parse
 from flight.schema.sections import Commands
 from ground.console.description import Body, commands_for, foreign_modes, layouts_for
 from ground.console.history import values
-from ground.link.commanding import FileSession, exchange, explained, obeyed
+from ground.link.commanding import FileSession, exchange, explained, no_answer, obeyed
 from ground.link.terminal import Terminal, report_of
 from ground.telemetry import decode, scan
 from knightcube.errors import FlightError, UsageError
@@ -254,7 +254,7 @@ class LinkFeed:
                 text = "; ".join(explained(report) for report in listed)
                 return {"obeyed": int(obeyed(reports)), "text": text, "counter": counter}
             time.sleep(0.02)
-        raise FlightError(f"no answer over the link within {_ANSWER_S:g} s")
+        raise no_answer(_ANSWER_S)
 
     @contextlib.contextmanager
     def transferring(self, store: Store, rate: float) -> Iterator[FileSession]:

@@ -174,6 +174,14 @@ def explained(report: Report) -> str:
     )
 
 
+def no_answer(seconds: float) -> FlightError:
+    """Return the error of a command on which no report arrived for `seconds` s."""
+    return FlightError(
+        f"no answer over the link within {seconds:g} s: the command or its reports were lost; look at the "
+        "telemetry before you send the command again, because it may have been executed"
+    )
+
+
 def command(terminal: Terminal, packet: bytes, spi: int, seconds: float, show: Show) -> list[Report]:
     """Send a command, pass its reports to `show` and return them. Raises FlightError without a report."""
     found = []
@@ -181,7 +189,7 @@ def command(terminal: Terminal, packet: bytes, spi: int, seconds: float, show: S
         show(report)
         found.append(report)
     if not found:
-        raise FlightError(f"no answer over the link within {seconds:g} s")
+        raise no_answer(seconds)
     return found
 
 

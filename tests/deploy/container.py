@@ -1,8 +1,9 @@
 """A machine of its own for the service: this one's files in an overlay, systemd booted in them by nspawn.
 
-`python -m tests.deploy.container FOLDER` is run by `boot` in a mount namespace of its own, so that nothing it
-mounts is seen outside or stays. It installs the service by `deploy/install.sh` and boots; inside, the unit
-`scenario` runs `tests.deploy.scenario`, which leaves what it saw in FOLDER, and the machine is switched off.
+`boot` runs `python -m tests.deploy.container FOLDER SCENARIO` in a mount namespace of its own, so that its
+mounts are not seen outside and end with it. The program installs the service by `deploy/install.sh` and
+boots. Inside, the unit `scenario` runs the module SCENARIO, which writes its observations into FOLDER, and
+the machine is switched off.
 """
 
 from __future__ import annotations
@@ -18,13 +19,17 @@ from typing import Any
 from knightcube.vision.startracker.index.sky_index import PATH
 from tests.hal.guardian.live_flight import ROOT, write_config
 
-LIMIT_S = 540.0
-"""Longest time (s) of the scenario in the container. It takes two minutes on an idle machine."""
+LIMIT_S = 900.0
+"""Longest time (s) of a scenario in the container. It takes two to five minutes on an idle machine."""
+SERVICES, RENEWALS = "tests.deploy.scenario", "tests.deploy.renewal_scenario"
+"""Modules of the scenarios: faults of the services, and renewals by the ground over the link."""
 _SHARE = "/share"
 _UNITS = "etc/systemd/system"
 _FACTS = "/run/knightcube-devices/facts.json"
 COMMANDS = "/run/knightcube/commands"
 """Where the service listens."""
+LINK, KEYS = "127.0.0.1:5010", "/var/lib/knightcube-link/keys"
+"""Address of the link, and its keys on board, of the scenario `RENEWALS`."""
 
 _OPENED = f"""[Service]
 ProtectHome=no
@@ -78,11 +83,16 @@ def _mounted() -> list[Path]:
     return [place for place in wanted if not any(other in place.parents for other in wanted)]
 
 
-def boot(folder: Path) -> dict[str, Any]:
-    """Boot, have the scenario played, return what it saw. Raises AssertionError with the log."""
+def boot(folder: Path, scenario: str = SERVICES) -> dict[str, Any]:
+    """Boot, run a scenario and return its observations. Raises AssertionError with the log."""
     words = ["unshare", "--mount", "--propagation", "private", sys.executable, "-m", "tests.deploy.container"]
     done = subprocess.run(
-        [*words, str(folder)], cwd=ROOT, capture_output=True, text=True, timeout=2.0 * LIMIT_S, check=False
+        [*words, str(folder), scenario],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=2.0 * LIMIT_S,
+        check=False,
     )
     result = folder / "seen.json"
     if not result.exists():
@@ -93,10 +103,10 @@ def boot(folder: Path) -> dict[str, Any]:
     return seen
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, scenario: str) -> None:
     """Build the machine, boot it, leave nothing."""
     root = _overlay()
-    _furnish(root, folder)
+    _furnish(root, folder, scenario)
     home = _enter_cgroup()
     try:
         subprocess.run(
@@ -159,15 +169,24 @@ def _overlay() -> Path:
     return Path("/mnt/root")
 
 
-def _furnish(root: Path, folder: Path) -> None:
+def _furnish(root: Path, folder: Path, scenario: str) -> None:
     """Install the service as anybody would, and put the emulated devices and the scenario beside it."""
     (root / "etc/machine-id").write_text("0123456789abcdef0123456789abcdef\n", encoding="ascii")
     config = write_config(folder)
     with config.open("a", encoding="utf-8") as file:
         file.write(f"\ncommands: {{socket: {COMMANDS}}}\n")
+        if scenario == RENEWALS:
+            file.write(f"link: {{keys: {KEYS}, spacecraft: 0x1A5, udp: {LINK}, rate: 100000}}\n")
     installer = ["chroot", str(root), str(ROOT / "deploy/install.sh")]
-    options = ["--venv", sys.prefix, "--config", str(config)]
+    options = ["--config", str(config)]
+    if scenario == RENEWALS:  # a release can be renewed from its own packages only
+        options += ["--python", f"{sys.base_prefix}/bin/python3"]
+        _make_keys(root, folder)
+    else:
+        options += ["--venv", sys.prefix]
     _do(*installer, *options)
+    if scenario == RENEWALS:
+        _do("chroot", str(root), "chown", "-R", "knightcube-link:", str(Path(KEYS).parent))
     again = subprocess.run([*installer, "--dry-run", *options], capture_output=True, text=True, check=True)
     (folder / "second_install.txt").write_text(again.stdout, encoding="utf-8")
     # The interpreter may stand in somebody's home, which the service's user must be let into here.
@@ -195,8 +214,8 @@ ExecStart=/opt/knightcube/bin/fly /etc/knightcube/flight.yaml --archive /var/lib
 """,
         encoding="utf-8",
     )
-    (units / "knightcube-renewal.service.d").mkdir()
-    for unit in ("knightcube-safe", "knightcube-renewal"):
+    for unit in ("knightcube-safe", "knightcube-renewal", "knightcube-link"):
+        (units / f"{unit}.service.d").mkdir(exist_ok=True)
         (units / f"{unit}.service.d/test.conf").write_text(f"{_opened()}\n", encoding="utf-8")
     (units / "scenario.service").write_text(
         f"""[Unit]
@@ -206,7 +225,7 @@ After=sysinit.target
 [Service]
 Type=oneshot
 WorkingDirectory={ROOT}
-ExecStart={sys.prefix}/bin/python -m tests.deploy.scenario /share {_FACTS}
+ExecStart={sys.prefix}/bin/python -m {scenario} /share {_FACTS}
 ExecStopPost=/bin/sh -c 'journalctl --no-pager > /share/journal.txt; systemctl --no-block --force poweroff'
 """,
         encoding="utf-8",
@@ -216,6 +235,19 @@ ExecStopPost=/bin/sh -c 'journalctl --no-pager > /share/journal.txt; systemctl -
         index = root / "var/cache/knightcube/knightcube" / PATH.name
         index.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(PATH, index)
+
+
+def _make_keys(root: Path, folder: Path) -> None:
+    """Make the keys of the link and of the renewals, and give the board its halves."""
+    for words in (["keys", "keys"], ["renewal", "keys", "signing"]):
+        subprocess.run(
+            [sys.executable, "-m", "flight", *words], cwd=folder, check=True, stdout=subprocess.DEVNULL
+        )
+    board = root / KEYS.lstrip("/")
+    board.parent.mkdir(parents=True, mode=0o700)
+    shutil.copytree(folder / "keys/satellite", board)
+    (root / "etc/knightcube").mkdir()
+    shutil.copyfile(folder / "signing/metadata/1.root.json", root / "etc/knightcube/root.json")
 
 
 def _opened() -> str:
@@ -283,4 +315,4 @@ def _do(*words: str) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), sys.argv[2])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import subprocess
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -141,12 +143,17 @@ def _kill_the_next_restart(board: RenewedBoard, part: str) -> None:
     """Request a restart, and kill the program at its first call of systemctl."""
     board.request("restart", part=part)
     board.step()
-    systemctl = board.place / "bin/systemctl"
-    text = systemctl.read_text(encoding="ascii")
-    systemctl.write_text("#!/bin/sh\nkill -9 $PPID\n", encoding="ascii")
-    done = subprocess.run([*board.words(), "--restart"], env=board.environment(), check=False)
+    _kill_at(board, "systemctl", "--restart")
+
+
+def _kill_at(board: RenewedBoard, name: str, *options: str) -> None:
+    """Run the root part, and kill it at its first call of a program."""
+    program = board.place / "bin" / name
+    text = program.read_text(encoding="ascii")
+    program.write_text("#!/bin/sh\nkill -9 $PPID\n", encoding="ascii")
+    done = subprocess.run([*board.words(), *options], env=board.environment(), check=False)
     assert done.returncode == -9
-    systemctl.write_text(text, encoding="ascii")
+    program.write_text(text, encoding="ascii")
 
 
 @pytest.mark.parametrize("content", [b"", b"flighu link", b"\xe6light link", b"\0" * 11])
@@ -327,19 +334,37 @@ def test_a_release_is_built_from_the_packages_of_the_present_one_and_tried(board
     assert board.release() == "old"
 
 
+@contextlib.contextmanager
+def running_the_old_release(board: RenewedBoard, unit: str) -> Iterator[None]:
+    """Let a unit run the release that flew at first."""
+    place = board.files.prefix / "releases" / FIRST / "venv/bin/python"
+    with subprocess.Popen([str(place), "60"], executable="/bin/sleep") as process:
+        (board.place / f"pid-{unit}").write_text(f"{process.pid}\n", encoding="ascii")
+        yield
+        process.kill()
+
+
 @pytest.mark.parametrize("unit", ["knightcube.service", "knightcube-link.service"])
 def test_a_trial_ends_if_flight_or_link_run_another_release(board: RenewedBoard, unit: str) -> None:
     request = board.activate(board.bundle("release", board.source("new"), 1), "release")
     board.step()
-    old = board.files.prefix / "previous"
-    place = board.files.prefix / "releases" / old.readlink().name / "venv/bin/python"
-    with subprocess.Popen([str(place), "60"], executable="/bin/sleep") as process:
-        (board.place / f"pid-{unit}").write_text(f"{process.pid}\n", encoding="ascii")
+    confirmed = board.request("confirm", "release")
+    with running_the_old_release(board, unit):
         board.step()
-        process.kill()
     assert board.release() == "old"
+    assert board.reports(confirmed)[-1] == ("failed", f"flight or link run release {FIRST} instead")
     result, text = board.reports(request)[-1]
     assert (result, f"run release {FIRST} instead" in text) == ("failed", True), text
+
+
+def test_a_trial_begins_when_the_release_is_built_even_after_a_kill(board: RenewedBoard) -> None:
+    request = board.activate(board.bundle("release", board.source("new"), 1), "release")
+    _kill_at(board, "python3")
+    assert not (board.own / "status").exists() or not board.reports(request)
+    with running_the_old_release(board, "knightcube.service"):  # it restarts only after the step
+        board.step()
+    assert board.release() == "new"
+    assert [result for result, _ in board.reports(request)] == ["started"]
 
 
 def test_a_release_is_not_built_from_damaged_packages(board: RenewedBoard) -> None:
@@ -347,6 +372,7 @@ def test_a_release_is_not_built_from_damaged_packages(board: RenewedBoard) -> No
     library.write_text(library.read_text(encoding="ascii").upper(), encoding="ascii")
     request = board.activate(board.bundle("release", board.source("new"), 1), "release")
     board.step()
+    assert not board.restarted()  # the flight goes on undisturbed
     assert board.release() == "old"
     result, text = board.reports(request)[-1]
     assert (result, "add the folder wheels, because venv/lib" in text) == ("failed", True), text

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import tarfile
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from flight.link.process.commanding import Report, Stage
 from tests.deploy.scripts import changed_testbed, script
 from tests.ground.commands.in_process import command
 
@@ -152,3 +154,29 @@ def test_versions_rise_unless_going_back_is_signed(signing: Path, tmp_path: Path
     assert "catalogue 3 is signed already" in command(*words, "3").stderr
     assert command(*words, "2", "--back").returncode == 0
     assert command(*words, "3").returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "stages", "status", "error"),
+    [
+        ("release", ["ACCEPTED", "STARTED", "STARTED"], 0, ""),
+        ("release", ["ACCEPTED", "STARTED", "FAILED"], 1, ""),
+        ("release", ["ACCEPTED", "STARTED"], 1, "no result of the renewal within 1800 s"),
+        ("elements", ["ACCEPTED", "STARTED"], 1, "no result of the renewal within 60 s"),
+        ("elements", [], 1, "no answer over the link within 60 s"),
+    ],
+)
+def test_activate_succeeds_only_if_the_trial_has_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, stages: list[str], status: int, error: str
+) -> None:
+    terminal = Mock()
+    terminal.follow.return_value = [Report(1, 7, Stage[stage], "activate", "text") for stage in stages]
+    monkeypatch.setattr("ground.commands.renewal.terminal_of", lambda _: terminal)
+    (tmp_path / "bundle").write_bytes(b"bundle")
+    done = command(
+        "renewal", "activate", "--link", "127.0.0.1:1", "--keys", "k", kind, "bundle", folder=tmp_path
+    )
+    assert done.returncode == status
+    assert done.stdout.splitlines() == [f"{stage.lower()}: text" for stage in stages]
+    assert error in done.stderr
+    assert bool(error) == bool(done.stderr)

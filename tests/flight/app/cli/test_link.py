@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import pty
@@ -20,6 +21,7 @@ from pathlib import Path
 import pytest
 
 from flight.app.cli import main
+from flight.app.cli.link import self_test
 from flight.link.coding import LinkCodes
 from flight.link.commands import PING, CommandPacker, Ping, open_unix
 from flight.link.modes import Mode
@@ -37,7 +39,7 @@ from ground.link.terminal import (
     report_of,
 )
 from ground.xtce import TELECOMMANDS
-from knightcube.errors import UsageError
+from knightcube.errors import FlightError, UsageError
 from tests.flight.link.vaults import frame_with
 from tests.support.flights import CONFIG
 from tests.support.linked_board import ROOT, free_ports, write_linked_config
@@ -231,3 +233,23 @@ def test_keys_are_never_overwritten(lines: dict[str, str], capsys: pytest.Captur
     assert "never overwritten" in capsys.readouterr().err
     modes = {path.stat().st_mode & 0o777 for path in Path(lines["place"], "keys").rglob("spi-*")}
     assert modes == {0o600}
+
+
+def test_a_release_tests_its_link_without_a_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sandbox of knightcube-renewal.service allows sockets of the family AF_UNIX only."""
+    opened = socket.socket.__init__
+
+    def refusing(self: socket.socket, family: int = -1, *words: int, **named: int | None) -> None:
+        if family != socket.AF_UNIX:
+            raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
+        opened(self, family, *words, **named)
+
+    monkeypatch.setattr(socket.socket, "__init__", refusing)
+    self_test()
+
+
+def test_a_release_whose_link_obeys_nothing_fails_its_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flight.app.cli.link.close_frame", lambda frame: frame + b"\0\0")
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    with pytest.raises(FlightError, match="executed no command"):
+        self_test()
